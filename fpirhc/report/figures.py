@@ -20,10 +20,12 @@ from fpirhc.simulation.drawing import (
     draw_line,
     draw_responses,
     draw_signal,
+    draw_title,
     literal,
     new_figure,
     quantity_label,
     row_of_axes,
+    show_usual,
     shown_motion,
     thinned,
     time_label,
@@ -101,26 +103,25 @@ def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Drawing]:
     Both sides have the same axes, and a picture has one unit: quantities of several units are several pictures.
     """
     figures = {}
-    for title, draw, signal, names in _pictures(plain.run):
+    for title, draw, signal, what, names in _pictures(plain.run):
         groups = by_unit(plain.run, signal, names)
         for unit, same in groups.items():
             name = title if len(groups) == 1 else f"{title} [{unit}]"
             same = same[:1] if draw is _draw_responses else same  # four lines each
-            figures[name] = _pair(draw, quantity_label(plain.run, signal, same), same, (plain, adaptive))
+            figures[name] = _pair(draw, quantity_label(plain.run, signal, same, what), same, (plain, adaptive))
     return figures
 
 
-def _pictures(run: Run) -> list[tuple[str, Draw, str, list[str]]]:
-    """Title, drawing, signal with the units, and names of every picture of a pair."""
+def _pictures(run: Run) -> list[tuple[str, Draw, str, str, list[str]]]:
+    """Title, drawing, signal with the units, what its entries are of the names, and names of every picture of a pair."""
     judged, inputs = list(run.layout["error"].elements), list(run.layout["command"].elements)
-    highest = "Second derivatives" if _is_second_order(run) else "Highest derivatives"
-    phases = [("Phase trajectories", _draw_phase, "error", _phase_names(run))] if _phase_names(run) else []
+    phases = [("Phase trajectories", _draw_phase, "error", "", _phase_names(run))] if _phase_names(run) else []
     return [
-        ("Trajectory tracking", _draw_trajectory, "error", judged),
+        ("Trajectory tracking", _draw_trajectory, "error", "", judged),
         *phases,
-        ("Tracking error", partial(draw_signal, signal="error"), "error", judged),
-        ("Command", partial(draw_signal, signal="command"), "command", inputs),
-        (highest, _draw_responses, "desired", list(run.layout["desired"].elements)),
+        ("Tracking error", partial(draw_signal, signal="error"), "error", "error of ", judged),
+        ("Command", partial(draw_signal, signal="command"), "command", "", inputs),
+        ("Highest derivatives", _draw_responses, "desired", "responses of ", list(run.layout["desired"].elements)),
     ]
 
 
@@ -133,7 +134,7 @@ def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, En
             draw_changes(axis, entry.run)
             axis.set_xlabel(time_label(entry.run))
             axis.set_ylabel(label)
-        axis.set_title(literal(entry.name), fontsize=10, y=1.0)
+        draw_title(axis, entry.name)
         draw_legend(axis)
     _share_axes(axes)
     return figure
@@ -153,14 +154,26 @@ def lyapunov_figure(comparison: Comparison) -> Drawing | None:
     if not views:
         return None
     figure, [axis] = row_of_axes(_WIDE, 4.0, 1)
-    for k, (entry, view) in enumerate(views):
-        color, values = PALETTE[k % len(PALETTE)], np.maximum(view.function, 1e-20)
+    colours = colours_of(comparison)
+    for entry, view in views:
+        color, values = colours[entry.name], _positive(view.function)
         times = entry.run.period * np.arange(values.size)
         axis.semilogy(thinned(times), thinned(values), color=color, lw=1, label=literal(entry.name))
-        axis.axhline(max(0.5 * view.ultimate**2, 1e-20), color=color, lw=0.8, ls="--")
+        axis.axhline(_positive(0.5 * view.ultimate**2), color=color, lw=0.8, ls="--")
     caption_axes(axis, time_label(views[0][0].run), "V")
     draw_legend(axis)
     return figure
+
+
+def _positive(values: np.ndarray | float) -> Any:
+    """Values that have a place on a logarithmic axis; the others are left out."""
+    return np.where((np.asarray(values) > 0) & np.isfinite(values), values, np.nan)
+
+
+def colours_of(comparison: Comparison) -> dict[str, str]:
+    """Return the colour of every controller that ran, by name: the same one in all pictures of a report."""
+    names = [e.name for e in comparison.entries if e.run.cycles > 1]
+    return dict(zip(names, PALETTE * len(names), strict=False))
 
 
 def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Figure:
@@ -174,7 +187,7 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
         for row in (0, 1):
             draw_bands(axes[row, column], entry.run)
             draw_changes(axes[row, column], entry.run)
-        axes[0, column].set_title(literal(entry.name), fontsize=10)
+        draw_title(axes[0, column], entry.name)
         axes[1, column].set_xlabel(time_label(entry.run))
         draw_legend(axes[0, column])
     limit = max(axes[1, 0].get_ylim(), key=abs)
@@ -183,14 +196,13 @@ def headline_figure(comparison: Comparison, plain: Entry, adaptive: Entry) -> Fi
     return figure
 
 
-def _is_second_order(run: Run) -> bool:
-    return all(unit.endswith("s^2") for unit in run.layout["desired"].entry_units)
-
-
 def _draw_trajectory(axis: Axes, run: Run, names: Sequence[str]) -> None:
     for k, name in enumerate(names):
         draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k % len(PALETTE)])
         draw_line(axis, run, f"reference.{name}", f"{name} nominal", _REFERENCES[k % len(_REFERENCES)], "--")
+    show_usual(
+        axis.set_ylim, run, [f"{one}.{name}" for one in (shown_motion(run.layout), "reference") for name in names]
+    )
 
 
 def _phase_names(run: Run) -> list[str]:
@@ -207,6 +219,8 @@ def _draw_phase(axis: Axes, run: Run, names: Sequence[str]) -> None:
         for signal, style, color in ((motion, "-", PALETTE[k % len(PALETTE)]), ("reference", "--", nominal)):
             x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
             axis.plot(thinned(x), thinned(y), style, color=color, lw=1, label=literal(f"{name} {signal}"))
+    for limit, prime in ((axis.set_xlim, ""), (axis.set_ylim, "'")):
+        show_usual(limit, run, [f"{one}.{name}{prime}" for one in (motion, "reference") for name in names])
     across, up = (quantity_label(run, motion, [name + prime for name in names]) for prime in ("", "'"))
     caption_axes(axis, across, up)
 
@@ -220,15 +234,15 @@ def contraction_figure(comparison: Comparison) -> Drawing | None:
     entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
     if not entries:
         return None
-    colours = {e.name: PALETTE[k % len(PALETTE)] for k, e in enumerate(entries)}
-    groups = _by_gain(entries)
+    colours, groups = colours_of(comparison), _by_gain(entries)
     figure, [*panels, last] = row_of_axes(_WIDE, 4.0, len(groups) + 1)
     for axis, ((name, scale), same) in zip(panels, groups.items(), strict=True):
         _draw_factor(axis, name, scale, same, colours)
     for entry in entries:
-        size = np.linalg.norm(entry.run["realised"][1:] - entry.run["desired"][:-1], axis=1)[:_CYCLES]
+        apart = (entry.run["realised"][1:] - entry.run["desired"][:-1])[:_CYCLES]
+        size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
         cycles = np.arange(1, size.size + 1)
-        last.semilogy(cycles, np.maximum(size, 1e-12), color=colours[entry.name], label=literal(entry.name), lw=1)
+        last.semilogy(cycles, _positive(size), color=colours[entry.name], label=literal(entry.name), lw=1)
     last.set_xlabel("control cycle")
     last.set_ylabel("|realised - desired|, response units")
     last.set_title("The response error in the first cycles", fontsize=10, y=1.0)
@@ -302,13 +316,13 @@ def mismatch_figure(comparison: ScenarioComparison) -> Drawing:
         f"{comparison.problem}: error against mismatch, {comparison.count} {'cases' if comparison.named else 'scenarios'}",
     )
     axis = figure.subplots()
-    finite = np.concatenate([s.errors[np.isfinite(s.errors)] for s in comparison.summaries])
-    edge = 200 * float(finite.max(initial=1e-3))
     for k, one in enumerate(comparison.summaries):
         colour, ended = PALETTE[k % len(PALETTE)], ~np.isfinite(one.errors)
         x, y = 100 * one.mismatch, 100 * one.errors
         axis.semilogy(x[~ended], y[~ended], "o", color=colour, ms=3, alpha=0.5)
-        axis.semilogy(x[ended], np.full(ended.sum(), edge), "x", color=colour, ms=6)
+        axis.plot(
+            x[ended], np.ones(ended.sum()), "x", color=colour, ms=6, transform=axis.get_xaxis_transform(), clip_on=False
+        )
         axis.semilogy(*_medians(x[~ended], y[~ended]), "-", color=colour, lw=1.5, label=literal(one.name))
     caption_axes(axis, "mismatch between model and plant [%]", _ERROR)
     axis.legend(fontsize=8, framealpha=0.8)
@@ -374,7 +388,7 @@ def _sweep_lines(result: Sweep) -> Drawing:
         if over.path in one.now:
             axis.axvline(one.now[over.path], color=colour, ls=":", lw=1)
     _scale_of(axis, result)
-    caption_axes(axis, literal(over.path), literal(_figure_label(result)))
+    caption_axes(axis, _path_label(result, over.path), literal(_figure_label(result)))
     draw_legend(axis)
     return figure
 
@@ -455,7 +469,7 @@ def _draw_map(axis: Axes, result: Sweep, values: np.ndarray, **colours: Any) -> 
     for over, scale, label in ((across, axis.set_xscale, axis.set_xlabel), (along, axis.set_yscale, axis.set_ylabel)):
         if over.logarithmic:
             scale("log" if over.values[0] > 0 else "symlog")
-        label(literal(over.path))
+        label(_path_label(result, over.path))
     return mesh
 
 
@@ -466,6 +480,11 @@ def _scale_of(axis: Axes, result: Sweep) -> None:
     finished = [v for one in result.maps for v in one.values[one.outcomes == "finished"]]
     if finished and min(finished) > 0 and max(finished) > 10 * min(finished):
         axis.set_yscale("log")
+
+
+def _path_label(result: Sweep, path: str) -> str:
+    unit = result.units.get(path)
+    return literal(f"{path} [{unit}]" if unit else path)
 
 
 def _figure_label(result: Sweep) -> str:

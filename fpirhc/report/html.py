@@ -21,6 +21,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.report.figures import (
+    colours_of,
     contraction_figure,
     limits_figure,
     lyapunov_figure,
@@ -30,7 +31,7 @@ from fpirhc.report.figures import (
     sweep_figure,
     sweep_panels,
 )
-from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure, responses_of, shown_motion
+from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import readable
 from fpirhc.simulation.run import judged_motion
@@ -58,8 +59,8 @@ _CAPTIONS = {
     "Phase trajectories": "First derivative against coordinate.",
     "Tracking error": "Nominal minus realised.",
     "Command": "After clipping.",
-    "Second derivatives": "With adaptation the realised acceleration lies on the desired one, although the deformed request "
-    "is far from both: the wrong model needs this request.",
+    "Highest derivatives": "Nominal, desired, deformed and realised response. Where adaptation works the realised one lies on the "
+    "desired one, although the deformed one is far from both.",
 }
 _LYAPUNOV = (
     "V = |S|^2 / 2 of the tracking law, dashed: its ultimate bound (sup|h| / rate)^2 / 2 by the response error h of the "
@@ -108,7 +109,7 @@ def render(comparison: Comparison, lab: str = "") -> str:
     pair, entries = headline_pair(comparison), comparison.entries
     own, motions = own_pictures(comparison)
     begin = [e.name for e in pair] if pair else []
-    series = {**chart_data(comparison, PALETTE), "bands": BANDS, "begin": begin, "motions": motions}
+    series = {**chart_data(comparison), "bands": BANDS, "begin": begin, "motions": motions}
     data = _in_script(json.dumps(series, separators=(",", ":")))
     contraction, lyapunov = contraction_figure(comparison), lyapunov_figure(comparison)
     return render_page(
@@ -116,6 +117,7 @@ def render(comparison: Comparison, lab: str = "") -> str:
         comparison.view,
         (
             asset("uPlot.iife.min.js"),
+            asset("axes.js"),
             *([planar.script()] if motions else []),
             f"const DATA={data};\n{asset('report.js')}",
         ),
@@ -351,14 +353,14 @@ INTERVALS = 300
 _REALITY = "reality_state"
 
 
-def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]:
+def chart_data(comparison: Comparison) -> dict[str, Any]:
     """Return the data of the page's charts: controllers with their colours, and charts with one series per controller."""
     entries = [e for e in comparison.entries if e.run.cycles > 1]
     if not entries:
         return {"controllers": [], "charts": [], "time": [], "timeUnit": comparison.time_unit}
     longest = max(entries, key=lambda e: e.run.cycles).run
     edges = _edges(longest.cycles)
-    first = entries[0].run
+    first, colours = entries[0].run, colours_of(comparison)
     names = first.layout["error"].elements
     charts = [
         _chart(f"error of {c}", first.unit(f"error.{c}"), [(e.name, e.run[f"error.{c}"]) for e in entries], edges)
@@ -383,11 +385,12 @@ def chart_data(comparison: Comparison, palette: Sequence[str]) -> dict[str, Any]
         "controllers": [
             {
                 "name": e.name,
-                "color": palette[k % len(palette)],
+                "color": colours[e.name],
                 "slots": _slots_of_run(e.run),
                 "changes": _changes(e.run),
+                "ended": bool(e.run.stop),
             }
-            for k, e in enumerate(entries)
+            for e in entries
         ],
         "timeUnit": comparison.time_unit,
         "steps": comparison.steps,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00",
 _POINTS = 2000  # drawn per line
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.95, 0.15, 0.6, 0.35  # margins of a row of axes, inches
 _BESIDE, _BELOW = 0.75, 0.33  # labels of a row's axes, inches from the axes
+_TITLE, _LABEL, _NAME = 60, 32, 48  # characters of a line of a title, a label of an axis, a name in a legend
 _TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
 
 
@@ -87,10 +89,16 @@ def time_label(run: _Recorded) -> str:
     return literal(f"time [{run.time_unit}]")
 
 
-def quantity_label(run: _Recorded, signal: str, names: Sequence[str]) -> str:
-    """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common."""
+def quantity_label(run: _Recorded, signal: str, names: Sequence[str], what: str = "") -> str:
+    """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common.
+
+    `what` they are of the names, such as 'error of '. Where the names are too long for a label, it says that there are several.
+    """
     units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
-    return literal(", ".join(names) + (f" [{units[0]}]" if len(units) == 1 else ""))
+    shown = ", ".join(names)
+    if len(what + shown) > _LABEL:
+        shown = "several" if len(names) > 1 else textwrap.shorten(names[0], _LABEL, placeholder="...")
+    return literal(what + shown + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
 def by_unit(run: _Recorded, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
@@ -143,8 +151,16 @@ def draw_line(axis: Axes, run: _Recorded, column: str, label: str, color: str, s
 
 def draw_legend(axis: Axes) -> None:
     """Add a legend where something has a label."""
-    if axis.get_legend_handles_labels()[0]:
-        axis.legend(fontsize=7, loc="best", framealpha=0.8)
+    handles, labels = axis.get_legend_handles_labels()
+    if handles:
+        fitting = [one if len(one) <= _NAME else f"{one[: _NAME // 2]}...{one[-_NAME // 2 :]}" for one in labels]
+        axis.legend(handles, fitting, fontsize=7, loc="best", framealpha=0.8)
+
+
+def draw_title(axis: Axes, name: str) -> None:
+    """Set a name as the title of one of two panels side by side; a long one is smaller, in at most two lines."""
+    lines = textwrap.wrap(literal(name), _TITLE, max_lines=2, placeholder=" ...")
+    axis.set_title("\n".join(lines), fontsize=10 if len(lines) == 1 else 8, y=1.0)
 
 
 def draw_responses(axis: Axes, run: _Recorded, name: str) -> None:
@@ -156,12 +172,24 @@ def draw_responses(axis: Axes, run: _Recorded, name: str) -> None:
     usual = float(np.quantile(values, 0.99))
     if usual > 0 and values.max() > _TALL * usual:
         axis.set_ylim(-3 * usual, 3 * usual)
+    show_usual(axis.set_ylim, run, columns.values())
+
+
+def show_usual(limit: Callable[[float, float], object], run: _Recorded, columns: Iterable[str]) -> None:
+    """Limit the range of an axis where the run ended early: what it reached at last does not hide the rest."""
+    values = np.concatenate([run[column] for column in columns])
+    most = _TALL * float(np.median(np.abs(values))) if run.stop and values.size else 0.0
+    if 0 < most < np.abs(values).max():
+        low, high = max(values.min(), -most), min(values.max(), most)
+        edge = 0.05 * (high - low)
+        limit(low - edge, high + edge)
 
 
 def draw_signal(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) -> None:
     """Draw entries of a signal of a run over time, each in its colour."""
     for k, name in enumerate(names):
         draw_line(axis, run, f"{signal}.{name}", name, PALETTE[k % len(PALETTE)])
+    show_usual(axis.set_ylim, run, [f"{signal}.{name}" for name in names])
 
 
 def caption_axes(axis: Axes, across: str, up: str) -> None:
@@ -199,7 +227,7 @@ def run_figure(run: _Recorded) -> Figure:
     axes = figure.subplots(len(panels), 1, sharex=True)
     for axis, (signal, what, draw, names) in zip(axes, panels, strict=True):
         draw(axis, run, names, signal)
-        axis.set_ylabel(what + quantity_label(run, signal, names))
+        axis.set_ylabel(quantity_label(run, signal, names, what))
         draw_bands(axis, run)
         draw_changes(axis, run)
         draw_legend(axis)
@@ -214,6 +242,7 @@ def _draw_motion(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) 
         draw_line(axis, run, f"reference.{name}", f"{name} reference", color, "--")
         if "setpoint" in run.layout:
             draw_line(axis, run, f"setpoint.{name}", f"{name} set-point", color, ":")
+    show_usual(axis.set_ylim, run, [f"{one}.{name}" for one in (signal, "reference") for name in names])
 
 
 def _draw_first_response(axis: Axes, run: _Recorded, names: Sequence[str], _: str) -> None:

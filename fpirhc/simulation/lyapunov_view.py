@@ -41,7 +41,8 @@ class LyapunovView:
     @property
     def function(self) -> np.ndarray:
         """V = |S|^2 / 2, shape (cycles,)."""
-        return np.asarray(0.5 * np.sum(self.surface**2, axis=1))
+        with np.errstate(over="ignore"):  # of a run that diverged
+            return np.asarray(0.5 * np.sum(self.surface**2, axis=1))
 
     @property
     def largest(self) -> float:

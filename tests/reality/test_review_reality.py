@@ -181,7 +181,7 @@ def test_comparison_shows_belief_beside_reality():
         shipped = fp.load_problem("two_mass")
         file = replace(shipped, problem=one, controllers=pair, headline=("CTC", "CTC+FPI"))
         comparison = fp.compare(file, seed=0, compiled=False)
-        titles[name] = [chart["title"] for chart in chart_data(comparison, ["#000"])["charts"]]
+        titles[name] = [chart["title"] for chart in chart_data(comparison)["charts"]]
         factor = comparison.entries[1].metrics.values["contraction.predicted"][""]
         reached = 1 - np.exp(-1e-3 / 0.01) if name == "real" else 1.0
         assert factor == pytest.approx(1 - 0.1 * 2.0 * reached, abs=1e-6)
@@ -197,7 +197,7 @@ def test_comparison_shows_the_responses_of_slots_that_a_reality_has():
     )
     names = "slots", "slots+FPI"
     file = replace(file, problem=problem, controllers={n: file.controllers[n] for n in names}, headline=names)
-    charts = chart_data(fp.compare(file, seed=0, compiled=False), ["#000"])["charts"]
+    charts = chart_data(fp.compare(file, seed=0, compiled=False))["charts"]
     titles = {chart["title"] for chart in charts}
     assert "slots+FPI: response of q2, observer and reality" in titles
     assert {"slots+FPI: responses of q1", "slots+FPI: responses of q2"} < titles

@@ -205,6 +205,24 @@ def test_axes_of_charts_name_time_and_its_unit(reports, visit):
     assert page.evaluate("[...new Set(plots.map((p) => p.chart.axes[0].label))]") == ["t [s]"]
 
 
+def test_ticks_of_any_size_differ_and_what_a_run_reached_at_last_hides_nothing(reports, visit):
+    """Digits tell ticks apart, in every language of the browser; the range is 20 times the usual size, and whole after a zoom."""
+    page = visit(reports["order_one"]).page
+    ticks = [
+        ([0, 5e-10, 1e-9], ["0", "5e-10", "1.0e-9"]),
+        ([-5e5, 0, 5e5, 1e6], ["-5e5", "0", "5e5", "1.0e6"]),
+        ([1000, 1002.5, 1005], ["1000.0", "1002.5", "1005.0"]),
+        ([0, 20000, 40000], ["0", "20000", "40000"]),
+        ([-1e20, 0, 1e20], ["-1e20", "0", "1e20"]),
+    ]
+    for numbers, texts in ticks:
+        assert page.evaluate("(numbers) => tickTexts(numbers)", numbers) == texts
+    chart = "{ data: [[0, 1, 2, 3, 4], [1, 2, 3, 1e6, 1e20]], series: [{}, { show: true }], scales: { x: { min: 0, max: %s } } }"
+    ranges = [page.evaluate(f"rangeOfValues(() => true)({chart % most}, 1, 1e20)") for most in (4, 3)]
+    assert ranges[0][1] < 100
+    assert ranges[1][1] >= 1e20
+
+
 def test_a_table_that_is_cut_says_so(reports, visit):
     """The hint is there where the table is wider than the window, and only there; at its end the shade is gone."""
     page = visit(reports["many"], 800).page

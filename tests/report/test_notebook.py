@@ -229,7 +229,7 @@ def test_report_holds_no_foreign_tags(comparison):
     assert "onerror" not in parsed.attributes
     assert "<b>m[/]" not in page
     assert page.count("<img ") == page.count("<img alt=")
-    assert page.count("</script>") == page.count("<script>") == 3
+    assert page.count("</script>") == page.count("<script>") == 4
     assert MARKED in parsed.text
     assert "skipped <b>[/b]" in parsed.text
 

@@ -87,7 +87,7 @@ def test_equations_and_tables_of_a_description_keep_their_columns():
 
 def test_data_of_the_charts_is_complete(comparison):
     """Every controller, every signal of a coordinate, and no peak lost."""
-    data = chart_data(comparison, ["#000000"])
+    data = chart_data(comparison)
     assert [c["name"] for c in data["controllers"]] == ["plain", HOSTILE]
     error = next(c for c in data["charts"] if c["title"] == "error of y")
     run = comparison["plain"].run
@@ -108,7 +108,7 @@ def test_predicted_band_is_drawn_around_the_distance_from_the_models_run():
     quiet = replace(problem(), start={"y": 0.0}, disturbances={})
     task = Task("case", Path("case.py"), "case", "", quiet, controllers, headline=("plain", "adaptive"))
     comparison_value = compare(task, seed=0, compiled=False)
-    data = chart_data(comparison_value, ["#000000"])
+    data = chart_data(comparison_value)
     [chart] = [c for c in data["charts"] if "band" in c]
     distance, upper, lower = ([v for v in s["values"] if v is not None] for s in chart["series"])
     entry: Any = comparison_value["adaptive"]

@@ -127,7 +127,7 @@ def test_every_unit_has_its_responses(reacted):
     """A mole and a kelvin have a picture each, of the first quantity with this unit."""
     figures = pair_figures(reacted["plain"], reacted["affine"])
     labels = [figure.axes[0].get_ylabel() for name, figure in figures.items() if name.startswith("Highest")]
-    assert labels == ["c [mol/l/s]", "T [K/s]"]
+    assert labels == ["responses of c [mol/l/s]", "responses of T [K/s]"]
 
 
 def test_a_reference_has_a_colour_of_its_own(reacted):

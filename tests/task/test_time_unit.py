@@ -71,7 +71,7 @@ def test_report_and_terminal_have_it(case, capsys, tmp_path):
     page = ALLOWED.sub("", without_scripts(whole))
     assert f"from t = {task.problem.measure_from:g} {UNIT} on" in page
     assert not SECONDS.search(page)
-    data = chart_data(comparison, ["#000000"])
+    data = chart_data(comparison)
     assert data["timeUnit"] == UNIT
     assert not [c["unit"] for c in data["charts"] if SECONDS.search(f"[{c['unit']}]")]
     assert "t [s]" not in whole

@@ -77,7 +77,7 @@ const charts = DATA.charts.map((spec) => {
   const axis = { stroke: ink, grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 } };
   const plot = new uPlot(
     { width: box.clientWidth || 400, height: 200, series: [{ label: "t [" + DATA.timeUnit + "]" }, ...lines], scales: { x: { time: false } },
-      axes: [{ ...axis, label: "t [" + DATA.timeUnit + "]", size: 30, labelSize: 18 }, { ...axis, size: 62 }], cursor: { sync: { key: "time" } },
+      axes: [{ ...axis, label: "t [" + DATA.timeUnit + "]", size: 30, labelSize: 18 }, { ...axis, ...AXIS_OF_VALUES }], cursor: { sync: { key: "time" } },
       hooks: { setCursor: [(u) => u.cursor.left >= 0 && moving?.follow(u.posToVal(u.cursor.left, "x"))] } },
     [[], ...lines.map(() => [])], box);
   return { spec, box, plot };

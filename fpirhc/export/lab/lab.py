@@ -379,7 +379,7 @@ def page(lab: Lab) -> str:
         "motion": _motion(lab),
     }
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    scripts = (asset("uPlot.iife.min.js"), planar.script(), f"const DATA={text};\n{_own('lab.js')}")
+    scripts = (asset("uPlot.iife.min.js"), asset("axes.js"), planar.script(), f"const DATA={text};\n{_own('lab.js')}")
     hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in scripts)
     policy = (
         f"default-src 'none'; script-src {hashes} 'wasm-unsafe-eval'; worker-src blob:; style-src 'unsafe-inline'; "

@@ -38,6 +38,9 @@ function bands(chart, spec) {
   ctx.restore();
 }
 
+// Whether a run that a chart shows ended early.
+const ended = (spec) => DATA.controllers.some((c) => c.ended && (spec.only ? c.name === spec.only : shown.has(c.name)));
+
 // Times at which live settings changed, in the colour of their controller.
 function changes(chart, spec) {
   const { ctx, bbox } = chart;
@@ -99,8 +102,8 @@ function draw({ box, spec }) {
     series,
     // What was predicted before the run, between its two edges.
     bands: spec.band ? [{ series: spec.band, fill: "#0072b222" }] : [],
-    scales: { x: { time: false } },
-    axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, size: 62 }],
+    scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec)) } },
+    axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: { sync: { key: sync.key } },
     hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => changes(chart, spec)] },
   };

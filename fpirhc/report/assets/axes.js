@@ -1,0 +1,33 @@
+"use strict";
+// The axis of values of a chart: digits that tell its ticks apart, powers of ten where numbers are long, whatever the browser's language.
+function tickTexts(splits) {
+  const step = Math.abs(splits[1] - splits[0]), largest = Math.max(...splits.map(Math.abs));
+  if (!(step > 0) || !isFinite(largest)) return splits.map((v) => String(+v.toPrecision(3)));
+  let decimals = -Math.floor(Math.log10(step) + 1e-9);
+  if (Math.abs(+(step * 10 ** decimals).toFixed(6) % 1) > 1e-6) decimals += 1; // steps of 2.5
+  return splits.map((v) => {
+    if (Math.abs(v) < 1e-6 * step) return "0";
+    if (largest < 1e6 && largest >= 1e-3) return v.toFixed(Math.max(0, decimals));
+    const digits = Math.max(0, decimals + Math.floor(Math.log10(Math.abs(v)) + 1e-9));
+    return v.toExponential(Math.min(digits, 15)).replace("e+", "e");
+  });
+}
+const AXIS_OF_VALUES = {
+  values: (_, splits) => (splits.length > 1 ? tickTexts(splits) : splits.map((v) => String(+v.toPrecision(6)))),
+  size: (_, texts) => Math.max(62, 16 + 7.5 * Math.max(0, ...(texts ?? []).map((text) => (text ?? "").length))),
+};
+
+// The range of values of a chart: where a run that ended early is shown whole, what it reached at last does not hide the rest.
+const TALL = 20; // largest size that is shown, over the usual one
+function rangeOfValues(ended) {
+  return (chart, low, high) => {
+    if (low === null) return [0, 1];
+    const [times] = chart.data, { min, max } = chart.scales.x;
+    if (ended(chart) && min <= times[0] && max >= times[times.length - 1]) {
+      const sizes = chart.data.slice(1).flatMap((one, k) => (chart.series[k + 1].show ? one.filter((v) => v !== null).map(Math.abs) : []));
+      const most = TALL * sizes.sort((a, b) => a - b)[sizes.length >> 1];
+      if (most > 0) [low, high] = [Math.max(low, -most), Math.min(high, most)];
+    }
+    return uPlot.rangeNum(low, high, 0.1, true);
+  };
+}
