@@ -126,7 +126,7 @@ def measure_job(task: Task, job: Job) -> Measurement:
         if run.stop is not None:
             return Measurement(DIVERGED, run.stop, {})
         measured = measure(problem, run, task.metrics)
-        numbers: dict[str, Number] = {m.key(element): value for m, element, value in measured if m.compared != "not"}
+        numbers = _numbers(measured)
         for metric, value in numbers.items():
             if metric_of(metric, task.metrics).finite and isinstance(value, float) and not math.isfinite(value):
                 return Measurement(DIVERGED, f"{metric} is not finite", {})
@@ -134,6 +134,10 @@ def measure_job(task: Task, job: Job) -> Measurement:
     except FpirhcError as error:
         return Measurement(f"{REFUSED} ({type(error).__name__})", str(error), {})
     return Measurement(FINISHED, "", {**numbers, **plan}, measured.broken)
+
+
+def _numbers(measured: run_metrics.Metrics) -> dict[str, Number]:
+    return {m.key(element): value for m, element, value in measured if m.compared != "not"}
 
 
 def first_plan(task: Task, problem: Problem, controller: Controller) -> dict[str, Number]:

@@ -2,7 +2,7 @@
 
 A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}). The first line of its docstring is its title.
 It may also define
-- `headline`, a pair (controller without adaptation, controller with adaptation) for the verdict,
+- `headline`, a pair (controller without adaptation, the same one with it) for the verdict,
 - `cases`, a `Cases`: named cases for `fpirhc compare --cases`,
 - `headline_metric`, the name of the number by which controllers are compared and tuned, 'in_band' or 'rms_error.q1',
 - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
@@ -31,6 +31,7 @@ from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, Prob
 from fpirhc.fields.checked import Checked, FoundByName, checked_call, mistakes_of
 from fpirhc.fields.kinds import call_of, described
 from fpirhc.fields.user_code import explained
+from fpirhc.problem_files.pairs import not_a_pair
 from fpirhc.problem_files.settings import (
     TuningSpans,
     as_declared,
@@ -234,8 +235,11 @@ def _headline(module: ModuleType, controllers: Mapping[str, Controller], mistake
             f"{_line_of(module, 'headline')}headline must be a pair of names (without adaptation, with), got {described(headline)}"
         )
         return None
-    mistakes.unknown(f"{_line_of(module, 'headline')}headline: controller", headline, controllers)
-    return headline[0], headline[1]
+    pair, line = (headline[0], headline[1]), _line_of(module, "headline")
+    mistakes.unknown(f"{line}headline: controller", pair, controllers)
+    if mistakes.none and (wrong := not_a_pair(controllers, pair)):
+        mistakes.add(f"{line}{wrong}")
+    return pair
 
 
 def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, object], mistakes: Mistakes) -> None:

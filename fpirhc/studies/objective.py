@@ -117,13 +117,20 @@ class Objective:
         value = self.value(record)
         return min(value, self._penalty) if math.isfinite(value) else float(self._penalty * (2 - record["lasted"]))
 
+    def check(self, controller: str, numbers: Mapping[str, object]) -> None:
+        """Raise unless the metric's numbers of a run that finished have this one, be it NaN."""
+        if self.metric is not None and self.element not in numbers:
+            names = [self.metric.key(element) for element in numbers]
+            lacking = (
+                nearest(self.name, names) if names else " 'fpirhc run' shows the numbers that it has, and what raised."
+            )
+            raise InvalidName(f"metric '{self.name}': a run of '{controller}' has none.{lacking}")
+
     def _number(self, record: Mapping[str, Any]) -> float | None:
         assert self.metric is not None
         numbers = record["metrics"].get(self.metric.name, {})
-        if self.element not in numbers and record["outcome"] == "finished":
-            names = [self.metric.key(element) for element in numbers]
-            lacking = nearest(self.name, names) if names else " Where its function raises, 'fpirhc run' says why."
-            raise InvalidName(f"metric '{self.name}': a run of '{record['controller']}' has none.{lacking}")
+        if record["outcome"] == "finished":
+            self.check(record["controller"], numbers)
         value = None if record["outcome"] == "ended early" else numbers.get(self.element)
         return None if value is None else value * self._sign
 
@@ -141,6 +148,10 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> 
         if metric.by is not None and not element:
             raise InvalidValue(
                 f"metric '{metric.name}' has a number for every {metric.by}; give one: '{metric.name}.NAME'"
+            )
+        if metric.by == "term" and (problem.cost is None or problem.horizon is None):
+            raise InvalidValue(
+                f"metric '{name}' needs Problem(horizon=..., cost=...), and this problem lacks one of them"
             )
         elements = _elements(metric, problem)
         if elements and element not in elements:

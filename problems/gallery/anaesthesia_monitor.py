@@ -109,7 +109,7 @@ controllers = {
     "cascade, slow low-pass": replace(cascade, deformation=fp.Filtered(map_, pole=0.92)),
     "cascade, Haar": replace(cascade, deformation=fp.Haar(map_, noise=0.34, levels=3)),  # mg/l of a bis of 3 at 50
 }
-headline = ("cascade, no filter", "cascade, Haar")
+headline = ("pump alone", "cascade, Haar")
 cases = people.cases
 metrics = people.metrics
 headline_metric, pictures = "in_band", people.pictures

@@ -38,5 +38,5 @@ controllers = {
         plan, fp.DisturbanceKalman(drift={"Gp": 0.05}, measured={"sensor": 2.0}, noise={"gut": 1000.0, "Gp": 0.3})
     ),
 }
-headline = ("RHC", "RHC offset-free")
+headline = ("RHC", "RHC+FPI, model-referenced")
 cases, metrics, headline_metric, pictures = silent.cases, silent.metrics, silent.headline_metric, silent.pictures

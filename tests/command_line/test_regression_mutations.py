@@ -141,8 +141,8 @@ def result(change):
     def fault(folder, patch):
         ordinary = measuring._numbers
 
-        def spoilt(problem, controller, run):
-            numbers = ordinary(problem, controller, run)
+        def spoilt(measured):
+            numbers = ordinary(measured)
             change(numbers)
             return numbers
 

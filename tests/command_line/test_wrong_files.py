@@ -286,6 +286,12 @@ OTHERS = {
         "'MPC' is unknown",
         "'RHC+FPi' is unknown. Did you mean 'RHC+FPI'?",
     ),
+    "headline of no pair": one(
+        PENDULUM,
+        "controllers = {",
+        'headline = ("RHC+FPI", "RHC")\ncontrollers = {',
+        "headline ('RHC+FPI', 'RHC') is no pair: expected a controller and the same one with adaptation; write ('RHC', 'RHC+FPI')",
+    ),
     "mistakes all over the file": Wrong(
         PENDULUM,
         (

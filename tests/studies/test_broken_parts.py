@@ -11,6 +11,7 @@ import pytest
 import tasks
 
 import fpirhc as fp
+from fpirhc.errors import InvalidName
 from fpirhc.review import review as reviewing
 from fpirhc.review.question import Verdict, known_questions
 from fpirhc.review.questions.gain import GAIN
@@ -68,6 +69,11 @@ def test_a_part_of_a_comparison_that_breaks_loses_no_run(part, name, monkeypatch
     assert [e.run.cycles for e in result.entries] == [50, 50]
     assert all(e.metrics.rms_error["q1"] > 0 for e in result.entries)
     assert any(note.startswith(f"{name} could not be computed (LinAlgError") for note in result.entries[1].notes)
+
+
+def test_a_figure_that_no_run_has_is_refused():
+    with pytest.raises(InvalidName, match=r"metric 'plans\.done': a run of 'CTC\+FPI \(eq 6\)' has none"):
+        fp.compare(task(metrics=[fp.Metric("plans.done", lambda problem, run: None)]), headline="plans.done", seed=0)
 
 
 def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):

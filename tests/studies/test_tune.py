@@ -163,6 +163,7 @@ def test_any_metric_with_a_direction_may_be_tuned_by(task, tmp_path):
         ("max_error", InvalidValue, "a number for every coordinate"),
         ("effort.u", InvalidValue, "no better direction"),
         ("max_error.z", InvalidName, "Did you mean 'max_error.y'"),
+        ("cost.total", InvalidValue, r"'cost\.total' needs Problem\(horizon=\.\.\., cost="),
     ],
 )
 def test_a_wrong_metric_is_refused(metric, error, message, task, tmp_path):

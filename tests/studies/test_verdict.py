@@ -15,12 +15,13 @@ from plants import linear, sine_of_three
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
+from fpirhc.problem_files.pairs import pair_of
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset, css_class
 from fpirhc.report.terminal import STYLES
 from fpirhc.simulation.metrics import Metrics, known_metrics
 from fpirhc.studies.comparison.changes import Finding, Outcome
-from fpirhc.studies.comparison.compare import _pair, compare
+from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.entry import Entry
 from fpirhc.studies.comparison.pairwise import partners
 from fpirhc.studies.comparison.timing import CycleTime, Price, measure_price, price_of
@@ -265,7 +266,7 @@ def test_a_pair_has_the_same_formulas_where_several_controllers_have_the_same_se
 
     heavy, light = (fp.RecedingHorizon(planner.optimiser, cost=weighed(w)) for w in (1e4, 1e2))
     controllers = {"heavy": heavy, "light": light, "light+FPI": replace(light, deformation=fp.Affine(-1.0))}
-    assert _pair(controllers, "light+FPI") == "light"
+    assert pair_of(controllers, "light+FPI") == "light"
 
 
 # One outcome decides words and colours, in comparisons and in studies of scenarios

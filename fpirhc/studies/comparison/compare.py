@@ -14,14 +14,14 @@ import numpy as np
 from fpirhc.contraction.spectrum import assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import resolved, without_deformation
+from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import automatic, innermost
-from fpirhc.describe import describe, identity
-from fpirhc.errors import FpirhcError, Mistakes, NotContractive, NotSupported
+from fpirhc.errors import FpirhcError, Mistakes, NotContractive
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.optimisers.base import FEASIBLE
 from fpirhc.plant.motion import with_space
+from fpirhc.problem_files.pairs import pair_of, same_as
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.questions.gain import recommended_for
 from fpirhc.review.response_prediction import Prediction, predict_response
@@ -48,7 +48,7 @@ from fpirhc.studies.comparison.pairwise import (
 )
 from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
-from fpirhc.studies.objective import objective
+from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.view import Progress, circumstances
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
@@ -105,6 +105,7 @@ def compare(
     check_gains(task, selected)
     built: dict[str, Built] = {}
     ran, skipped = _entries(task, selected, seed, compiled, progress, built, changes or {})
+    _check_figure(figure, ran)
     sizes = scales(task.problem)
     found, unjudged = partners(task.problem, ran, selected, seed=seed, compiled=compiled, metrics=task.metrics)
     alone = [entry for entry, _ in found.values()]
@@ -152,6 +153,17 @@ def _advised(task: Task, entries: Sequence[Entry], first: Finding, nulls: Sequen
     advice = recommended_for(task.problem, task.controllers[first.pair[1]])
     more = () if advice is None else (f"its gain: {advice.text}",)
     return [replace(e, notes=(*e.notes, *more)) if e.name == first.pair[1] else e for e in entries]
+
+
+def _check_figure(figure: Objective, entries: Sequence[Entry]) -> None:
+    """Raise where runs finished and none has the figure, unless its function raised, which the notes tell."""
+    metric, finished = figure.metric, [e for e in entries if e.run.stop is None]
+    if metric is None or any(
+        figure.element in e.metrics[metric.name] or metric.name in e.metrics.broken for e in finished
+    ):
+        return
+    for entry in finished[-1:]:
+        figure.check(entry.name, entry.metrics[metric.name])
 
 
 def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
@@ -235,7 +247,7 @@ def _entry(
         metrics=metrics,
         cycle=cycle,
         adaptive=adaptive,
-        pair=_pair(controllers, name) if adaptive else None,
+        pair=pair_of(controllers, name) if adaptive else None,
         contraction=contraction,
         optimality=optimality,
         notes=(
@@ -252,7 +264,7 @@ def _entry(
         weighed=weighed(problem, ready),
         exact=has_exact_model(problem, ready),
         learns=ready.learns,
-        fixed=_same(controller.inner, controllers) if ready.learns and controller.inner is not None else None,
+        fixed=same_as(controller.inner, controllers) if ready.learns and controller.inner is not None else None,
         plan_every=every,
         information=informed,
         automatic=automatic(controller.deformation),
@@ -271,24 +283,6 @@ def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Pred
         return predict_response(problem, controller, compiled=compiled)
     except FpirhcError:
         return None
-
-
-def _pair(controllers: Mapping[str, Controller], name: str) -> str | None:
-    """The controller with the same settings and no adaptation."""
-    try:
-        wanted = without_deformation(controllers[name])
-    except NotSupported:
-        return None
-    return _same(wanted, {n: c for n, c in controllers.items() if not c.deformation.adapts})
-
-
-def _same(wanted: Controller, controllers: Mapping[str, Controller]) -> str | None:
-    """The controller with these settings; where several have them, the one whose formulas are the same too."""
-    for said in (identity, describe):
-        for name, one in controllers.items():
-            if said(one) == said(wanted):
-                return name
-    return None
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
