@@ -35,7 +35,12 @@ def describe(value: Any) -> Any:
         return value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    return getattr(value, "__name__", type(value).__name__)
+    name = getattr(value, "__name__", None)
+    return type(value).__name__ if name is None else name if isinstance(value, type) else FunctionName(name)
+
+
+class FunctionName(str):
+    """What `describe` has of a function: its numbers count, and not what it is called."""
 
 
 def identity(value: Any) -> tuple[str, tuple[object, ...]]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from fpirhc.baselines.measuring import FINISHED, NOMINAL, Measurement, Number, Variant, metric_of
-from fpirhc.describe import describe
+from fpirhc.describe import FunctionName, describe
 from fpirhc.errors import BaselineError, OutputError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.shipped import missing
@@ -122,12 +122,17 @@ def fingerprint(value: Any) -> str:
     return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
 
 
-def differences(where: str, before: Flat, now: Flat) -> list[str]:
-    """Return a sentence for every setting that differs: 'where: name was ..., is ...'."""
+def differences(where: str, before: Flat, now: Flat, *, names: bool = True) -> list[str]:
+    """Return a sentence for every setting that differs: 'where: name was ..., is ...'.
+
+    `names`: whether another name of a function is a difference.
+    """
     missing = object()
     sentences = []
     for name in sorted({*before, *now}):
         old, new = before.get(name, missing), now.get(name, missing)
+        if not names and isinstance(new, FunctionName) and isinstance(old, str):
+            continue
         if fingerprint(None if old is missing else [_by_value(old)]) != fingerprint(
             None if new is missing else [_by_value(new)]
         ):

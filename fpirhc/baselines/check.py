@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -24,6 +24,7 @@ from fpirhc.baselines.baseline import (
     Settings,
     baseline_path,
     check_inside,
+    differences,
     expected,
     fingerprint,
     settings_hash,
@@ -34,6 +35,7 @@ from fpirhc.baselines.judging import Judgement, judge
 from fpirhc.baselines.measuring import (
     FINISHED,
     REFUSED,
+    SEEDS,
     SOURCES,
     Job,
     measure_all,
@@ -51,6 +53,7 @@ from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.view import Progress, versions
 from fpirhc.whole_file import write_whole
 
+_SEEDS = 8  # of bands, where there is noise
 _LARGEST = 20_000_000  # bytes; a baseline has some tens of thousands
 
 
@@ -260,7 +263,7 @@ def measure_expected(
     controllers: Sequence[str],
     *,
     seed: Seed = 0,
-    seeds: int = 8,
+    seeds: int = _SEEDS,
     compiled: bool = True,
     processes: Few = 1,
     progress: Progress | None = None,
@@ -283,7 +286,7 @@ def compose_baseline(
     reason: str,
     *,
     seed: Seed = 0,
-    seeds: int = 8,
+    seeds: int = _SEEDS,
     compiled: bool = True,
 ) -> Baseline:
     """Return the baseline of the controllers that were measured."""
@@ -335,7 +338,7 @@ def accept(
     reason: str,
     *,
     seed: Seed = 0,
-    seeds: Annotated[int, Range("a whole number of at least 2 (8 is usual)", low=2)] = 8,
+    seeds: Annotated[int, Range("a whole number of at least 2 (8 is usual)", low=2)] = _SEEDS,
     baselines: Path | None = None,
     compiled: bool = True,
     processes: Few = 1,
@@ -364,30 +367,46 @@ def accept(
     return baseline, write_baseline(task, baseline, baselines, project)
 
 
-def write_merged(problem: Path, parts: Sequence[str], working: Path) -> Path:
-    """Write the baseline of all parts, with those controllers of the earlier file that no part has.
+def seeds_of(task: Task) -> tuple[int, int]:
+    """Return seed and number of seeds of the baseline beside a problem file; without one, those of a new baseline."""
+    try:
+        earlier = read_baseline(baseline_path(task.path))
+    except BaselineError:
+        return 0, _SEEDS
+    drawn = len(earlier.varied.get(SEEDS, ()))
+    return earlier.seed, drawn + 1 if drawn else _SEEDS
+
+
+def write_merged(task: Task, parts: Sequence[str], working: Path) -> Path:
+    """Write the baseline of all parts, with those of the task's controllers in the earlier file that no part has.
 
     `working`: a folder of the project, outside of which nothing is written.
     """
-    path = baseline_path(problem)
+    path = baseline_path(task.path)
     check_inside(path, working)
     merged = read_text(parts[0], path)
     for text in parts[1:]:
         merged = _joined(merged, read_text(text, path))
     if path.exists():
-        earlier = read_baseline(path)
-        _check_mergeable(earlier, merged)
+        earlier = _without(read_baseline(path), task.controllers)
+        _check_mergeable(earlier, settings_of(task), merged)
         merged = _joined(earlier, merged)
     _write(merged, path)
     return path
 
 
-def _check_mergeable(before: Baseline, merged: Baseline) -> None:
+def _without(baseline: Baseline, controllers: Collection[str]) -> Baseline:
+    """The baseline without controllers that the problem file no longer has."""
+    gone = set(baseline.controllers) - set(controllers)
+    left = {name: one for name, one in baseline.controllers.items() if name not in gone}
+    return replace(baseline, settings=baseline.settings.without(gone), controllers=left)
+
+
+def _check_mergeable(before: Baseline, now: Settings, merged: Baseline) -> None:
     """Raise if controllers of the earlier baseline were not measured, although problem or seed changed."""
     others = [name for name in before.controllers if name not in merged.controllers]
-    if others and (
-        fingerprint(before.settings.problem) != fingerprint(merged.settings.problem) or before.seed != merged.seed
-    ):
+    changed = differences("", before.settings.problem, now.problem, names=False)
+    if others and (changed or before.seed != merged.seed):
         raise BaselineError(
             f"problem '{before.problem}' changed, and {', '.join(others)} were not measured; its baseline is left as it "
             "is: run the tests of all its controllers, or fpirhc accept"

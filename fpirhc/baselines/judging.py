@@ -105,7 +105,8 @@ def judge(
     rows: list[Row] = []
     for name in names:
         rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
-    causes = _stale(baseline, settings, list(fresh))
+    # A function of another name makes the baseline stale where numbers changed: else it has been renamed.
+    causes = _stale(baseline, settings, list(fresh), names=not all(row.holds for row in rows))
     notes = [f"{name}: {why}" for name, one in fresh.items() for why in (one.why, *one.broken.values()) if why]
     return Judgement(
         baseline.problem,
@@ -131,12 +132,13 @@ def ignoring(judgement: Judgement, share: float) -> Judgement:
     return replace(judgement, rows=rows, notes=(*judgement.notes, note))
 
 
-def _stale(baseline: Baseline, settings: Settings, names: Sequence[str]) -> tuple[Cause, ...]:
-    causes = [Cause("", text) for text in differences("problem", baseline.settings.problem, settings.problem)]
-    for name in names:
+def _stale(baseline: Baseline, settings: Settings, controllers: Sequence[str], *, names: bool) -> tuple[Cause, ...]:
+    texts = differences("problem", baseline.settings.problem, settings.problem, names=names)
+    causes = [Cause("", text) for text in texts]
+    for name in controllers:
         before = baseline.settings.controllers.get(name)
         if before is not None:
-            texts = differences(f"controller '{name}'", before, settings.controllers[name])
+            texts = differences(f"controller '{name}'", before, settings.controllers[name], names=names)
             causes += [Cause(name, text) for text in texts]
     return tuple(causes)
 

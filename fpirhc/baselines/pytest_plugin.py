@@ -71,13 +71,14 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
 
 
 def _measure(config: pytest.Config, task: Any, names: list[str] | None, compiled: bool) -> None:
-    """Measure, and store the result as text for the process that writes."""
+    """Measure with the seeds of the earlier baseline, and store the result as text for the process that writes."""
     from fpirhc.baselines.baseline import to_text
-    from fpirhc.baselines.check import compose_baseline, measure_expected
+    from fpirhc.baselines.check import compose_baseline, measure_expected, seeds_of
     from fpirhc.studies.comparison.compare import select
 
-    expectations = measure_expected(task, list(select(task, names)), compiled=compiled)
-    baseline = compose_baseline(task, expectations, config.getoption("--fpirhc-accept"), compiled=compiled)
+    (seed, seeds), reason = seeds_of(task), config.getoption("--fpirhc-accept")
+    expectations = measure_expected(task, list(select(task, names)), seed=seed, seeds=seeds, compiled=compiled)
+    baseline = compose_baseline(task, expectations, reason, seed=seed, seeds=seeds, compiled=compiled)
     config.stash[_measured].append((str(task.path.resolve()), to_text(baseline)))
 
 
@@ -100,13 +101,14 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         return
     from fpirhc.baselines.check import write_merged
     from fpirhc.errors import FpirhcError
+    from fpirhc.problem_files.problem_file import load_problem
 
     texts: dict[str, list[str]] = {}
     for path, text in sorted(measured):
         texts.setdefault(path, []).append(text)
     for path, parts in texts.items():
         try:
-            written = write_merged(Path(path), parts, config.rootpath)
+            written = write_merged(load_problem(path), parts, config.rootpath)
             config.stash[_messages].append(f"wrote {written}")
         except FpirhcError as error:
             config.stash[_messages].append(str(error))

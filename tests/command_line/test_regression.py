@@ -479,12 +479,26 @@ def test_pytest_plugin(pytester, blessed):
     assert second.controllers["CTC"] != first.controllers["CTC"]
     assert second.controllers["RHC+FPI"] == first.controllers["RHC+FPI"]
     run().assert_outcomes(passed=3)
+    # A function of another name has the same numbers; a renamed controller takes the place of the old one, with the old seed.
+    path.write_text(
+        LINE.replace(
+            "plant =", "def rhs(q, v, u, p):\n    return {'y': p.b * u.u - p.k * q.y}\n\n\nplant =", 1
+        ).replace('lambda q, v, u, p: {"y": p.b * u.u - p.k * q.y}', "rhs")
+    )
+    file.write_text(to_text(replace(first, seed=3)))
+    run().assert_outcomes(passed=3)
+    path.write_text(path.read_text().replace('"CTC":', '"slow":'))
+    pytester.makepyfile(test_line=TEST.replace('"CTC",', '"slow",'))
+    run("--fpirhc-accept", "renamed", "-k", "slow").assert_outcomes(passed=1, deselected=2)
+    renamed = read_baseline(file)
+    assert (list(renamed.controllers), renamed.seed) == (["CTC+FPI", "RHC+FPI", "slow"], 3)
+    pytester.makepyfile(test_line=TEST)
     # A changed problem cannot be blessed for one of its controllers alone.
     path.write_text(LINE.replace("period=1e-3", "period=2e-3"))
     refused = run("--fpirhc-accept", "slower", "-k", "line and not FPI")
     assert refused.ret == pytest.ExitCode.TESTS_FAILED
     refused.stdout.fnmatch_lines(["*were not measured; its baseline is left as it is*"])
-    assert read_baseline(file) == second
+    assert read_baseline(file) == renamed
 
 
 def test_pytest_plugin_wants_a_reason(pytester):
