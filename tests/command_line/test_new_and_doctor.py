@@ -67,6 +67,18 @@ def test_new_does_not_follow_a_link(folder):
     assert not (folder / "elsewhere.py").exists()
 
 
+def test_new_in_another_project_goes_there_first(folder, capsys, monkeypatch):
+    """A baseline of another project is not accepted from here."""
+    monkeypatch.setattr("fpirhc.scaffold.first_baseline", lambda problem: problem)
+    (folder / "here").mkdir()
+    monkeypatch.chdir(folder / "here")
+    assert main(["new", "arm", "--dir", "../there"]) == 0
+    assert capsys.readouterr().out.partition("next:\n")[2].splitlines()[:2] == [
+        "  cd ../there",
+        "  fpirhc compare arm.py",
+    ]
+
+
 def test_new_into_a_file(folder, capsys):
     """A folder that cannot be made: exit code 3 and what to do."""
     (folder / "taken").write_text("")

@@ -17,6 +17,8 @@ def _add(parser: argparse.ArgumentParser) -> None:
 def _run(options: argparse.Namespace) -> ExitCode:
     import shlex
 
+    from fpirhc.baselines.baseline import check_inside
+    from fpirhc.errors import OutputError
     from fpirhc.scaffold import create_problem, first_baseline
 
     problem, test = create_problem(options.name, Path(options.dir))
@@ -24,6 +26,11 @@ def _run(options: argparse.Namespace) -> ExitCode:
     print("measuring the baseline: every controller, with several seeds and ways of computing", flush=True)
     print(f"wrote {first_baseline(problem)}")
     print("next:")
+    try:
+        check_inside(problem, Path())
+    except OutputError:  # of another project than that of this folder, from which nothing is accepted there
+        print(f"  {shlex.join(['cd', str(problem.parent)])}")
+        problem, test = Path(problem.name), Path(test.name)
     print(f"  {shlex.join(['fpirhc', 'compare', str(problem)])}")
     print(f"  {shlex.join(['python', '-m', 'pytest', str(test)])}")
     print(f"  {shlex.join(['fpirhc', 'accept', str(problem), '--reason', '...'])}      when new numbers are right")
