@@ -171,7 +171,7 @@ def test_what_the_zero_dynamics_do_is_not_the_gains(grid, monkeypatch):
     case: Any = SimpleNamespace(grid=grid, controller=None, loops=loops(0.5))
     assert box_converges(case).change == convergence(grid, loops(1.0)).change == theirs
     assert convergence(grid, loops(0.9, 1.25, ideal=1.25)).change == theirs
-    assert convergence(grid, loops(math.exp(-0.5 * EDGE), ideal=0.999)).change == OWN
+    assert convergence(grid, loops(math.exp(-0.5 * EDGE), ideal=0.999)).change.startswith("It converges as slowly")
 
 
 @pytest.mark.parametrize(
@@ -520,7 +520,7 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
     assert one.verdict == verdict
     assert one.evidence == f"the request changes by up to 14 per s, the map by {ratio * 14:.3g}"
     assert one.numbers == {"needed": pytest.approx(14.0, rel=1e-3), "limit": pytest.approx(ratio * 14.0), "jump": 0.0}
-    change = f"Raise the map's scale at least {2 / ratio:.2g} times, or leave it out to have it chosen."
+    change = f"Raise the map's scale at least {2 / ratio:.2g} times."
     assert one.change == ("" if verdict == "yes" else change)
 
 

@@ -109,7 +109,7 @@ def test_the_basin_grows_with_the_step_of_the_map_and_four_times_the_error_is_wa
         one = asked(ratio * error / basin)
         assert one.verdict == verdict
         assert one.numbers["basin"] == pytest.approx(ratio * error, rel=1e-6)
-        told = f"Raise the map's scale at least {4 / ratio:.2g} times, or leave it out to have it chosen."
+        told = f"Raise the map's scale at least {4 / ratio:.2g} times."
         assert one.change == ("" if verdict == "yes" else told)
         assert ("times are wanted" in one.evidence) == (verdict != "yes")
     assert answer(moving(), fp.Affine(gain=-0.5), "come back") is None

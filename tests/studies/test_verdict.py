@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -291,7 +292,7 @@ def summary(name: str, interval: tuple[float, float] | None) -> Summary:
         "first_ended": None,
         "scenarios": np.arange(5),
     }
-    counts: dict[str, Any] = {"count": 5, "outcomes": {"finished": 5}, "statuses": {}, "better": 2, "equal": 0}
+    counts: dict[str, Any] = {"count": 6, "outcomes": {"finished": 6}, "statuses": {}, "better": 2, "equal": 0}
     metrics: dict[str, Any] = {"metrics": {"rms_error": {}}, "worst_metrics": {}}
     return Summary(name=name, difference=difference, ratio=1.0, **figures, **places, **counts, **metrics)
 
@@ -310,6 +311,17 @@ def test_a_summary_is_what_its_interval_leaves_no_doubt_of(interval, outcome, wo
     assert baseline.outcome is None
     assert rival.outcome is outcome
     assert words in verdict([baseline, rival], {})[0]
+
+
+def test_five_scenarios_have_no_interval_and_runs_that_all_ended_no_difference():
+    """All of five smaller is chance in one of 16 samples; of nothing there is no median."""
+    few = replace(summary("RHC+FPI", (-0.2, -0.1)), count=5)
+    assert few.outcome is Outcome.NO_DIFFERENCE
+    [told, *_] = verdict([replace(summary("RHC", None), count=5), few], {})
+    assert told.startswith("RHC+FPI and RHC have too few scenarios for an interval (median difference")
+    lost = replace(summary("RHC+FPI", (0.0, 0.0)), median=math.inf, equal=6)
+    [told, *_] = verdict([summary("RHC", None), lost], {})
+    assert told == "RHC+FPI and RHC cannot be compared: neither has a finite error in any of the scenarios."
 
 
 def test_green_is_for_better_alone():

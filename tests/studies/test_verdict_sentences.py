@@ -38,7 +38,10 @@ def entry(name: str, pair: str | None = None, *, micro: float | None = 5.0, erro
     values += [
         np.asarray(changes.get(n, np.arange(CYCLES) % 2), dtype=float)[:, None] for n in ("command", "reference")
     ]
-    signals, values = [*signals, Signal("true_error", ("y", "z"), ("m", "rad"))], [*values, values[0]]
+    signals, values = (
+        [*signals, Signal("true_error", ("y", "z"), ("m", "rad"))],
+        [*values, np.asarray(changes.get("true_error", values[0]))],
+    )
     if changes.get("planning"):
         signals, values = [*signals, Signal("solve", SOLVE)], [*values, np.zeros((CYCLES, len(SOLVE)))]
     log = np.hstack(values)[: changes.get("cycles", CYCLES)]
@@ -83,7 +86,9 @@ def test_who_finishes():
     """The adaptive run ended, the plain one, or both: the adaptive one is told first."""
     assert said(entry("RHC"), entry("FPI", "RHC", stop=STOP)) == (f"FPI does not finish: {STOP}.",)
     assert said(entry("RHC", stop=STOP), entry("FPI", "RHC")) == (f"FPI finishes where RHC does not ({STOP}).",)
-    assert said(entry("RHC", stop="b"), entry("FPI", "RHC", stop="a")) == ("FPI does not finish: a, nor does RHC (b).",)
+    assert said(entry("RHC", stop="b"), entry("FPI", "RHC", stop="a")) == (
+        "Neither FPI nor RHC finishes. FPI: a. RHC: b.",
+    )
     outcomes = [
         first(entry("RHC", stop=a), entry("FPI", "RHC", stop=b)).outcome
         for a, b in ((None, "b"), ("a", None), ("a", "b"))
@@ -573,6 +578,17 @@ def test_plans_that_did_not_converge_are_a_cause_from_a_twentieth_of_the_cycles_
     assert no_difference(measured=swinging).startswith(" Its command stands at a limit in 40 % of the cycles")
 
 
+def test_errors_of_the_start_hide_no_difference_at_the_end():
+    """Where the last quarters differ and both are small beside the whole, the start is what was compared."""
+    begin = np.array([[8.0, 0.0]]) * (np.arange(CYCLES) < CYCLES // 2)[:, None]
+    ends = {name: begin + np.array([size, 0.0]) for name, size in (("RHC", 1.0), ("FPI", 0.01))}
+    pair = entry("RHC", true_error=ends["RHC"]), entry("FPI", "RHC", true_error=ends["FPI"])
+    assert first(*pair).text.endswith(
+        "Most of this error is that of the start; in the last quarter of the run it is 1 and 0.01 m: state measure_from."
+    )
+    assert "start" not in first(pair[0], entry("FPI", "RHC", true_error=ends["RHC"])).text
+
+
 def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
     def with_limits(share: float, before: float = 0.0, **both: Any) -> str:
         plain = entry("RHC", measured={"at_limit": {"": before}}, **both)
@@ -588,6 +604,14 @@ def test_commands_at_their_limits_are_a_cause_from_a_fifth_of_the_cycles_on():
     )
     assert with_limits(0.9, 0.5, reference=np.arange(CYCLES) / CYCLES) == (
         f"{head}50 %): both swing to and fro where the reference does not. Mend the loop without adaptation first; see its review."
+    )
+    assert with_limits(0.9, math.nan).startswith(
+        " Its command stands at a limit in 90 % of the cycles, where"
+    )  # it ended
+    falling = np.concatenate([np.full(CYCLES // 2, 10.0), np.linspace(9.0, 8.0, CYCLES - CYCLES // 2)])
+    assert with_limits(0.5, 0.4, command=falling) == (
+        " Its command stands at a limit in 50 % of the cycles (that of RHC in 40 %), while it comes from its start: state "
+        "measure_from, from which errors count."
     )
     alone = entry("RHC", measured={"at_limit": {"": 0.5}}, reference=np.arange(CYCLES) / CYCLES)
     ramp = {"reference": np.arange(CYCLES) / CYCLES, "command": np.arange(CYCLES)}

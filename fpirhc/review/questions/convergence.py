@@ -263,6 +263,8 @@ def box_converges(case: Case) -> Answer:
 def _slow(grid: ReviewGrid, controller: Controller, loops: Loops, worst: float) -> str:
     """What is quicker, where it converges at every point and is slow beside the loop with the right model; else nothing."""
     ideal = loops.ideal.radius if loops.ideal is not None else 1.0
+    if worst <= ideal < 1:
+        return "It converges as slowly as with the right model: the loop is slow without adaptation, not the iteration."
     if not ideal < worst < 1:
         return ""
     time = duration(_SURE / -math.log(worst) * grid.problem.period, grid.problem)

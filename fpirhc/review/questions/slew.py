@@ -56,7 +56,7 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
         cycles = math.ceil(sudden / step)
         text += f"; a jump of a disturbance takes the map {cycles} cycle{'s' * (cycles > 1)}"
     ratio = step / problem.period / max(needed, 1e-300)
-    change = f"Raise the map's scale at least {SPARE / ratio:.2g} times, or leave it out to have it chosen."
+    change = f"Raise the map's scale at least {SPARE / ratio:.2g} times."
     return Answer(SLEW, graded(ratio, SPARE), text, change, numbers)
 
 
@@ -160,7 +160,7 @@ def comes_back(case: Case) -> Answer | None:
     numbers = {"error": error, "basin": basin}
     unsure = ratio > _LASTING or not deformation.iteration.constant
     verdict = Verdict.YES if ratio >= _WANTED else Verdict.CAUTION if unsure else Verdict.NO
-    change = f"Raise the map's scale at least {_WANTED / ratio:.2g} times, or leave it out to have it chosen."
+    change = f"Raise the map's scale at least {_WANTED / ratio:.2g} times."
     return Answer(BASIN, verdict, text, change, numbers)
 
 

@@ -8,7 +8,7 @@ is then doubtful: the plant left alone does better, the reference is not followe
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -178,7 +178,9 @@ def _unit(entry: Entry, name: str) -> str:
 MANY_CYCLES = 3  # of a run from which the slew of its desired response is judged
 _MORE = 2.0  # times the pair's movement of the command, from which it is stated
 _CHATTER = 10.0  # times, from which it is a reason
-_STILL = 1e-9  # of the rms command per unit of time: what moves less stands still
+_STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
+_AT_FIRST = 0.9  # of the cycles at a limit, and of the largest error, from which a run comes from its start
+_APART = 2.0  # times, from which errors of two runs at their ends clearly differ, and the start counts for most
 _SWINGS = 4.0  # times the turns of the reference, from which a command oscillates by itself
 _OFTEN = 0.2  # share of the cycles from which commands at their limits are a reason
 
@@ -282,7 +284,10 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
     before, after = (_share(e, "at_limit", "") for e in (plain, adaptive))
     if not after >= _OFTEN:  # nor where the run ends before the first cycle that counts
         return ""
-    fact = f"Its command stands at a limit in {in_percent(after)} of the cycles (that of {plain.name} in {in_percent(before)})"
+    beside = f" (that of {plain.name} in {in_percent(before)})" if math.isfinite(before) else ""
+    fact = f"Its command stands at a limit in {in_percent(after)} of the cycles{beside}"
+    if _comes_from_its_start(adaptive, after):
+        return f"{fact}, while it comes from its start: state measure_from, from which errors count."
     if before >= _OFTEN and not np.ptp(adaptive.run["reference"], axis=0).any():
         return (
             f"{fact}, where no adaptation can act: disturbances and noise ask for more than the limits allow, or the loop swings "
@@ -295,6 +300,32 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
     if before >= _OFTEN:
         return f"{fact}, where no adaptation can act: slow the reference down or ask for less, or widen limits that are a choice."
     return f"{fact}, where no adaptation can act: it asks for too much, or oscillates; the command in the report shows which."
+
+
+def _comes_from_its_start(entry: Entry, share: float) -> bool:
+    """Whether a command stands at one limit from the first cycle on and at none later, and the first error is the largest."""
+    command, errors = entry.run["command"], np.abs(entry.run["true_error"])
+    first = command[: max(2, int(_AT_FIRST * share * len(command)))]
+    stands = (np.ptp(first, axis=0) == 0) & ((first[0] == command.max(axis=0)) | (first[0] == command.min(axis=0)))
+    return bool(stands.any() and (errors[0] >= _AT_FIRST * errors.max(axis=0)).any() and np.ptp(command, axis=0).any())
+
+
+def start_counts(plain: Entry, adaptive: Entry, names: Sequence[str]) -> str:
+    """Return a sentence where errors are those of the start, and differ clearly at the end of the run; else nothing."""
+    if not names or plain.run.stop is not None or adaptive.run.stop is not None:
+        return ""
+    last = max(1, adaptive.run.cycles // _QUARTERS)
+    ends = [[_rms(entry.run[f"true_error.{n}"][-last:]) for n in names] for entry in (plain, adaptive)]
+    whole = [[_rms(entry.run[f"true_error.{n}"]) for n in names] for entry in (plain, adaptive)]
+    differ = [k for k in range(len(names)) if max(e[k] for e in ends) > _APART * min(e[k] for e in ends)]
+    if not differ or any(w[k] <= _APART * e[k] for w, e in zip(whole, ends, strict=True) for k in differ):
+        return ""
+    told = ", ".join(f"{ends[0][k]:.3g} and {ends[1][k]:.3g}{_unit(adaptive, names[k])}" for k in differ)
+    return f"Most of this error is that of the start; in the last quarter of the run it is {told}: state measure_from."
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _swings(entry: Entry) -> bool:

@@ -25,6 +25,7 @@ from fpirhc.studies.comparison.causes import (
     left_alone_is_better,
     movement,
     not_followed,
+    start_counts,
     stuck_cause,
 )
 from fpirhc.studies.comparison.changes import HELPS, HURTS, ROUNDING, Change, Finding, Outcome, major, outcome_of, times
@@ -126,14 +127,8 @@ def _told_of_partner(finding: Finding, apart: bool) -> Finding:
 def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     """Return what adaptation does to one pair."""
     pair = (plain.name, adaptive.name)
-    if adaptive.run.stop is not None:
-        also = f", nor does {plain.name} ({plain.run.stop})" if plain.run.stop is not None else ""
-        text = f"{adaptive.name} does not finish: {adaptive.run.stop}{also}.{causes(plain, adaptive)}"
-        return Finding(text, Outcome.NOT_COMPARABLE if also else Outcome.WORSE, pair)
-    if plain.run.stop is not None:
-        return Finding(
-            f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop}).", Outcome.BETTER, pair
-        )
+    if plain.run.stop is not None or adaptive.run.stop is not None:
+        return _of_ends(plain, adaptive)
     changes = _changes(plain, adaptive, yardstick.scales)
     lost = [c.name for c in changes.values() if not math.isfinite(c.before + c.after)]
     if lost or not changes:
@@ -154,13 +149,27 @@ def judge(plain: Entry, adaptive: Entry, yardstick: Yardstick) -> Finding:
     text = _effect(plain, adaptive, list(counted.values()), outcome) + beside
     if outcome is not Outcome.BETTER:
         worse = left_alone_is_better(plain, adaptive, list(counted), yardstick)
-        why = causes(plain, adaptive)
+        start = start_counts(plain, adaptive, list(counted)) if outcome is Outcome.NO_DIFFERENCE else ""
+        why = f" {start}" if start else causes(plain, adaptive)
         return Finding(text + (f" {worse}{_of(adaptive, why)}" if worse else why), outcome, pair, ratios)
     against = caveats(plain, adaptive, list(counted), yardstick)
     more = movement(plain, adaptive), effort_cause(adaptive), grows_alone(plain, adaptive)
     text += "".join(f" {sentence}" for sentence in more if sentence)
     against = _of(adaptive, against)
     return Finding(f"{against} {text}" if against else text, Outcome.DOUBTFUL if against else outcome, pair, ratios)
+
+
+def _of_ends(plain: Entry, adaptive: Entry) -> Finding:
+    """The finding where one of a pair, or both, do not finish."""
+    pair, why = (plain.name, adaptive.name), causes(plain, adaptive)
+    if adaptive.run.stop is None:
+        text = f"{adaptive.name} finishes where {plain.name} does not ({plain.run.stop})."
+        return Finding(text, Outcome.BETTER, pair)
+    if plain.run.stop is None:
+        return Finding(f"{adaptive.name} does not finish: {adaptive.run.stop}.{why}", Outcome.WORSE, pair)
+    ends = " ".join(f"{e.name}: {e.run.stop}." for e in (adaptive, plain))
+    text = f"Neither {adaptive.name} nor {plain.name} finishes. {ends}{_of(adaptive, why)}"
+    return Finding(text, Outcome.NOT_COMPARABLE, pair)
 
 
 _MINOR, _NOT_WEIGHED = "Too small beside them to count", "The cost does not weigh, so the verdict leaves out"

@@ -137,8 +137,15 @@ class Summary(FoundByName):
         """What it is beside the baseline, where the interval of the difference leaves no doubt; None for the baseline itself."""
         if self.difference is None:
             return None
+        if self.is_small:
+            return Outcome.NO_DIFFERENCE
         low, high = self.difference.low, self.difference.high
         return Outcome.BETTER if high < 0 else Outcome.WORSE if low > 0 else Outcome.NO_DIFFERENCE
+
+    @property
+    def is_small(self) -> bool:
+        """Whether there are too few scenarios for an interval: five of five smaller ones are chance in one of 16 samples."""
+        return self.count < FEWEST
 
     @property
     def failures(self) -> int:
@@ -173,7 +180,8 @@ def verdict(
     elif not summaries:
         sentences.append("No controller could serve the problem, so nothing can be compared.")
     if summaries:
-        worst = (f"{s.name} {figure.text(s.worst)} in {s.worst_name}" for s in summaries)
+        which = "" if what == noun(True) else f"{noun(False).removesuffix('s')} "
+        worst = (f"{s.name} {figure.text(s.worst)} in {which}{s.worst_name}" for s in summaries)
         sentences.append(f"Worst {what}: {'; '.join(worst)}.")
     sentences += [_failed(s, what) for s in summaries if s.failures]
     sentences += _nowhere([s for s in summaries if not s.failures], what)
@@ -185,11 +193,16 @@ def verdict(
 def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> str:
     difference = one.difference
     assert difference is not None
+    if one.equal == one.count and math.isinf(one.median):
+        return f"{one.name} and {baseline.name} cannot be compared: neither has a finite {figure.noun} in any of the {what}."
+    interval = "" if one.is_small else f", 95 % interval {figure.interval(difference.low, difference.high)}"
+    equal = f", equal in {one.equal}" if one.equal else ""
     numbers = (
-        f"median difference of {figure.subject} {figure.difference(difference.median)}, 95 % interval "
-        f"{figure.interval(difference.low, difference.high)}; "
-        f"{figure.better} in {one.better} of {one.count} {what}{f', equal in {one.equal}' if one.equal else ''}"
+        f"median difference of {figure.subject} {figure.difference(difference.median)}{interval}; "
+        f"{figure.better} in {one.better} of {_counted(one.count, what)}{equal}"
     )
+    if one.is_small:
+        return f"{one.name} and {baseline.name} have too few {what} for an interval ({numbers})."
     # Of numbers that may be negative, such as a lowest level, a ratio can say the opposite.
     more = figure.better == ("larger" if one.outcome is Outcome.BETTER else "smaller")
     times = f"; {one.ratio:.3g} times its {figure.noun}" if one.ratio >= 0 and (one.ratio > 1) == more else ""
@@ -201,9 +214,13 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 
 
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what.removesuffix('s') if count == 1 else what}"
+
+
 def _failed(one: Summary, what: str) -> str:
     parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
-    said = f"{one.name} fails in {one.failures} of {one.count} {what} ({', '.join(parts)})"
+    said = f"{one.name} fails in {one.failures} of {_counted(one.count, what)} ({', '.join(parts)})"
     if what == noun(True):
         return f"{said}."
     low, high = map(in_percent, one.failure_share)
@@ -218,12 +235,13 @@ def _nowhere(none: Sequence[Summary], what: str) -> list[str]:
     verb = "fail" if len(none) > 1 else "fails"
     most = in_percent(none[0].failure_share[1])
     return [
-        f"{names} {verb} in none of {none[0].count} {what}: in at most {most} of what is drawn so, with 95 % confidence."
+        f"{names} {verb} in none of {_counted(none[0].count, what)}: in at most {most} of what is drawn so, with 95 % confidence."
     ]
 
 
 RESAMPLES = 4000
 LEVEL = 0.95
+FEWEST = 6  # scenarios of which the sign test can reach that level: 2 / 2^n is smaller than 1 - LEVEL
 _MANY = 2000  # values from which no resample is drawn
 _AT_ONCE = 2_000_000  # largest number of values that are drawn at once
 
@@ -260,9 +278,9 @@ def median_interval(values: Quantiles, seed: int) -> ConfidenceInterval:
     """Return the median of `values` and its percentile bootstrap interval.
 
     Infinite values are allowed: they lie beyond all others. The interval is that of the population's median; with fewer than
-    about ten values it is too narrow. Of many values the ends are those of infinitely many resamples: the median of one is at most
-    the k-th value with the probability P(X >= n / 2), X binomial with n trials of k / n. They are further out by the places by
-    which a value that is told may be wrong.
+    about ten values it is too narrow, and with fewer than `FEWEST` it is not told. Of many values the ends are those of infinitely
+    many resamples: the median of one is at most the k-th value with the probability P(X >= n / 2), X binomial with n trials of
+    k / n. They are further out by the places by which a value that is told may be wrong.
 
     References:
         B. Efron, R. J. Tibshirani, An Introduction to the Bootstrap, Chapman and Hall, 1993, chapter 13.

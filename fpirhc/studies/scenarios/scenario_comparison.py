@@ -209,8 +209,10 @@ def _beside(one: Summary, figure: Objective) -> list[str]:
     d = one.difference
     if d is None:
         return ["baseline", "", ""]
-    apart = f"{figure.difference(d.median)} ({figure.interval(d.low, d.high)})"
-    return [apart, written_out(one.ratio), f"{one.better} of {one.count}"]
+    if one.equal == one.count and math.isinf(one.median):
+        return ["none", "none", f"0 of {one.count}"]
+    interval = "too few" if one.is_small else figure.interval(d.low, d.high)
+    return [f"{figure.difference(d.median)} ({interval})", written_out(one.ratio), f"{one.better} of {one.count}"]
 
 
 def _number(column: Number, of: Mapping[str, Mapping[str, float]]) -> str:
