@@ -207,10 +207,10 @@ def test_the_middle_of_a_box_is_in_it(grid, monkeypatch):
 
 @pytest.mark.parametrize(
     ("share", "ideal", "seconds"),
-    [(0.5, 0.5, "20 s"), (0.25, 0.5, "40 s"), (0.5, 0.999, ""), (-0.5, 0.5, ""), (0.0, 0.5, ""), (0.5, None, "")],
+    [(0.5, 0.5, "20 s"), (0.25, 0.5, "40 s"), (-0.5, 0.5, ""), (0.0, 0.5, ""), (0.5, None, "")],
 )
 def test_a_slow_loop_is_told_its_time_where_the_right_model_is_quicker(grid, share, ideal, seconds):
-    """A share of the hundredfold change in a run of 10 s takes its inverse of it; what grows or is as slow anyway is not told."""
+    """A share of the hundredfold change in a run of 10 s takes its inverse of it; of what grows it is not told."""
     one = convergence(grid, loops(math.exp(-share * EDGE), ideal=ideal))
     assert one.verdict == "unknown"
     told = f"It converges, and takes {seconds} for a factor of 100, more than the run has: a larger gain is quicker."
