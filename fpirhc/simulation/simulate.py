@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import casadi as ca
@@ -63,6 +63,7 @@ class Simulator:
         compiled: whether the loop is compiled C.
         why_not_compiled: reason where it is not; empty where it is.
         live: the settings that a run may change.
+        held: numbers of live settings that a run has where it is given none; problem and controller are those with them.
     """
 
     problem: Problem
@@ -72,6 +73,12 @@ class Simulator:
     compiled: bool
     why_not_compiled: str
     live: LiveSettings
+    held: Numbers = field(default_factory=dict)
+
+    def holding(self, settings: Numbers) -> Simulator:
+        """Return the loop whose runs have these numbers of its live settings, without another build."""
+        problem, controller, _ = self.live.changed(settings)
+        return replace(self, problem=problem, controller=controller, held=settings)
 
     @property
     def remembers(self) -> bool:
@@ -87,7 +94,7 @@ class Simulator:
 
     def in_force(self, variant: Problem | None = None, settings: Numbers | None = None) -> InForce:
         """Return problem and controller of a run; arguments as in `run`."""
-        return in_force(self.live, self.loop, variant or self.problem, settings or {}, {})
+        return in_force(self.live, self.loop, variant or self.problem, settings or self.held, {})
 
     def run(
         self,
@@ -109,7 +116,7 @@ class Simulator:
             variant: the simulator's problem with other exact parameters or another duration; None: the problem itself.
             disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
-            settings: numbers of live settings by path; the others have the numbers of the build.
+            settings: numbers of live settings by path; the others have the numbers of the build. None: those that are held.
             changes: numbers of live settings from a time on, by time in s.
             setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
@@ -120,7 +127,11 @@ class Simulator:
         """
         problem = variant or self.problem
         force = in_force(
-            self.live, self.loop, problem, {} if settings is None else settings, {} if changes is None else changes
+            self.live,
+            self.loop,
+            problem,
+            self.held if settings is None else settings,
+            {} if changes is None else changes,
         )
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)

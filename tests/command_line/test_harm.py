@@ -13,6 +13,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.cli.main import main
+from fpirhc.symbolic.native import Native
 
 RED = "\x1b[1;31m"
 FILE = '''"""A mass on a line; the model has 2 % too little gain."""
@@ -115,13 +116,19 @@ def test_a_run_of_it_says_the_same_as_its_comparison(file, compared, capsys):
     assert red(shown(capsys, "run", "line.py", "CTC", "--no-compile")) == []
 
 
-def test_a_run_with_another_gain_is_judged_with_it(file, capsys):
-    """The smaller the gain of the plain form, the more it harms."""
-    factors = []
+def test_a_run_with_another_gain_is_judged_with_it(file, capsys, monkeypatch):
+    """The smaller the gain of the plain form, the more it harms; the compiler has two loops for all gains, with it and without."""
+    factors, codes = [], set()
+
+    def native(function, *_arguments, **_named):
+        codes.add(function.serialize())
+        return Native(function, False, "it is not called here")
+
+    monkeypatch.setattr("fpirhc.simulation.simulate.native", native)
     for gain in (-0.9, -0.2, -0.05):
-        printed = shown(capsys, "run", "line.py", "CTC+gentle", "--no-compile", "--set", f"deformation.gain={gain}")
+        printed = shown(capsys, "run", "line.py", "CTC+gentle", "--set", f"deformation.gain={gain}")
         factors += [float(match[3]) for match in [re.match(LOSES, red(printed)[0])] if match]
-    assert len(factors) == 3
+    assert (len(factors), len(codes)) == (3, 2)
     assert factors[2] > 3 * factors[1]
     assert factors[1] > 1.5 * factors[0]
 

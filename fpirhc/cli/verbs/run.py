@@ -61,7 +61,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     folder = results_folder(options.out, task.name)
     settings, points = by_kind(numbers(options.settings))
     with progress_bars() as progress:
-        problem, changed, run = _simulated(
+        run, problem, built = _simulated(
             task.problem,
             controller,
             settings,
@@ -77,7 +77,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
     facts = {"seed": seed, "compiled": not options.no_compile, "metrics": task.metrics}
-    harm = () if points else harm_of_adaptation(problem, name, changed, **facts)  # of a run with the file's set-points
+    harm = () if points else harm_of_adaptation(name=name, **built, **facts)  # of a run with the file's set-points
     show_run(run, measure(problem, run, task.metrics), harm, folder / f"{stem}.npz")
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
 
@@ -103,8 +103,8 @@ def _simulated(
     settings: Mapping[str, float | tuple[float, ...]],
     setpoints: Mapping[str, float] | None,
     **run: Any,
-) -> tuple[Problem, Controller, Run]:
-    """Problem and controller with these settings, and their run; live ones, which need no compiler, where they can be."""
+) -> tuple[Run, Problem, dict[str, Any]]:
+    """The run, its problem, and what its loop was built of; settings are live, which need no compiler, where they can be."""
     from fpirhc.controllers.live_settings import OF_PROBLEM, live_settings
     from fpirhc.errors import NotSupported
     from fpirhc.problem_files.settings import as_declared, is_own, of_problem, with_numbers, with_settings
@@ -117,18 +117,18 @@ def _simulated(
     problem = with_numbers(problem, {p: settings[p] for p in data})
     settings = {p: v for p, v in settings.items() if p not in data}
     if not settings:
-        return problem, controller, simulate(problem, controller, **run)
+        return simulate(problem, controller, **run), problem, {"problem": problem, "controller": controller}
     with with_recommended_gain(problem, _with_gains(controller, settings)):
         try:
             live = simulate(problem, controller, settings=settings, **run)
-            changed, ready, _ = live_settings(problem, controller, list(settings)).changed(settings)
-            return changed, ready, live
+            changed, _, _ = live_settings(problem, controller, list(settings)).changed(settings)
+            return live, changed, {"problem": problem, "controller": controller, "settings": settings}
         except NotSupported:
             changed = with_numbers(problem, {p: v for p, v in settings.items() if p in own})
             rebuilt = with_settings(
                 controller, as_declared(controller, {p: v for p, v in settings.items() if p not in own})
             )
-            return changed, rebuilt, simulate(changed, rebuilt, **run)
+            return simulate(changed, rebuilt, **run), changed, {"problem": changed, "controller": rebuilt}
 
 
 def _with_gains(controller: Controller, settings: Mapping[str, Any]) -> Controller:

@@ -17,7 +17,8 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.errors import FpirhcError
+from fpirhc.controllers.live_settings import Numbers
+from fpirhc.errors import FpirhcError, NotSupported
 from fpirhc.fields.checked import FoundByName
 from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.review.questions.gain import reviewed_gain
@@ -247,30 +248,42 @@ def harm_of_adaptation(
     seed: int,
     compiled: bool,
     metrics: Sequence[Metric] | None = None,
+    settings: Numbers | None = None,
 ) -> tuple[str, ...]:
     """Return a sentence for a run in which adaptation raises the error, and one for a null test that it fails.
 
     Empty without harm, for a controller that does not adapt, and for one that has no pair or cannot run.
+
+    Args:
+        settings: numbers of live settings in place of those of the controller and the problem; loops are compiled once for all.
     """
     if not controller.deformation.adapts:
         return ()
     try:
-        both = without_deformation(controller), controller
-        return _harm(problem, (f"{name} without adaptation", name), both, seed, compiled, metrics)
+        loops = _both(problem, controller, compiled, settings or {})
+        return _harm(loops[1].problem, (f"{name} without adaptation", name), loops, seed, metrics)
     except FpirhcError:
         return ()
+
+
+def _both(problem: Problem, controller: Controller, compiled: bool, settings: Numbers) -> tuple[Simulator, Simulator]:
+    """The loops without and with adaptation; the one without it is built for these numbers where they cannot be live there."""
+    adapting = simulator(problem, controller, compiled=compiled, live=list(settings)).holding(settings)
+    own = {path: value for path, value in settings.items() if not path.startswith("deformation.")}
+    try:
+        bare = simulator(problem, without_deformation(controller), compiled=compiled, live=list(own)).holding(own)
+    except NotSupported:
+        bare = simulator(adapting.problem, without_deformation(adapting.controller), compiled=compiled)
+    return bare, adapting
 
 
 def _harm(
     problem: Problem,
     pair: tuple[str, str],
-    controllers: tuple[Controller, Controller],
+    loops: tuple[Simulator, Simulator],
     seed: int,
-    compiled: bool,
     metrics: Sequence[Metric] | None,
 ) -> tuple[str, ...]:
-    bare, adapting = controllers
-    loops = simulator(problem, bare, compiled=compiled), simulator(problem, adapting, compiled=compiled)
     sizes, model, counted = scales(problem), ModelAsPlant(problem, seed=seed), weighed(problem, loops[1].controller)
     losses: list[str] = []
     cured: Mapping[str, float] = dict.fromkeys(problem.judged_names, 0.0)
