@@ -35,6 +35,7 @@ from fpirhc.task.problem import Problem
 
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
 _BOXES = 99  # of 1 % to 99 %
+_MOST_DRAWS = 100_000  # plants of a box: hours of runs
 _FIRST = 8  # percent: the first box that is tried
 _GENERATION = 20  # plants of a generation, at most
 _SIDE_BY_SIDE = 64  # plants that run before it is asked whether one failed
@@ -124,7 +125,8 @@ def robust_boxes(
 
     Raises:
         InvalidProblem: unknown controllers, gains of the wrong sign.
-        InvalidValue: a share that is none, `fails` that is not positive, or a plant without parameters or dead times to draw.
+        InvalidValue: a share that is none or needs too many plants, `fails` that is not positive, or a plant without parameters
+            or dead times to draw.
     """
     begin = time.perf_counter()
     most = _most(task)
@@ -151,8 +153,20 @@ def robust_boxes(
 
 
 def wanted_draws(risk: float, confidence: float) -> int:
-    """Return how many plants have to hold in a box; see `robust_boxes`."""
-    return math.ceil(math.log(_BOXES / (1 - confidence)) / -math.log1p(-risk))
+    """Return how many plants have to hold in a box; see `robust_boxes`.
+
+    Raises:
+        InvalidValue: more than a hundred thousand.
+    """
+    wanted = math.log(_BOXES / (1 - confidence))
+    draws = wanted / -math.log1p(-risk)
+    if draws > _MOST_DRAWS:
+        least = 1.001 * -math.expm1(-wanted / _MOST_DRAWS)
+        raise InvalidValue(
+            f"a risk of {risk:g} with confidence {confidence:g} needs {draws:.2g} plants per box: expected at most "
+            f"{_MOST_DRAWS:g}, so a risk of at least {least:.3g}, or less confidence"
+        )
+    return math.ceil(draws)
 
 
 def _most(task: Task) -> int:
@@ -207,11 +221,14 @@ class _Plants:
         self._problem, self._judge = task.problem, Judge(task, fails, seed)
         self._controller, self._compiled, self._seed = controller, compiled, seed
         self._parameters, self._dead_times = task.problem.moved.parameters, DeadTimes(task.problem, most)
-        streams = [np.random.SeedSequence(seed, spawn_key=(SEARCHING, k)).spawn(3) for k in range(draws)]
-        shares = [np.random.default_rng(own).random(len(self._parameters)) for own, _, _ in streams]
-        late = [np.random.default_rng(own).random(int(self._dead_times.drawn)) for _, _, own in streams]
-        self._shares = np.hstack([shares, late])
-        self._noise = [int(noise.generate_state(1)[0]) for _, noise, _ in streams]
+        sizes, shares, self._noise = (len(self._parameters), int(self._dead_times.drawn)), [], []
+        for k in range(draws):
+            own, noise, late = np.random.SeedSequence(seed, spawn_key=(SEARCHING, k)).spawn(3)
+            shares.append(
+                np.hstack([np.random.default_rng(one).random(n) for one, n in zip((own, late), sizes, strict=True)])
+            )
+            self._noise.append(int(noise.generate_state(1)[0]))
+        self._shares = np.array(shares)
         self._errors, self._metrics = np.zeros(draws), [m for m in task.metrics if m.name == "rms_error"]
         self._loop = self._built()
 
