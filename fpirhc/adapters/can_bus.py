@@ -10,6 +10,7 @@ frames are bad answers; remote frames, which ask for a value, are none.
 
 from __future__ import annotations
 
+import re
 import struct
 import time as wall
 from collections.abc import Iterable, Iterator, Mapping
@@ -18,22 +19,41 @@ from typing import Any
 
 from fpirhc.adapters.names import adapter, require, require_methods
 from fpirhc.adapters.real_time import RealTime, Setup, device
-from fpirhc.errors import InvalidProblem, package
+from fpirhc.errors import InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Nonzero
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
+_NUMBER = re.compile(r"[@=<>!]?[bBhHiIlLqQefd?]")
+_LONGEST = 64  # bytes of a message of CAN FD
+
 
 @dataclass(frozen=True)
 class Field(Checked):
-    """Where a value is: the identifier of its message, its format (see `struct`) at a byte, and value = scale x number."""
+    """Where a value is: the identifier of its message, its format (see `struct`) at a byte, and value = scale x number.
+
+    Raises:
+        InvalidValue: a format of no number, or of several; an identifier or a place that no message has.
+    """
 
     identifier: CountOrZero
     format: str = "<f"
     byte: CountOrZero = 0
     scale: Nonzero = 1.0
     extended: bool = False
+
+    def __post_init__(self) -> None:
+        if not _NUMBER.fullmatch(self.format):
+            raise InvalidValue(
+                f"Field.format: expected that of one number, such as '<f', '>h' or 'B', got {self.format!r}"
+            )
+        bits, end = 29 if self.extended else 11, self.byte + struct.calcsize(self.format)
+        if self.identifier >> bits:
+            wide = "" if self.extended else "; a larger one needs extended=True"
+            raise InvalidValue(f"Field.identifier: expected one of {bits} bits, got 0x{self.identifier:X}{wide}")
+        if end > _LONGEST:
+            raise InvalidValue(f"Field.byte: a message has at most {_LONGEST} bytes, and the field ends at byte {end}")
 
 
 @adapter

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from fpirhc.errors import InvalidValue, package
+from fpirhc.errors import FpirhcError, InvalidValue, package
 
 _MEMORY = ((0x00000000, 4 << 20), (0x20000000, 4 << 20), (0xE000E000, 1 << 12))  # flash, RAM, control registers
 _OPEN, _WRITE, _READ, _EXIT = 0x01, 0x05, 0x06, 0x18  # operations of semihosting
@@ -26,13 +26,22 @@ class Image:
     """A program for a Cortex-M as an ELF file.
 
     Raises:
-        InvalidValue: it is no 32-bit ELF file for ARM.
+        InvalidValue: it cannot be read, or is no whole 32-bit ELF file for ARM.
     """
 
     def __init__(self, path: Path) -> None:
-        self.bytes = path.read_bytes()
-        if self.bytes[:6] != b"\x7fELF\x01\x01" or self.bytes[18:20] != b"\x28\x00":
-            raise InvalidValue(f"'{path}' is no program for a Cortex-M: expected the .elf of `--to cortex-m`")
+        try:
+            self.bytes = path.read_bytes()
+            if self.bytes[:6] != b"\x7fELF\x01\x01" or self.bytes[18:20] != b"\x28\x00":
+                raise ValueError
+            self._read()
+        except OSError as error:
+            raise InvalidValue(f"'{path}' cannot be read: {error.strerror}") from None
+        except (IndexError, ValueError, struct.error):
+            what = f"'{path}' is no program for a Cortex-M, or not all of one"
+            raise InvalidValue(f"{what}: expected the .elf of `--to cortex-m`") from None
+
+    def _read(self) -> None:
         head = struct.unpack_from("<16sHHIIIIIHHHHHH", self.bytes)
         segments = [struct.unpack_from("<8I", self.bytes, head[5] + 32 * k) for k in range(head[10])]
         self.segments = [(s[3], self.bytes[s[1] : s[1] + s[4]]) for s in segments if s[0] == 1 and s[4]]
@@ -132,10 +141,24 @@ def _instructions(code: bytes) -> int:
     return number
 
 
-if __name__ == "__main__":
-    program = Image(Path(sys.argv[1]))
-    step = next((name for name in program.symbols if name.endswith("_step")), "")
-    board = Board(program, sys.stdin.buffer, sys.stdout.buffer, step)
+def main(arguments: list[str]) -> None:
+    """Run the image of the command line.
+
+    Raises:
+        SystemExit: there is no image, or what it lacks.
+    """
+    if len(arguments) != 1:
+        raise SystemExit("usage: python -m fpirhc.export.cortex IMAGE, the .elf of `fpirhc export --to cortex-m`")
+    try:
+        program = Image(Path(arguments[0]))
+        step = next((name for name in program.symbols if name.endswith("_step")), "")
+        board = Board(program, sys.stdin.buffer, sys.stdout.buffer, step)
+    except FpirhcError as error:
+        raise SystemExit(str(error)) from None
     board.run()
     if board.counts:
         print(f"instructions of a step: mean {np.mean(board.counts):.0f}, most {max(board.counts)}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

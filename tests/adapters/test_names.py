@@ -103,6 +103,23 @@ def test_a_derivative_beyond_the_second_is_a_mistake():
         mistakes.raise_if_any()
 
 
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ({"format": "zz"}, "Field.format: expected that of one number, such as '<f', '>h' or 'B', got 'zz'"),
+        ({"format": "<ff"}, "got '<ff'"),
+        (
+            {"identifier": 0x18FF},
+            "Field.identifier: expected one of 11 bits, got 0x18FF; a larger one needs extended=True",
+        ),
+        ({"byte": 62}, "at most 64 bytes, and the field ends at byte 66"),
+    ],
+)
+def test_a_field_that_no_message_has_is_refused(field, message):
+    with pytest.raises(InvalidValue, match=re.escape(message)):
+        Field(**({"identifier": 0x201} | field))
+
+
 def test_what_a_package_raises_has_the_adapters_name():
     message = "plant_of: TypeError: ss(sys): sys must be a StateSpace or TransferFunction"
     with pytest.raises(InvalidProblem, match=re.escape(message)):

@@ -94,14 +94,19 @@ def test_a_worst_case_names_missed_cycles_and_bytes():
 
 @needs_compiler
 def test_an_arduino_library_computes_in_float(tmp_path):
-    """Its sources build here with every warning an error, and their type is float; header and sketch have one name."""
+    """Its sources build here with every warning an error, and their type is float; header and sketch have one name.
+
+    A number may be called as a macro of Arduino's headers.
+    """
     write(device("CTC+FPI (eq 6)"), target_called("arduino"), tmp_path)
     assert "includes=arm.h" in (tmp_path / "library.properties").read_text().splitlines()
     sketch = (tmp_path / "examples" / "arm" / "arm.ino").read_text()
     assert "#include <arm.h>" in sketch
     assert "@" not in sketch
     own = [str(path) for path in (tmp_path / "src").glob("*.c")]
-    (tmp_path / "type.c").write_text('#include "arm.h"\nchar is_float[sizeof(((arm_command*)0)->Q1) == 4 ? 1 : -1];\n')
+    (tmp_path / "type.c").write_text(
+        '#define Q1 17\n#include "arm.h"\nchar is_float[sizeof(((arm_command*)0)->Q1) == 4 ? 1 : -1];\n'
+    )
     command = [str(find_compiler()), *STRICT, f"-I{tmp_path / 'src'}", "-c", *own, str(tmp_path / "type.c")]
     subprocess.run(command, check=True, cwd=tmp_path)
 

@@ -20,6 +20,7 @@ import fpirhc as fp
 import fpirhc.export.processor
 from fpirhc.cli.main import main
 from fpirhc.errors import InvalidField, InvalidValue, OutputError
+from fpirhc.export import cortex
 from fpirhc.export.cortex import Image
 from fpirhc.export.device import Device
 from fpirhc.export.processor import Processor
@@ -279,6 +280,16 @@ def tools() -> None:
 
 def emulated(image: Path) -> list[str]:
     return [sys.executable, "-m", "fpirhc.export.cortex", str(image)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [([], "usage: "), (["gone.elf"], "No such file"), (["half.elf"], "or not all of one")]
+)
+def test_a_board_without_an_image_is_told(arguments, message, tmp_path, monkeypatch):
+    (tmp_path / "half.elf").write_bytes(b"\x7fELF\x01\x01".ljust(18, b"\0") + b"\x28\x00")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message):
+        cortex.main(arguments)
 
 
 @pytest.mark.slow

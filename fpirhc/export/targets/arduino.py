@@ -40,6 +40,7 @@ _ATANH = (
 _NARROW = (
     '#if defined(__AVR__)\n#pragma GCC optimize("no-split-wide-types", "no-tree-forwprop", "no-ssa-phiopt")\n#endif\n'
 )
+_MEMBER = re.compile(r"^ *(?:casadi_real|\}) (\w+)(?:\[\d+\])?;", re.MULTILINE)
 _STARTED = 900  # bytes of flash of Arduino's own core, without what a sketch calls
 
 
@@ -115,7 +116,17 @@ def _pace(device: Device) -> str:
 
 
 def _own(device: Device) -> dict[str, str]:
-    return {file: _NARROW * file.endswith(".c") + _in_float(text) for file, text in sources(device).items()}
+    return {
+        file: _in_float(_NARROW + text if file.endswith(".c") else _without_macros(text))
+        for file, text in sources(device).items()
+    }
+
+
+def _without_macros(header: str) -> str:
+    """The header, which a sketch reads after Arduino's own ones: a number called B0, PI or PORTB there is no macro of theirs."""
+    names = dict.fromkeys(n for n in _MEMBER.findall(header) if n.isupper() and n != "F")  # F("text") is another thing
+    lines = "".join(f"#undef {name}\n" for name in names)
+    return header.replace("#ifdef __cplusplus", f"{lines}\n#ifdef __cplusplus" if lines else "#ifdef __cplusplus", 1)
 
 
 def _lacking(sizes: Mapping[_Board, _Size]) -> dict[str, str]:

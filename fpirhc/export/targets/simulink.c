@@ -46,7 +46,7 @@ static void mdlInitializeSampleTimes(SimStruct* S) {
   ssSetOffsetTime(S, 0, 0.0);
 }
 
-#define MDL_START
+@number@#define MDL_START
 static void mdlStart(SimStruct* S) {
   block* b = (block*)calloc(1, sizeof *b);
   ssSetPWorkValue(S, 0, b);
