@@ -254,8 +254,9 @@ class Mistakes:
         Raises:
             InvalidProblem: with a list of all mistakes.
         """
+        where = f"{self._where}: " if self._where else ""
         if len(self._mistakes) == 1:
-            raise InvalidProblem(f"{self._where}: {self._mistakes[0]}")
+            raise InvalidProblem(f"{where}{self._mistakes[0]}")
         if self._mistakes:
             lines = "\n".join(f"  {k}. {m}" for k, m in enumerate(self._mistakes, 1))
-            raise InvalidProblem(f"{self._where}: {len(self._mistakes)} mistakes\n{lines}")
+            raise InvalidProblem(f"{where}{len(self._mistakes)} mistakes\n{lines}")

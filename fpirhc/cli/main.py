@@ -51,6 +51,12 @@ def _ended_by(error: BaseException) -> int:
 
 
 def _run(words: list[str]) -> ExitCode:
+    if any("\0" in word for word in words):
+        from fpirhc.errors import InvalidValue
+
+        raise InvalidValue(
+            "an argument has a null character, which no name of a file or a controller has; leave it out"
+        )
     verbs = known()
     if not words or words[0].startswith("-"):
         return _about(words, verbs)

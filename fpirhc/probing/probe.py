@@ -48,6 +48,8 @@ class Probe(FoundByName):
         candidates: by the same names.
         problem: the problem with the estimated plant as its reality, to be reviewed or swept; None: it has no equations.
         notes: what to know beside.
+        units: of responses, by controlled quantity.
+        time_unit: of the problem.
     """
 
     gain: Mapping[str, Mapping[str, Interval]]
@@ -61,6 +63,8 @@ class Probe(FoundByName):
     candidates: Mapping[str, Deformation] = field(default_factory=dict)
     problem: Problem | None = None
     notes: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    time_unit: str = "s"
 
     @property
     def lines(self) -> str:
@@ -100,9 +104,17 @@ class Probe(FoundByName):
             for column, one in entries.items()
         ]
         dead = [(f"dead time of {name}, cycles", _interval(one)) for name, one in self.dead_time.items()]
-        lags = [(f"lag of {name}", _interval(one)) for name, one in self.lag.items()]
-        noise = [(f"noise of {name}", number(one)) for name, one in self.noise.items()]
-        return (*gains, *dead, *lags, *noise, *((f"drift of {name}", number(one)) for name, one in self.drift.items()))
+        lags = [(f"lag of {name}, {self.time_unit}", _interval(one)) for name, one in self.lag.items()]
+        noise = [(f"noise of {name}{self._unit(name)}", number(one)) for name, one in self.noise.items()]
+        drift = [
+            (f"drift of {name}{self._unit(name, f'/{self.time_unit}^0.5')}", number(v))
+            for name, v in self.drift.items()
+        ]
+        return (*gains, *dead, *lags, *noise, *drift)
+
+    def _unit(self, name: str, per: str = "") -> str:
+        unit = self.units.get(name, "1")
+        return f", {unit}{per}" if per or unit != "1" else ""
 
 
 @checked_call
@@ -234,6 +246,8 @@ def _answer(
         candidates=dict(candidates),
         problem=estimated,
         notes=tuple(notes),
+        units=dict(zip(names, problem.plant.response_signal("realised").entry_units, strict=True)),
+        time_unit=problem.time_unit,
     )
 
 

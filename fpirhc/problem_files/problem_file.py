@@ -18,6 +18,7 @@ import importlib.util
 import io
 import linecache
 import sys
+import textwrap
 import traceback
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -334,7 +335,7 @@ class _MistakesOfFile:
                     for call in _calls(statement):
                         self._check(call)
         return "\n".join(
-            f"{_place(self.path, line)}\n    {one}" for line in sorted(self.said) for one in self.said[line]
+            f"{_place(self.path, line)}\n{_indented(one)}" for line in sorted(self.said) for one in self.said[line]
         )
 
     def _lacks(self, source: ast.AST) -> bool:
@@ -386,7 +387,11 @@ class _MistakesOfFile:
 def _message(path: Path, error: BaseException, cause: str) -> str:
     """Return "file.py, line 12: source" of the innermost line of the file in the traceback, and the cause below it."""
     line = _line(path, error)
-    return f"{_place(path, line) if line else path.name}\n    {cause}"
+    return f"{_place(path, line) if line else path.name}\n{_indented(cause)}"
+
+
+def _indented(cause: str) -> str:
+    return textwrap.indent(cause, "    ")
 
 
 def _cause_of(error: Exception) -> str:

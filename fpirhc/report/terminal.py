@@ -119,15 +119,21 @@ def _least(table: Table, place: int) -> int:
     texts = [cell_len(printable(row.cells[place])) for row in table.rows]
     if place < table.names:
         texts = [min(length, _NAMED) for length in texts]
-    return max([*texts, *(cell_len(word) for word in printable(table.columns[place].head).split())], default=1)
+    return max([*texts, *(cell_len(word) for word in _whole_units(table.columns[place].head).split(" "))], default=1)
+
+
+def _whole_units(head: str) -> str:
+    """A heading whose lines do not end inside a unit."""
+    return re.sub(r"\[[^]]*\]", lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), printable(head))
 
 
 def _grid(table: Table, part: Sequence[int], title: str, caption: str, width: int) -> Grid:
+    heads = [_whole_units(table.columns[k].head) for k in range(len(table.columns))]
     grid = Grid(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(title), caption=Text(caption) or None)
     places = [*range(table.names), *part]
     for k, own in zip(places, _widths(table, places, width), strict=True):
         justify: JustifyMethod = "left" if k < table.names or table.columns[k].left else "right"
-        grid.add_column(Text(printable(table.columns[k].head)), justify=justify, width=own, overflow="fold")
+        grid.add_column(Text(heads[k]), justify=justify, width=own, overflow="fold")
     for row in table.rows:
         cells = (Text(printable(row.cells[k]), "bold" if k in row.best else "") for k in places)
         grid.add_row(*cells, style=row.style)
@@ -213,8 +219,8 @@ def announce_backend(runs: Iterable[Run]) -> None:
         print(f"fpirhc: loops ran in CasADi's virtual machine, more slowly, because {why}", file=sys.stderr)
 
 
-def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Path) -> None:
-    """Print what speaks against its adaptation, one run's metrics and the path of its file."""
+def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Path]) -> None:
+    """Print what speaks against its adaptation, one run's metrics and the paths of its files."""
     show_harm(harm)
     for text in (*settings_in_force(run), *set_points_in_force(run)):
         say(text)
@@ -224,7 +230,7 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Path) -> No
         say(f"ended early: {run.stop}")
     for text in (*metrics.broken.values(), *run.remarks):
         say(text)
-    say(f"saved: {saved}", wrap=False)
+    say(f"saved: {', '.join(map(str, saved))}", wrap=False)
 
 
 def settings_in_force(run: Run) -> list[str]:

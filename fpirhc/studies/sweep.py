@@ -285,12 +285,12 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
 
 def _check_controllers(task: Task, axis: Axis, words: Collection[str]) -> None:
     """Raise where no controller has the setting, or one that has it cannot take a value."""
-    lacking = []
+    lacking: dict[str, str] = {}
     for name, controller in task.controllers.items():
         try:
             current_setting(controller, axis.path)
         except FpirhcError as error:
-            lacking.append(f"{name}: {error}")
+            lacking[name] = f"{name}: {error}"
             continue
         if is_whole(controller, axis.path) and any(v % 1 for v in axis.values):
             shown = ", ".join(map(number, axis.values))
@@ -301,7 +301,8 @@ def _check_controllers(task: Task, axis: Axis, words: Collection[str]) -> None:
         return
     word, fields_of = axis.path.partition(".")[0], {n for one in task.controllers.values() for n in names_in(one)}
     if word in fields_of:
-        raise InvalidName(f"no controller has '{axis.path}'. {lacking[-1]}")
+        told = [text for name, text in lacking.items() if task.controllers[name].deformation.adapts]
+        raise InvalidName(f"no controller has '{axis.path}'. {(told or list(lacking.values()))[-1]}")
     parameter = f" The parameter is 'exact.{word}'." if word in task.problem.moved.parameters else ""
     hint = parameter or nearest(word, sorted({*words, *fields_of}))
     raise InvalidName(f"neither the problem nor a controller has '{axis.path}'.{hint}")
@@ -335,7 +336,7 @@ def _unit(problem: Problem, path: str) -> str:
 class _Values(Cases):
     """Values of settings as cases; a message has them in place of the name of a case."""
 
-    _where = "sweep"
+    _where = ""
 
     def _place(self, name: str, path: str = "", *, head: bool = False) -> str:  # noqa: ARG002
         return name

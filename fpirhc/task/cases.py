@@ -309,7 +309,8 @@ def _check_change(problem: Problem, changes: Mapping[str, object], path: str) ->
         return
     paths = [f.name for f in fields(problem) if f.name not in _OWN]
     if word not in paths:
-        raise InvalidName(f"a case has no '{path}'.{_meant(problem, path) or nearest(word, [*_WORDS, *paths])}")
+        meant = _meant(problem, path.rpartition(".")[2]) or nearest(word, [*_WORDS, *paths])
+        raise InvalidName(f"the problem has no '{path}'.{meant}")
     if isinstance(content_at(problem, path, "the problem"), int | float):
         _check_number(changes[path])
 

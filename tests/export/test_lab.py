@@ -170,7 +170,7 @@ def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):
     lab = made("noisy_motor", duration=0.5, controllers=["RHC"])
     paths = {s.path for s in lab.sliders}
     assert {"exact.k", "approximate.k"} & paths or len(paths) > 5
-    assert "only Python computes that" in lab.without["limits.inputs.voltage.1"]
+    assert "only Python does that" in lab.without["limits.inputs.voltage.1"]
     assert lab.without["approximate.coulomb"] == "it is zero: nothing says how far a slider would go"
     assert not paths & set(lab.without)
 
@@ -244,7 +244,7 @@ def test_a_page_runs_its_own_scripts_and_webassembly_alone(short, monkeypatch):
     assert "default-src 'none'" in policy
     assert "'wasm-unsafe-eval'; worker-src blob:;" in policy
     assert "<title>&lt;b&gt;&amp;: lab</title>" in text
-    assert text.count("</script>") == 3
+    assert text.count("</script>") == 4
     assert "@" not in resources.files("fpirhc.export.lab").joinpath("lab.js").read_text()
 
 

@@ -138,7 +138,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no case": (lambda: fp.Cases({}), 'cases: there is none; expected {"heavy": {"exact.mass": 2.0}}'),
     "a parameter without its word": (
         lambda: case({"b": 2.0}),
-        "cases: case 'heavy', 'b': a case has no 'b'. It is a parameter: 'exact.b' is what moves, "
+        "cases: case 'heavy', 'b': the problem has no 'b'. It is a parameter: 'exact.b' is what moves, "
         "'approximate.b' is what the controllers know, 'known.b' is both: what moves has it, and the "
         "controllers know it.",
     ),
@@ -149,9 +149,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "a field that is misspelt": (
         lambda: case({"limit.inputs.u": (-1.0, 1.0)}),
-        "cases: case 'heavy', 'limit.inputs.u': a case has no 'limit.inputs.u'. Did you mean 'limits'? Valid: "
-        "exact, approximate, known, start, reference, period, duration, limits, disturbances, dead_time, "
-        "sensing, horizon, cost, integrator, measure_from, judged, input_before, reality, signals.",
+        "cases: case 'heavy', 'limit.inputs.u': the problem has no 'limit.inputs.u'. It is an input: "
+        "'limits.inputs.u' are its limits.",
     ),
     "a text for a number": (
         lambda: case({"start.q": "0.1"}),

@@ -259,7 +259,7 @@ def test_terminal_shows_names_literally(comparison, capsys, monkeypatch):
         assert name in printed
     assert "report: [bold]report.html" in printed
     assert "\x1b[31m" not in printed
-    show_run(comparison[HOSTILE].run, comparison[HOSTILE].metrics, ["[/]harm"], Path("[/]run.npz"))
+    show_run(comparison[HOSTILE].run, comparison[HOSTILE].metrics, ["[/]harm"], [Path("[/]run.npz")])
     assert UNIT in capsys.readouterr().out
     with progress_bars() as report:
         report(HOSTILE, 1, 2)

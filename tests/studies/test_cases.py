@@ -379,11 +379,14 @@ WRONG_PATHS: dict[str, tuple[Any, str]] = {
     "a parameter that is not there": ({"exact.c": 1.0}, r"'exact\.c': .* there is no 'c'\. .*Valid: b, k"),
     "a parameter alone": (
         {"b": 1.0},
-        r"a case has no 'b'\. It is a parameter: 'exact\.b' is what moves, 'approximate\.b'",
+        r"the problem has no 'b'\. It is a parameter: 'exact\.b' is what moves, 'approximate\.b'",
     ),
     "a state alone": ({"y'": 1.0}, r"It is a state: 'start\.y'' is its first value"),
     "an input alone": ({"u": 1.0}, r"It is an input: 'limits\.inputs\.u' are its limits"),
-    "a field that is misspelt": ({"dead_tme.measurement": 0.1}, r"a case has no 'dead_tme.*Did you mean 'dead_time'\?"),
+    "a field that is misspelt": (
+        {"dead_tme.measurement": 0.1},
+        r"the problem has no 'dead_tme.*Did you mean 'dead_time'\?",
+    ),
     "a field inside": ({"dead_time.measurment": 0.1}, r"Did you mean 'measurement'\?"),
     "a parameter outside its bounds": ({"exact.b": -70.0}, r"'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70"),
     "no number": ({"exact.b": "1.2"}, r"'exact\.b': expected a finite number, got the text '1\.2'"),

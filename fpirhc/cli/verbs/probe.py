@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ from fpirhc.cli.options import add_json, add_problem, add_seed
 from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
+    from fpirhc.controllers.base import Controller
     from fpirhc.probing.probe import Probe
 
 _CYCLES = 300
@@ -44,10 +46,10 @@ def _run(options: argparse.Namespace) -> ExitCode:
             raise InvalidValue(
                 f"--{name} is of an excitation, and a --recording has been excited: leave one of them out"
             )
-    controllers = select(task, None if options.controller is None else [options.controller])
+    name, controller = _probed(select(task, None if options.controller is None else [options.controller]))
     answer = probe(
         task.problem,
-        next(iter(controllers.values())),
+        controller,
         cycles=_CYCLES if options.cycles is None else options.cycles,
         amplitude=options.amplitude,
         recording=options.recording,
@@ -60,15 +62,32 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
         print(to_json(answer.plain))
     else:
-        _show(task.name, answer)
+        _show(f"{task.name}: probe with {name}", answer)
     return ExitCode.FINISHED if answer.deformation is not None else ExitCode.ANSWERED_NO
 
 
-def _show(name: str, answer: Probe) -> None:
+def _probed(controllers: Mapping[str, Controller]) -> tuple[str, Controller]:
+    """The first controller whose deformation can be replaced, by its name."""
+    from fpirhc.errors import NotSupported
+
+    reasons = []
+    for name, controller in controllers.items():
+        try:
+            controller.with_deformation(controller.deformation)
+        except NotSupported as error:
+            reasons.append(f"{name}: {error}")
+            continue
+        return name, controller
+    raise NotSupported(
+        f"probe needs a controller with a deformation: choose another one by --controller. {'; '.join(reasons)}"
+    )
+
+
+def _show(title: str, answer: Probe) -> None:
     from fpirhc.report.terminal import say, show_table
     from fpirhc.summary import Column, Table
 
-    estimates = Table(f"{name}: probe", [Column("estimate", left=True), Column("value (interval)")])
+    estimates = Table(title, [Column("estimate", left=True), Column("value (interval)")])
     for estimate, value in answer.facts:
         estimates.add([estimate, value])
     show_table(estimates)

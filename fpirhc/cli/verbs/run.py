@@ -78,7 +78,9 @@ def _run(options: argparse.Namespace) -> ExitCode:
     announce_backend([run])
     facts = {"seed": seed, "compiled": not options.no_compile, "metrics": task.metrics}
     harm = () if points else harm_of_adaptation(name=name, **built, **facts)  # of a run with the file's set-points
-    show_run(run, measure(problem, run, task.metrics), harm, folder / f"{stem}.npz")
+    show_run(
+        run, measure(problem, run, task.metrics), harm, [folder / f"{stem}{ending}" for ending in (".npz", ".png")]
+    )
     return ExitCode.FINISHED if run.stop is None else ExitCode.ENDED_EARLY
 
 

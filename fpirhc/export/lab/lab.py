@@ -330,7 +330,9 @@ def _places(
         spared = loop.computed_once if path.startswith("reference.") else ()
         also = [name for name in columns if not _is_the_number(name, path) and name not in spared]
         if also:
-            without[path] = f"'{also[0]}' in the memory of {loop.name} follows from it, and only Python computes that"
+            without[path] = (
+                f"the start of {loop.name} is computed from it, and only Python does that: use fpirhc run --set"
+            )
             return {}
         own = [int(k) for k, name in zip(moved, columns, strict=True) if name not in spared]
         if own:

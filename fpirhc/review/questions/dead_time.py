@@ -128,8 +128,8 @@ def _latency_of(case: Case, loops: Sequence[LinearLoop], whose: str) -> Answer:
     if borne == _LATENCY:
         text = f"{whose}{_LATENCY} cycles later, the slowest mode is multiplied by {radii[-1]:.6g} per cycle"
         return Answer(UNSTATED, Verdict.YES, text, "", numbers)
-    later = "1 cycle" if borne == 0 else f"{borne + 1} cycles"
-    text = f"{whose}{later} later, the slowest mode is multiplied by {radii[borne]:.6g} per cycle; it bears {borne}"
+    borne_text = f"{borne} cycle{'s' * (borne > 1)} later it converges, and with one more" if borne else "1 cycle later"
+    text = f"{whose}{borne_text} the slowest mode is multiplied by {radii[borne]:.6g} per cycle"
     measure = f"measure the latency and state it, {case.grid.states_dead_time}"
     share = None if whose else _share_that_bears(case)
     if share is None:

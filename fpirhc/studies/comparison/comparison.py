@@ -167,7 +167,16 @@ def _plans(comparison: Comparison) -> Table:
             Column("max [us]", "max us"),
             Column("first [us]", "first us"),
         ],
-        "gap: cost above the converged optimum, relative; plan: median of the cycles that plan; p99, max: of all cycles",
+        "; ".join(
+            [
+                *(["gap: cost above the converged optimum, relative"] if any(e.optimality for e in planners) else []),
+                *(
+                    ["plan: median of the cycles that plan; p99, max: of all cycles"]
+                    if any(e.cycle for e in planners)
+                    else []
+                ),
+            ]
+        ),
     )
     for e in planners:
         gaps = [gap(v, 1) for v in (e.optimality.median, e.optimality.worst)] if e.optimality else ["", ""]
