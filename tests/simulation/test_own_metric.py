@@ -78,6 +78,11 @@ def test_scenarios_have_it(task, tmp_path):
     assert len(set(leads)) == 3
     assert study["CTC"].metrics["largest_lead"]["y"] == pytest.approx(np.median(leads))
     assert [c.short for c in study.columns][-2:] == ["largest lead y [m]", "share inside"]
+    broken = replace(task, metrics=[*task.metrics, fp.Metric("mine", lambda problem, run: 1 / 0)])
+    told = fp.compare_scenarios(
+        broken, count=1, percent=9.0, seed=1, folder=tmp_path / "broken", compiled=False
+    ).verdict
+    assert told[-1] == "No run has metric 'mine'; where its function raises, fpirhc run tells why."
     with pytest.raises(fp.FpirhcError, match="results are never mixed: metrics was"):
         fp.compare_scenarios(
             replace(task, metrics=task.metrics[:-1]), count=3, percent=10.0, seed=1, folder=tmp_path, compiled=False

@@ -20,7 +20,7 @@ from fpirhc.fields.kinds import Few, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values
 from fpirhc.simulation.metrics import Metric
-from fpirhc.simulation.metrics.base import Column
+from fpirhc.simulation.metrics.base import Column, known_metric
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.scenarios.bench import (
@@ -136,7 +136,7 @@ def compare_scenarios(
         summaries=summaries,
         records=records,
         skipped=skipped,
-        verdict=verdict(summaries, skipped, noun(conditions.named), figure),
+        verdict=(*verdict(summaries, skipped, noun(conditions.named), figure), *_without_numbers(task, summaries)),
         tuning={n: note for n, note in (tuning or {}).items() if n in names},
         **circumstances(task, select(task, names), command, begin),
         pictures=task.pictures,
@@ -160,6 +160,13 @@ def _workers(
     if cluster is not None:
         return Cluster(cluster, opening, header, processes)
     return Workers(__package__ + ".worker", opening, header, processes) if processes > 1 else None
+
+
+def _without_numbers(task: Task, summaries: Sequence[Summary]) -> list[str]:
+    """A sentence for every metric of the problem file's own that no run has."""
+    own = [metric.name for metric in task.metrics if known_metric(metric.name) is None]
+    lacking = [name for name in own if summaries and not any(one.metrics.get(name) for one in summaries)]
+    return [f"No run has metric '{name}'; where its function raises, fpirhc run tells why." for name in lacking]
 
 
 def _to_look_at(
