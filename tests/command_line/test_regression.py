@@ -199,6 +199,8 @@ def test_accept_replaces_a_baseline_and_keeps_the_reason(folder, capsys):
     assert main(["run", "noisy.py", "CTC", "--no-compile"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "± " in shown
+    (folder / "noisy.py").write_text((folder / "noisy.py").read_text().replace("1 / 0", "1.0"))
+    assert main(["check", "noisy.py", "--no-compile"]) == ExitCode.CHANGED, "a metric that was mended is new"
     assert shown.count("metric 'mine' could not be computed (ZeroDivisionError: division by zero)") == 4
 
 
