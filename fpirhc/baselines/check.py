@@ -337,8 +337,8 @@ def accept(
     task: Task,
     reason: str,
     *,
-    seed: Seed = 0,
-    seeds: Annotated[int, Range("a whole number of at least 2 (8 is usual)", low=2)] = _SEEDS,
+    seed: Seed | None = None,
+    seeds: Annotated[int, Range("a whole number of at least 2 (8 is usual)", low=2)] | None = None,
     baselines: Path | None = None,
     compiled: bool = True,
     processes: Few = 1,
@@ -348,6 +348,8 @@ def accept(
     """Measure every controller under all variants, write the baseline, and return it with its path.
 
     Args:
+        seed: of the run that is compared; None: that of the earlier baseline, 0 without one.
+        seeds: number of seeds for the bands; None: as many as before, 8 without a baseline.
         baselines: folder of the baselines; None: the one beside the problem file.
         working: a folder of the project, outside of which nothing is written; None: the current folder.
         progress: function of (problem, runs done, runs in all) that is called after every run.
@@ -360,6 +362,8 @@ def accept(
     require_reason(reason)
     project = working or Path.cwd()
     check_inside(baseline_path(task.path, baselines), project)
+    before = seeds_of(task, baselines)
+    seed, seeds = (usual if given is None else given for given, usual in zip((seed, seeds), before, strict=True))
     expectations = measure_expected(
         task, list(task.controllers), seed=seed, seeds=seeds, compiled=compiled, processes=processes, progress=progress
     )
@@ -367,10 +371,10 @@ def accept(
     return baseline, write_baseline(task, baseline, baselines, project)
 
 
-def seeds_of(task: Task) -> tuple[int, int]:
-    """Return seed and number of seeds of the baseline beside a problem file; without one, those of a new baseline."""
+def seeds_of(task: Task, baselines: Path | None = None) -> tuple[int, int]:
+    """Return seed and number of seeds of the baseline of a problem file; without one, those of a new baseline."""
     try:
-        earlier = read_baseline(baseline_path(task.path))
+        earlier = read_baseline(baseline_path(task.path, baselines))
     except BaselineError:
         return 0, _SEEDS
     drawn = len(earlier.varied.get(SEEDS, ()))

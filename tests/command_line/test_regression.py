@@ -193,15 +193,18 @@ def test_accept_replaces_a_baseline_and_keeps_the_reason(folder, capsys):
     text = (folder / "noisy.py").read_text() + "metrics = (fp.Metric('mine', lambda problem, run: 1 / 0),)\n"
     (folder / "noisy.py").write_text(text.replace("rate=6.0", "rate=7.0"))
     assert main(["check", "noisy.py", "--no-compile"]) == 6
+    given = ("--seed", "3", "--seeds", "2")
+    assert main(["accept", "noisy.py", "--reason", "other seeds", "--no-compile", *given]) == 0
     assert main(["accept", "noisy.py", "--reason", " faster\n tracking", "--no-compile"]) == 0
-    assert read_baseline(folder / "baselines" / "noisy.json").reason == "faster tracking"
+    accepted = read_baseline(folder / "baselines" / "noisy.json")
+    assert (accepted.reason, accepted.seed, accepted.varied[SEEDS]) == ("faster tracking", 3, ["seed 4"])
     assert main(["check", "noisy.py", "--no-compile"]) == 0
     assert main(["run", "noisy.py", "CTC", "--no-compile"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
     assert "± " in shown
     (folder / "noisy.py").write_text((folder / "noisy.py").read_text().replace("1 / 0", "1.0"))
     assert main(["check", "noisy.py", "--no-compile"]) == ExitCode.CHANGED, "a metric that was mended is new"
-    assert shown.count("metric 'mine' could not be computed (ZeroDivisionError: division by zero)") == 4
+    assert shown.count("metric 'mine' could not be computed (ZeroDivisionError: division by zero)") == 5
 
 
 def signed(facts):

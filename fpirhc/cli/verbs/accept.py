@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_baselines, add_no_compile, add_problem, add_processes, add_seed, whole
+from fpirhc.cli.options import add_baselines, add_no_compile, add_problem, add_processes, whole
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -12,9 +12,10 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     text = "why the new numbers are right; kept in the baseline"
     parser.add_argument("--reason", required=True, metavar="TEXT", help=text)
-    add_seed(parser, "the run that is compared")
-    text = "number of seeds for the bands (default: 8)"
-    parser.add_argument("--seeds", type=whole(2), default=8, metavar="N", help=text)
+    text = "seed of the run that is compared (default: that of the earlier baseline, or 0)"
+    parser.add_argument("--seed", type=whole(0), metavar="K", help=text)
+    text = "number of seeds for the bands (default: as many as before, or 8)"
+    parser.add_argument("--seeds", type=whole(2), metavar="N", help=text)
     add_baselines(parser)
     add_processes(parser)
     add_no_compile(parser)
