@@ -57,7 +57,7 @@ class FixedPoint(Optimiser):
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     hessian: HessianModel | None = None
     damping: NotNegative = 0.0
-    feasible: float = 1e-8
+    feasible: Positive = 1e-8
     most_iterations: Count = 100
     second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 

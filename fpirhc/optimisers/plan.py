@@ -10,6 +10,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.fields.checked import ByName, checked_call
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.optimisers.base import FEASIBLE, Optimiser, first_plan, improved, judge
@@ -164,14 +165,20 @@ def solve(
 
     Raises:
         NotSupported: the optimiser cannot serve the problem.
+        InvalidShape: a state, data or first inputs of another shape.
+        InvalidValue: numbers of them that are not finite.
     """
     optimiser.check(ocp)
+    state = _checked("state", state, (ocp.state.size,))
+    data = _checked("data", data, (ocp.data.size, ocp.stages + 1))
+    if start is not None:
+        start = _checked("start", start, (ocp.input.size, ocp.stages))
     if start is None:
         inputs, diagnostics, _, count = first_plan(optimiser, ocp, state, data, calls=calls)
     else:
         layout = optimiser.memory(ocp)
         memory = layout.start()
-        memory[layout.slice("plan_inputs")] = np.asarray(start, dtype=float).ravel(order="F")
+        memory[layout.slice("plan_inputs")] = start.ravel(order="F")
         inputs, diagnostics, _, count = improved(optimiser, ocp, state, data, memory, calls=calls)
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     status = Status(int(diagnostics[4]))
@@ -189,6 +196,16 @@ def solve(
         np.asarray(ca.DM(data).full()),
         (ocp.input_lower, ocp.input_upper),
     )
+
+
+def _checked(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The value as an array of this shape, which a column may have in place of a vector."""
+    array = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
+    if array.shape not in (shape, (*shape, 1)):
+        raise InvalidShape(f"solve: {name} has the shape {array.shape}, expected {shape}")
+    if not np.isfinite(array).all():
+        raise InvalidValue(f"solve: {name} is not finite")
+    return array.reshape(shape)
 
 
 def _apart(value: float, by: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from test_certificate import PROBLEMS, first_horizon
 
 import fpirhc as fp
 from fpirhc.controllers.contract import with_optimiser
+from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 
@@ -125,3 +127,20 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
     run = fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
     assert run["command"].min() > 40.0
     assert fp.measure(problem, run).rms_error["h2"] < 0.03
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"state": np.zeros(3)}, InvalidShape, "state has the shape (3,), expected (4,)"),
+        ({"data": np.zeros((2, 2))}, InvalidShape, "data has the shape (2, 2), expected"),
+        ({"start": np.zeros((3, 3))}, InvalidShape, "start has the shape (3, 3), expected (2, 20)"),
+        ({"state": np.full(4, np.nan)}, InvalidValue, "state is not finite"),
+    ],
+)
+def test_what_is_solved_has_its_shape(change, error, text):
+    ocp, data, first = first_horizon("two_mass")
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-8)
+    every = {"state": first, "data": data, **change}
+    with pytest.raises(error, match=re.escape(text)):
+        fp.solve(ocp, optimiser, every.pop("state"), every.pop("data"), **every)
