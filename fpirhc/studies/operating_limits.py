@@ -274,8 +274,9 @@ def _left(problem: Problem, run: Run) -> str:
     signal = "plant_state" if "plant_state" in run.layout else "state"
     begin = min(round(problem.measure_from / problem.period), max(run.cycles - 1, 0))
     for name, (lower, upper) in problem.limits.states.items():
-        width = upper - lower if math.isfinite(upper - lower) else abs(upper if math.isfinite(upper) else lower)
         values = run[f"{signal}.{name}"][begin:]
+        width = upper - lower if math.isfinite(upper - lower) else abs(upper if math.isfinite(upper) else lower)
+        width = width or float(np.abs(values).max())  # the only limit is zero
         if values.min() < lower - _OUTSIDE * width or values.max() > upper + _OUTSIDE * width:
             return f"{name} leaves its limits"
     return ""

@@ -170,7 +170,7 @@ def test_a_controller_that_fails_as_the_problem_stands():
 
 
 def test_a_state_that_leaves_its_limits_has_failed():
-    """The error is small, and y passes the limit of 0.9 m that its reference keeps."""
+    """The error is small, and y passes the limit of 0.9 m that its reference keeps. Beside a limit of 0 its own size counts."""
     problem = pump(
         reference=fp.Trajectory(lambda t: {"y": 0.8 * ca.sin(t)}),
         start={"y": 0.0},
@@ -181,6 +181,9 @@ def test_a_state_that_leaves_its_limits_has_failed():
     one = limit_of("latency", problem=problem)
     assert one.why == "y leaves its limits"
     assert {p.value: p.error for p in one.points}[one.fails] < 0.5
+    touching = fp.Trajectory(lambda t: {"y": 0.4 * (1 - ca.cos(t))})
+    above = replace(problem, reference=touching, limits=fp.Limits(states={"y": (0.0, math.inf)}))
+    assert limit_of("latency", problem=above).holds > 0
 
 
 def test_a_refusal_far_from_the_problem_is_a_limit(monkeypatch):
