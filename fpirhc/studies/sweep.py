@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEDGER = "sweep.jsonl"
-_MOST = 2  # settings of a map
+_MOST, _CELLS = 2, 1_000_000  # settings of a map, and its cells
 _BLOCK = 64  # cells that run side by side, and are finished together
 _LOG = "log"
 _TIMES = ("dead_time", "duration", "measure_from", "period")  # fields of a problem
@@ -93,6 +93,8 @@ class Axis:
             raise InvalidValue(
                 f"--over {text}: an empty range; expected two different finite ends and at least 2 values"
             )
+        if count > _CELLS:
+            raise InvalidValue(f"--over {text}: expected at most {_CELLS} values, got {count}")
         logarithmic = bool(parts[3:])
         if logarithmic and not low * high > 0:
             raise InvalidValue(f"--over {text}: equal factors need two ends of one sign that are not zero")
@@ -267,6 +269,8 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
         raise InvalidValue(
             f"a sweep has one setting or two, got {len(axes)}; a third one is another sweep, with run --set"
         )
+    if (cells := math.prod(len(axis.values) for axis in axes)) > _CELLS:
+        raise InvalidValue(f"a sweep has at most {_CELLS} cells, got {cells}: give fewer values")
     if len({axis.path for axis in axes}) < len(axes):
         raise InvalidValue(f"'{axes[0].path}' is given twice")
     words = {f.name for f in fields(task.problem)} | {*PARAMETERS, START}

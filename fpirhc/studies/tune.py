@@ -34,6 +34,7 @@ from fpirhc.studies.view import Progress
 from fpirhc.symbolic.paths import content_at, paths_to
 
 LEDGER = "trials.jsonl"
+_MOST = 1_000_000  # trials, all of which a proposal follows from
 _REGISTER = 8  # runs of a generation from which they are side by side
 _PRESENT = -1  # number of the trial of the settings as they are, which no budget counts
 
@@ -147,8 +148,8 @@ def tune(
     optuna = _optuna()
     names = _tunable(task, controllers)
     for what, value in (("trials", trials), ("population", population)):
-        if value < 1:
-            raise InvalidValue(f"{what} {value}: expected at least 1")
+        if not 1 <= value <= _MOST:
+            raise InvalidValue(f"{what} {value}: expected at least 1, and at most {_MOST}")
     # One scenario may be without draws: it is the problem itself.
     numbers = scenario_numbers(task, None if cases is not None and count == 1 else count, percent, cases, same=True)
     # A generation is a call of its own, so its runs alone fill a register.

@@ -402,6 +402,7 @@ compare mine.py --headline effort.torque => metric 'effort' has no better direct
 compare mine.py --headline '' => metric '' is unknown. Valid: relative error, cycles, rms_error
 compare mine.py --tuned gone.json => 'gone.json': No such file ... 'fpirhc tune mine' writes such a file
 compare mine.py --scenarios 0 => --scenarios: expected a whole number of at least 1, got '0'.
+compare mine.py --scenarios 10000000000 --mismatch 9 => scenarios 10000000000: expected at least 1, and at most 10000000
 compare mine.py --processes 2 => --processes needs --scenarios N, the number of scenarios
 compare two_mass --optimisers all --controllers CTC => plans with an optimiser
 run mine.py RHC RHC+FPI => 'RHC+FPI' is a word too many; write fpirhc run PROBLEM CONTROLLER [options].
@@ -417,6 +418,7 @@ run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.
 solve mine.py --tolerance 0 => --tolerance: expected a number above 0, got '0'. See fpirhc solve --help.
 solve mine.py --optimisers => --optimisers needs a value: --optimisers NAME. See fpirhc solve --help.
 tune mine.py => no search space for tuning; add to its file ... tuning = {'RHC+FPI': {'deformation.map.gain':
+tune two_mass --trials 10000000000 => trials 10000000000: expected at least 1, and at most 1000000
 tune mine.py --trials 0 => --trials: expected a whole number of at least 1, got '0'.
 tune two_mass --metric settling.qq => metric 'settling.qq' is unknown. Did you mean 'settling.q2'?
 replay mine.py RHC => FILE (CSV file: time, what the controller is given, and the inputs

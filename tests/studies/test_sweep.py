@@ -152,6 +152,7 @@ WRONG = {
     "exact.b=1:1:5": "an empty range; expected two different finite ends and at least 2 values",
     "exact.b=1:2:1": "an empty range",
     "exact.b=1:inf:3": "an empty range",
+    "exact.b=1:2:10000000000": "expected at most 1000000 values",
     "exact.b=-1:1:3:log": "equal factors need two ends of one sign that are not zero",
     "exact.b=1:2:3:lin": "expected PATH=LOW:HIGH:COUNT",
     "exact.bb=1:2:3": "'exact.NAME' has a parameter of what moves, and there is no 'bb'. Did you mean 'b'?",

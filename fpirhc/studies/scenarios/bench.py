@@ -31,6 +31,7 @@ from fpirhc.studies.view import finite_alone
 from fpirhc.task.problem import Problem
 
 _BLOCK = 64  # scenarios that run side by side
+_MOST = 10_000_000  # scenarios of a study: a table of their places is kept
 SIDE_BY_SIDE = 64  # scenarios from which it pays to compile a loop for lanes
 
 
@@ -357,8 +358,8 @@ def scenario_numbers(
         for name in wanted:  # what is wrong with a case is said before the first run
             task.cases.problem(name, task.problem)
         return [task.cases.names.index(name) for name in wanted]
-    if count is None or count < 1:
-        raise InvalidValue(f"scenarios {count}: expected at least 1")
+    if count is None or not 1 <= count <= _MOST:
+        raise InvalidValue(f"scenarios {count}: expected at least 1, and at most {_MOST}")
     if not same and not _differ(task.problem, percent):
         mend = "give --mismatch P" if not percent else "state parameters of the plant, or a dead time"
         raise InvalidValue(
