@@ -10,31 +10,26 @@ frames are bad answers; remote frames, which ask for a value, are none.
 
 from __future__ import annotations
 
-import re
 import struct
 import time as wall
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fpirhc.adapters.names import adapter, require, require_methods
+from fpirhc.adapters.names import InMessage, adapter, in_format, require, require_methods
 from fpirhc.adapters.real_time import RealTime, Setup, device
-from fpirhc.errors import InvalidProblem, InvalidValue, package
-from fpirhc.fields.checked import Checked
+from fpirhc.errors import InvalidProblem, package
 from fpirhc.fields.kinds import CountOrZero, Nonzero
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
-_NUMBER = re.compile(r"[@=<>!]?[bBhHiIlLqQefd?]")
-_LONGEST = 64  # bytes of a message of CAN FD
-
 
 @dataclass(frozen=True)
-class Field(Checked):
+class Field(InMessage):
     """Where a value is: the identifier of its message, its format (see `struct`) at a byte, and value = scale x number.
 
     Raises:
-        InvalidValue: a format of no number, or of several; an identifier or a place that no message has.
+        InvalidValue: a format of no number, or of several; an identifier of too many bits.
     """
 
     identifier: CountOrZero
@@ -42,18 +37,6 @@ class Field(Checked):
     byte: CountOrZero = 0
     scale: Nonzero = 1.0
     extended: bool = False
-
-    def __post_init__(self) -> None:
-        if not _NUMBER.fullmatch(self.format):
-            raise InvalidValue(
-                f"Field.format: expected that of one number, such as '<f', '>h' or 'B', got {self.format!r}"
-            )
-        bits, end = 29 if self.extended else 11, self.byte + struct.calcsize(self.format)
-        if self.identifier >> bits:
-            wide = "" if self.extended else "; a larger one needs extended=True"
-            raise InvalidValue(f"Field.identifier: expected one of {bits} bits, got 0x{self.identifier:X}{wide}")
-        if end > _LONGEST:
-            raise InvalidValue(f"Field.byte: a message has at most {_LONGEST} bytes, and the field ends at byte {end}")
 
 
 @adapter
@@ -105,8 +88,7 @@ class _Traffic:
         for at, value in zip(self._sent, command, strict=True):
             content = data.setdefault((at.identifier, at.extended), bytearray())
             content.extend(bytes(max(at.byte + struct.calcsize(at.format) - len(content), 0)))
-            number = float(value) / at.scale
-            struct.pack_into(at.format, content, at.byte, number if at.format[-1] in "efd" else round(number))
+            struct.pack_into(at.format, content, at.byte, in_format(at.format, float(value) / at.scale))
         for (identifier, wide), content in data.items():
             self._bus.send(self._can.Message(arbitration_id=identifier, data=content, is_extended_id=wide))
 

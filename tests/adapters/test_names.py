@@ -108,11 +108,7 @@ def test_a_derivative_beyond_the_second_is_a_mistake():
     [
         ({"format": "zz"}, "Field.format: expected that of one number, such as '<f', '>h' or 'B', got 'zz'"),
         ({"format": "<ff"}, "got '<ff'"),
-        (
-            {"identifier": 0x18FF},
-            "Field.identifier: expected one of 11 bits, got 0x18FF; a larger one needs extended=True",
-        ),
-        ({"byte": 62}, "at most 64 bytes, and the field ends at byte 66"),
+        ({"identifier": 0x18FF}, "Field.identifier: 0x18FF has more than 11 bits; with extended=True it has 29"),
     ],
 )
 def test_a_field_that_no_message_has_is_refused(field, message):
