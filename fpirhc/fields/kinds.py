@@ -132,7 +132,8 @@ Product: TypeAlias = Annotated[  # of effective gain and eigenvalue, with which 
     Range("effective gain times eigenvalue above 0 and below 2", low=0.0, high=2.0, open_low=True, open_high=True),
 ]
 Count: TypeAlias = Annotated[int, whole(1, 1_000_000)]
-Few: TypeAlias = Annotated[int, whole(1, 1000)]
+FEW = 1000
+Few: TypeAlias = Annotated[int, whole(1, FEW)]
 Seed: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]  # of random numbers
 CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]
 

@@ -306,10 +306,11 @@ def curvature_at_rest(along: _ReferenceExpansion, step: float) -> np.ndarray:
     An input without curvature gets the largest curvature of the others, or 1 where no input has one.
     """
     slope, total = along.b[0], along.r[0].diagonal().copy()
-    for a, q in zip(along.a[1:], along.q[1:], strict=True):
-        total += np.einsum("ik,ij,jk->k", slope, q, slope)
-        slope = a @ slope
-    total = np.abs(total + np.einsum("ik,ij,jk->k", slope, along.final, slope)) / step
+    with np.errstate(all="ignore"):
+        for a, q in zip(along.a[1:], along.q[1:], strict=True):
+            total += np.einsum("ik,ij,jk->k", slope, q, slope)
+            slope = a @ slope
+        total = np.abs(total + np.einsum("ik,ij,jk->k", slope, along.final, slope)) / step
     usable = np.isfinite(total) & (total > 0)
     return np.where(usable, total, total[usable].max() if usable.any() else 1.0)
 
@@ -317,9 +318,12 @@ def curvature_at_rest(along: _ReferenceExpansion, step: float) -> np.ndarray:
 def answered_curvature(along: _ReferenceExpansion) -> np.ndarray:
     """Return the diagonal of Q_uu (nu,) of the first stage, by a Riccati sweep; it may be no positive number."""
     value = along.final
-    for a, b, q, s, r in zip(*(v[::-1] for v in (along.a, along.b, along.q, along.s, along.r)), strict=True):
-        q_uu, cross = r + b.T @ value @ b, s + b.T @ value @ a
-        value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(q_uu, cross, rcond=None)[0]
+    with np.errstate(all="ignore"):  # of a step that grows beyond every number
+        for a, b, q, s, r in zip(*(v[::-1] for v in (along.a, along.b, along.q, along.s, along.r)), strict=True):
+            q_uu, cross = r + b.T @ value @ b, s + b.T @ value @ a
+            if not (np.isfinite(q_uu).all() and np.isfinite(cross).all()):
+                return np.full(len(q_uu), np.nan)
+            value = q + a.T @ value @ a - cross.T @ np.linalg.lstsq(q_uu, cross, rcond=None)[0]
     return np.asarray(q_uu.diagonal())
 
 

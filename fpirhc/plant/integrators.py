@@ -9,16 +9,16 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import TypeAlias, cast
+from typing import Self, TypeAlias, cast
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Accuracy, Few
+from fpirhc.fields.kinds import FEW, Accuracy, Few
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
@@ -37,7 +37,7 @@ class Integrator(Checked, ABC):
         """Whether it moves maps; False for what integrates differential equations."""
         return False
 
-    def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
+    def finer(self, times: int) -> Self | None:  # noqa: ARG002
         """The same method with about `times` times the work; None where it has no such setting."""
         return None
 
@@ -71,7 +71,18 @@ class Integrator(Checked, ABC):
 
 
 @dataclass(frozen=True)
-class RungeKutta4(Integrator):
+class _Substepped(Integrator):
+    """Equal sub-steps of one method; `finer` has more of them, as many as there may be."""
+
+    substeps: Few = 1
+
+    def finer(self, times: int) -> Self | None:
+        more = self.substeps * times
+        return replace(self, substeps=more) if more <= FEW else None
+
+
+@dataclass(frozen=True)
+class RungeKutta4(_Substepped):
     """Classical fourth-order Runge-Kutta with equal sub-steps: local error O(h^5), global O(h^4).
 
     Args:
@@ -80,11 +91,6 @@ class RungeKutta4(Integrator):
     Raises:
         InvalidValue: fewer than one sub-step.
     """
-
-    substeps: Few = 1
-
-    def finer(self, times: int) -> RungeKutta4:
-        return RungeKutta4(self.substeps * times)
 
     def growth(self, modes: np.ndarray) -> np.ndarray:
         """|1 + z + z^2/2 + z^3/6 + z^4/24|^n at z/n, n sub-steps."""
@@ -103,7 +109,7 @@ class RungeKutta4(Integrator):
 
 
 @dataclass(frozen=True)
-class Euler(Integrator):
+class Euler(_Substepped):
     """Explicit Euler with equal sub-steps: x+ = x + h f(x, u). First order, as in the horizons of the original papers.
 
     Args:
@@ -112,8 +118,6 @@ class Euler(Integrator):
     Raises:
         InvalidValue: fewer than one sub-step.
     """
-
-    substeps: Few = 1
 
     def growth(self, modes: np.ndarray) -> np.ndarray:
         """|1 + z/n|^n, n sub-steps."""
@@ -296,10 +300,9 @@ _Coefficients: TypeAlias = tuple[np.ndarray, np.ndarray]  # a (stages, stages) a
 
 
 @dataclass(frozen=True)
-class _Implicit(Integrator):
+class _Implicit(_Substepped):
     """Sub-steps of one implicit method, each with a fixed number of Newton steps."""
 
-    substeps: Few = 1
     newton: Few = 3
 
     @property

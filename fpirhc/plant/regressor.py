@@ -254,11 +254,14 @@ def _check_linear(regressor: Regressor) -> None:
         x, r, p = _point(plant, random)
         wanted = plant.equations.inverse(x, r, p).full()
         y, rest = (m.full() for m in regressor.function(x, r, p))
-        error = y @ regressor.theta_function(p).full() + rest - wanted
+        terms = y * regressor.theta_function(p).full().T
+        error = terms.sum(axis=1, keepdims=True) + rest - wanted
         if np.isfinite(error).all():
             tried += 1
-            worst = max(worst, float(np.abs(error).max() / (1 + np.abs(wanted).max())))
-            entering |= np.abs(y).max(axis=0) > _TOLERANCE
+            # Each force by the size of its own terms: forces have units of their own.
+            sizes = np.maximum(np.abs(terms).sum(axis=1, keepdims=True) + np.abs(rest) + np.abs(wanted), 1e-300)
+            worst = max(worst, float((np.abs(error) / sizes).max()))
+            entering |= (np.abs(terms) > _TOLERANCE * sizes).any(axis=0)
     if not tried:
         raise InvalidValue("Regressor: the inverse dynamics is not finite at any random state; give Plant(inverse=...)")
     if worst > _TOLERANCE:
@@ -303,9 +306,10 @@ def _nonlinear_pairs(plant: Plant) -> np.ndarray:
         value, first, curved = (np.asarray(m.full()) for m in second(*point))
         if not np.isfinite(curved).all():
             continue
-        sizes = np.abs(point[2]) + 1e-3
-        terms = np.abs(curved.reshape((count, len(plant.names), count))).max(axis=1) * np.outer(sizes, sizes)
-        nonlinear |= terms > _TOLERANCE * (1 + np.abs(value).max() + np.abs(first * sizes).max())
+        sizes = np.abs(point[2])
+        terms = np.abs(curved.reshape((count, len(plant.names), count))) * sizes[:, None, None] * sizes
+        forces = np.abs(value).ravel() + (np.abs(first) * sizes).sum(axis=1)
+        nonlinear |= (terms > _TOLERANCE * forces[:, None]).any(axis=1)
     return nonlinear
 
 

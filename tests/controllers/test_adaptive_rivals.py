@@ -238,6 +238,16 @@ def test_projection_shrinks_the_parameter_error(gain, widths):
     assert errors[-1] < 0.1 * errors[0]
 
 
+def test_the_unit_of_a_response_does_not_matter_to_projection():
+    """A response in other units than its neighbour changes no step."""
+    change = rule_step(fp.Projection(0.5), {"p0": (0.0, 1.0), "p1": (0.0, 1.0)}, rows=2)
+    matrix, error = np.array([[1.0, 0.5], [0.3, 1.0]]), np.array([0.25, 0.16])
+    for unit in (1e-6, 1e6):
+        scale = np.array([1.0, unit])
+        found, wanted = change(matrix * scale[:, None], error * scale).full(), change(matrix, error).full()
+        np.testing.assert_allclose(found, wanted, rtol=1e-9)
+
+
 def test_dead_zone_ends_learning():
     """Below it nothing moves; beyond it the step grows from zero."""
     bounds = {"p0": (0.0, 1.0), "p1": (0.0, 1.0)}

@@ -24,7 +24,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import output_chain
 from fpirhc.controllers.slots.slotted import floquet_radius
-from fpirhc.errors import FpirhcError, InvalidValue
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Named
 
@@ -580,6 +580,14 @@ def test_blanked_cycles_keep_the_distance():
             distance = away[k : k + 6, int(result["slot"][k, 0])]
             assert np.ptp(distance[:4]) < 1e-9 if blank else np.ptp(distance[:4]) > 1e-3
             assert abs(distance[4] - distance[3]) > 1e-5
+
+
+def test_a_map_that_would_never_learn_is_refused():
+    slots = replace(SHIPPED.crane_slots.controllers["slots+FPI"], blank=10**6)
+    with pytest.raises(
+        InvalidProblem, match=r"slot 'cart' lasts .* cycles, and its map learns nothing in the first blank"
+    ):
+        slots.check(SHIPPED.crane_slots.problem)
 
 
 def test_too_little_gain_holds_the_command():

@@ -16,7 +16,7 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
-from fpirhc.learning.estimators.base import Seen
+from fpirhc.learning.estimators.base import Seen, forgetting_factor
 from fpirhc.plant.disturbed import disturbed
 from fpirhc.symbolic.expression import expression
 
@@ -304,6 +304,11 @@ def test_a_disturbed_plant():
 def test_bad_settings_are_refused(build, message):
     with pytest.raises(InvalidValue, match=message):
         build()
+
+
+def test_a_pair_is_not_forgotten_before_the_next_one_comes():
+    with pytest.raises(InvalidValue, match=r"time of forgetting is 0.001, shorter than the control cycle of 0.002"):
+        forgetting_factor(1e-3, 2e-3)
 
 
 TWO = fp.Plant(

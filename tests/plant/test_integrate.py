@@ -89,7 +89,9 @@ def test_implicit_methods_are_exact_on_linear_plants_with_one_newton_step():
         assert float(next_state) == pytest.approx(pole, rel=1e-14)
 
 
-@pytest.mark.parametrize("method", [fp.ImplicitMidpoint, fp.RadauIIA, fp.Euler])
+@pytest.mark.parametrize("method", [fp.ImplicitMidpoint, fp.RadauIIA, fp.Euler, fp.RungeKutta4])
 def test_counts_are_checked(method):
     with pytest.raises(InvalidValue, match="expected a whole number from 1 to"):
         method(0)
+    assert method(3).finer(2) == method(6)
+    assert method(600).finer(2) is None  # beyond what there may be

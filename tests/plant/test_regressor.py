@@ -149,6 +149,21 @@ def test_linear_parameters_are_found():
     assert linear_parameters(fp.load_problem("two_link_arm").problem.plant) == ("I1", "Ie", "b")
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_the_unit_of_force_changes_no_verdict(unit):
+    """A pendulum whose torque counts in this unit: its mass enters linearly, its length does not."""
+    plant = fp.Plant(
+        coordinates={"a": "rad"},
+        inputs={"torque": "N m"},
+        response=lambda q, v, u, p: {"a": (unit * u.torque - p.m * 9.81 * p.l * ca.sin(q.a)) / (p.m * p.l**2)},
+        parameters={"m": fp.Parameter(1.0, 1.5, "kg"), "l": fp.Parameter(0.5, 0.6, "m")},
+    )
+    assert Regressor(plant, ("m",)).names == ("m",)
+    assert linear_parameters(plant) == ()
+    with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly"):
+        Regressor(plant, ("l",))
+
+
 def test_parameters_that_enter_nonlinearly_are_refused_by_name():
     with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly; in products: 'm' with 'l'.*Combination"):
         Regressor(pendulum(), ("m", "l"))

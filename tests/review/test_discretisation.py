@@ -53,6 +53,17 @@ def test_poles_of_a_stage(method, verdict, pole):
     assert answer.numbers["largest_pole"] == pytest.approx(abs(pole), abs=2e-3)
 
 
+def test_a_stage_that_grows_beyond_every_number_is_a_no():
+    """The plan cannot be rolled out; the review says so, and which discretisation can."""
+    plant = replace(PLANT, parameters={"rate": fp.Parameter(1e40, 1e40, "1/s")})
+    problem = replace(PROBLEM, plant=plant, horizon=replace(HORIZON, discretisation=fp.RungeKutta4(8)))
+    answer = discretisation_follows(review_grid(problem, 0.0, 0))
+    assert answer is not None
+    assert answer.verdict == Verdict.NO
+    assert "Use Horizon(discretisation=RadauIIA())" in answer.change
+    assert answers(problem, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)))
+
+
 def test_a_problem_without_a_horizon_is_not_asked():
     assert discretisation_follows(review_grid(replace(PROBLEM, horizon=None, cost=None), 0.0, 0)) is None
 

@@ -144,10 +144,23 @@ class Slotted(Controller):
         if names:
             self.schedule.check(list(dict.fromkeys(names)), problem, mistakes)
         mistakes.raise_if_any()
+        self._check_blank(problem)
         channels = self.channels(problem)
         for one in channels:
             _check_gain(problem, one)
         self._check_growth(problem, channels)
+
+    def _check_blank(self, problem: Problem) -> None:
+        """Raise where a slot that adapts is over before its map learns."""
+        dwells, mistakes = self.schedule.dwells([s.coordinate for s in self.slots], problem), Mistakes("Slotted")
+        for one in self.slots:
+            cycles = dwells[one.coordinate] / problem.period
+            if one.deformation.adapts and self.blank >= cycles * (1 + 1e-9):
+                mistakes.add(
+                    f"slot '{one.coordinate}' lasts {cycles:.4g} cycles, and its map learns nothing in the first "
+                    f"blank = {self.blank}; choose a smaller blank"
+                )
+        mistakes.raise_if_any()
 
     def _check_growth(self, problem: Problem, channels: Sequence[Channel]) -> None:
         """Raise where zero dynamics grow too much by the model at the reference's last point; it needs a set-point there."""

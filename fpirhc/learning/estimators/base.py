@@ -21,7 +21,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Deviation, Range
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Layout
-from fpirhc.symbolic.live import Following
+from fpirhc.symbolic.live import Following, nominal
 from fpirhc.task.problem import Problem
 
 
@@ -190,5 +190,11 @@ def deviations(parameters: Mapping[str, Uncertain]) -> ca.DM:
 
 
 def forgetting_factor(time: float, period: float) -> float:
-    """Factor of a pair's weight from one cycle to the next, exp(-period / time)."""
+    """Factor of a pair's weight from one cycle to the next, exp(-period / time).
+
+    Raises:
+        InvalidValue: a time below the period: a pair would be forgotten before the next one comes.
+    """
+    if nominal(time) < period:
+        raise InvalidValue(f"the time of forgetting is {nominal(time):g}, shorter than the control cycle of {period:g}")
     return math.exp(-period / time)

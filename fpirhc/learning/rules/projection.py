@@ -13,7 +13,7 @@ from fpirhc.fields.kinds import NotNegative, Range
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.layout import Expression
 
-_RELATIVE = 1e-9  # of the trace of the matrix that is inverted: a response without information changes nothing
+_RELATIVE = 1e-9  # of the diagonal of the matrix that is inverted: a response without information changes nothing
 
 
 _CONVERGENT = Range("a number between 0 and 2, both excluded", 0.0, 2.0, open_low=True, open_high=True)
@@ -24,14 +24,15 @@ class Projection(Rule):
     """p_hat+ = p_hat + gamma W G^T (G W G^T + eps I)^-1 h, gated; h = G (p - p_hat) is the response error of the model.
 
     With exact data every step shrinks |W^(-1/2) (p - p_hat)| for 0 < gamma < 2, with or without excitation (Kaczmarz; normalised
-    least mean squares). W is diagonal, the squared widths of the parameters' bounds, so that units do not matter. Unlike a gradient
-    of tracking errors it also learns while a deformation keeps these errors small, and while the command is clipped. A changing
-    estimate is itself a disturbance, and noise of the response acts like a wrong model: choose gamma well below 1, and a dead zone
-    above the noise.
+    least mean squares). W is diagonal, the squared widths of the parameters' bounds, and each response is divided by its own size,
+    so that units do not matter. Unlike a gradient of tracking errors it also learns while a deformation keeps these errors small,
+    and while the command is clipped. A changing estimate is itself a disturbance, and noise of the response acts like a wrong
+    model: choose gamma well below 1, and a dead zone above the noise.
 
     Args:
         gain: gamma, between 0 and 2.
-        dead_zone: |h| below which the estimate stays, in units of the response; above it the step grows as (|h| - dead_zone) / |h|.
+        dead_zone: |h| over all responses below which the estimate stays, in their unit; above it the step grows as
+            (|h| - dead_zone) / |h|.
 
     References:
         G. C. Goodwin, K. S. Sin, Adaptive Filtering, Prediction and Control, Prentice-Hall 1984, ch. 3 (projection, dead zone).
@@ -58,12 +59,15 @@ class Projection(Rule):
         del period
         matrix, error = evidence.equation()
         widths = ca.DM([(upper - lower) ** 2 for lower, upper in bounds.values()])
-        spread = ca.mtimes(matrix, ca.diag(widths))
-        square = ca.mtimes(spread, matrix.T)
-        trace, size = ca.trace(square), ca.sqrt(ca.sumsqr(error))
-        square += (_RELATIVE * trace + (trace <= 0)) * ca.DM.eye(error.numel())
+        size = ca.sqrt(ca.sumsqr(error))
         share = self.gain * ca.fmax(size - self.dead_zone, 0) / (size + (size <= 0))
-        return share * ca.mtimes(spread.T, ca.solve(square, error))
+        # Every response by its own size: they have units of their own.
+        sizes = ca.sqrt(ca.mtimes(matrix**2, widths))
+        sizes += sizes <= 0
+        matrix = matrix / ca.repmat(sizes, 1, widths.numel())
+        spread = ca.mtimes(matrix, ca.diag(widths))
+        square = ca.mtimes(spread, matrix.T) + _RELATIVE * ca.DM.eye(error.numel())
+        return share * ca.mtimes(spread.T, ca.solve(square, error / sizes))
 
 
 EXAMPLES = (Projection(gain=0.02), Projection(gain=0.5, dead_zone=0.1))

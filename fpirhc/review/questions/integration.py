@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.plant.integrators import Integrator, poles, stiffness
+from fpirhc.plant.integrators import Integrator, RadauIIA, poles, stiffness
 from fpirhc.plant.maps import poles_over
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, state_slopes
@@ -62,11 +62,13 @@ def first_place(grid: ReviewGrid, parameters: np.ndarray) -> Place:
 def step_poles(plant: Plant, integrator: Integrator, step: float, place: Place) -> StepPoles:
     """Return the poles of one step at a point."""
     rates = np.linalg.eigvals(state_slopes(plant, place.state, place.command, place.parameters).a)
-    poles = np.linalg.eigvals(_matrix(plant, integrator, step, place))
-    exact = poles_over(plant, rates, step)
-    apart = float(max(np.abs(poles - one).min() for one in exact))
+    exact, matrix = poles_over(plant, rates, step), _matrix(plant, integrator, step, place)
+    fastest, decays = float(np.abs(rates).max()), bool(np.abs(exact).max() <= 1 + 1e-9)
+    if not np.isfinite(matrix).all():  # it grows beyond every number
+        return StepPoles(np.inf, fastest, np.inf, decays)
+    poles = np.linalg.eigvals(matrix)
     return StepPoles(
-        apart, float(np.abs(rates).max()), float(np.abs(poles).max()), bool(np.abs(exact).max() <= 1 + 1e-9)
+        float(max(np.abs(poles - one).min() for one in exact)), fastest, float(np.abs(poles).max()), decays
     )
 
 
@@ -83,7 +85,10 @@ def advice(setting: str, plant: Plant, integrator: Integrator, step: float, plac
         for times in _FINER:
             finer = method.finer(times)
             if finer is not None and step_poles(plant, finer, step, place).follows:
-                return f"Use {setting.format(finer)}, which follows every mode, or {implicit} for modes that need not be followed."
+                other = "" if integrator == RadauIIA() else f", or {implicit} for modes that need not be followed"
+                return f"Use {setting.format(finer)}, which follows every mode{other}."
+    if integrator == RadauIIA():
+        return f"Shorten the step; no number of sub-steps up to {_FINER[-1]} times that in use follows every mode."
     return f"Use {implicit}; no number of explicit sub-steps up to {_FINER[-1]} times that in use follows every mode."
 
 
