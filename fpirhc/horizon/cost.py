@@ -31,7 +31,9 @@ class View:
     state: Named  # the plant's state
     reference: Named  # nominal state; of a plant with outputs, the nominal outputs and their derivatives
     input: Named  # input of the stage
-    input_before: Named  # input of the stage before; NaN unless the cost uses it
+    # input of the stage before; where the stage has another length than `step`, an input from which the change is as large as in
+    # that time, so that rates are the same; NaN unless the cost uses it
+    input_before: Named
     feedforward: Named  # the model's input along the reference; NaN unless the cost uses it
     parameters: Named  # of the model
     time: Expression  # in the problem's unit of time
