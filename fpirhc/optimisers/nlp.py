@@ -247,8 +247,8 @@ class Ipopt(MultipleShooting):
         narrowest = float(np.min(ocp.half_ranges[ocp.half_ranges > 0], initial=1.0))
         return {
             **_QUIET,
-            "ipopt.bound_relax_factor": 1e-8
-            * min(1.0, narrowest),  # its own is 1e-8, in units of the limits' size or 1
+            # by itself it relaxes limits by 1e-8, however small they are
+            "ipopt.bound_relax_factor": 1e-8 * min(1.0, narrowest),
             "ipopt.sb": "yes",
             "ipopt.print_level": 0,
             "ipopt.tol": self.accuracy,
