@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -37,15 +37,17 @@ def plausible_range(problem: Problem, own: Mapping[str, Interval] | None = None)
     Args:
         own: intervals by name, "q1", "q1'", or "q1''" for the response, that replace the automatic ones.
     """
-    columns = _columns(problem)
-    _check(own or {}, columns)
-    shown = {columns[name]: interval for name, interval in _automatic(problem).items() if name in columns}
-    return shown | {columns[name]: interval for name, interval in (own or {}).items()}
+    own, columns = own or {}, _columns(problem)
+    _check(own, columns.values())
+    known = _automatic(problem)
+    # A state behind outputs may have the name of one.
+    ranges = {column: own.get(name, known.get(column, known.get(name))) for column, name in columns.items()}
+    return {column: interval for column, interval in ranges.items() if interval is not None}
 
 
 @lru_cache(maxsize=8)  # every controller of a comparison has the same ones
 def _automatic(problem: Problem) -> Mapping[str, Interval]:
-    """Intervals by the name of the measured quantity."""
+    """Intervals by the name of the measured quantity; of states behind outputs by column."""
     plant, ranges = problem.plant, _behind_outputs(problem)
     responses, values = _largest_responses(problem), _values(problem)
     for name in plant.controlled_names:
@@ -111,28 +113,29 @@ def _plausible_states(task: Problem, along: np.ndarray, generator: np.random.Gen
 
 
 def _behind_outputs(problem: Problem) -> dict[str, Interval]:
-    """Intervals of the states of a plant with outputs, by name."""
+    """Intervals of the states of a plant with outputs, by column."""
     plant, ranges = problem.plant, {}
-    behind = [name for signal in measured_signals(plant)[:-1] for name in signal.elements]
+    behind = [
+        one for signal in measured_signals(plant)[:-1] for one in zip(signal.elements, signal.columns, strict=True)
+    ]
     along = reference_states(nominal(problem), _SAMPLES) if behind else np.zeros((0, 0))
-    for k, name in enumerate(behind):
+    for k, (name, column) in enumerate(behind):
         ends = [*problem.limits.states.get(name, ()), *plant.ranges.get(name, ())]
         seen = np.array([*along[k], problem.start_state[k], *ends], dtype=float)
         middle, reach = _about(seen[np.isfinite(seen)])
         if reach > 0:
-            ranges[name] = (middle - reach, middle + reach)
+            ranges[column] = (middle - reach, middle + reach)
     return ranges
 
 
 def _columns(problem: Problem) -> dict[str, str]:
-    """Column of the sample by the name of the measured quantity."""
+    """Name of the measured quantity by column of the sample."""
     plant, raw = problem.plant, raw_signal(problem)
-    given = given_states(problem) if raw is not None else measured_signals(plant)[:-1]
-    beside = {e: f"{signal.name}.{e}" for signal in given for e in signal.elements}
+    signals = measured_signals(plant) if raw is None else (*given_states(problem), raw)
+    columns = {c: e for signal in signals for c, e in zip(signal.columns, signal.elements, strict=True)}
     if raw is not None:
-        return beside | dict(zip(raw.elements, raw.columns, strict=True))
-    columns = beside | {e: f"{plant.output.name}.{e}" for e in plant.output.elements}
-    return columns | {n: f"realised.{c}" for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
+        return columns
+    return columns | {f"realised.{c}": n for n, c in zip(response_names(plant), plant.controlled_names, strict=True)}
 
 
 def _values(problem: Problem) -> dict[str, np.ndarray]:
@@ -148,9 +151,9 @@ def _values(problem: Problem) -> dict[str, np.ndarray]:
     return values
 
 
-def _check(own: Mapping[str, Interval], columns: Mapping[str, str]) -> None:
+def _check(own: Mapping[str, Interval], names: Iterable[str]) -> None:
     mistakes = Mistakes("plausible")
-    mistakes.unknown("measured quantity", own, columns)
+    mistakes.unknown("measured quantity", own, dict.fromkeys(names))
     for name, interval in own.items():
         try:
             lower, upper = (float(v) for v in interval)

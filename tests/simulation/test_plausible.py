@@ -14,7 +14,7 @@ from fpirhc.controllers.plausible import plausible_range
 from fpirhc.status import Status
 
 PROBLEM = two_masses()
-OF_OUTPUTS = ("anaesthesia",)
+OF_OUTPUTS = ("anaesthesia", "tumour_vessels")  # the second has an output with the name of a state
 
 
 def test_range_of_a_response_holds_what_the_model_can_do():
