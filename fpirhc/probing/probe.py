@@ -182,7 +182,8 @@ def probe(
         why = "the loop refuses every candidate"
     elif try_them and name is None:
         bearing = "" if all(one.bears for one in results.values()) else f", and bore {MARGIN:g} times its gain"
-        why = f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}"
+        since = "" if problem.measure_from else "; errors count from the start on, where measure_from is not stated"
+        why = f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}{since}"
     elif candidates and name is None:
         why = "no candidate bears twice the gain, which one that is not tried has to"
     elif name is not None:

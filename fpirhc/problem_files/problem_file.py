@@ -397,7 +397,7 @@ def _indented(cause: str) -> str:
 def _cause_of(error: Exception) -> str:
     """What an error says, without the place, and with what to write instead."""
     if isinstance(error, InvalidField):
-        return error.text.lstrip()
+        return textwrap.dedent(error.text.strip("\n"))
     if isinstance(error, FpirhcError):
         return str(error)
     cause = explained(error)

@@ -303,8 +303,10 @@ def limit_cause(plain: Entry, adaptive: Entry) -> str:
 
 
 def _comes_from_its_start(entry: Entry, share: float) -> bool:
-    """Whether a command stands at one limit from the first cycle on and at none later, and the first error is the largest."""
+    """Whether the error never grows, or is the largest at first and a command stands at a limit from there on, but not later."""
     command, errors = entry.run["command"], np.abs(entry.run["true_error"])
+    if len(errors) > 1 and (errors[-1] < errors[0]).any() and (np.diff(errors, axis=0) <= 0).all():
+        return True
     first = command[: max(2, int(_AT_FIRST * share * len(command)))]
     stands = (np.ptp(first, axis=0) == 0) & ((first[0] == command.max(axis=0)) | (first[0] == command.min(axis=0)))
     return bool(stands.any() and (errors[0] >= _AT_FIRST * errors.max(axis=0)).any() and np.ptp(command, axis=0).any())

@@ -199,7 +199,7 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
     equal = f", equal in {one.equal}" if one.equal else ""
     numbers = (
         f"median difference of {figure.subject} {figure.difference(difference.median)}{interval}; "
-        f"{figure.better} in {one.better} of {_counted(one.count, what)}{equal}"
+        f"{figure.better} in {one.better} of {counted(one.count, what)}{equal}"
     )
     if one.is_small:
         return f"{one.name} and {baseline.name} have too few {what} for an interval ({numbers})."
@@ -214,13 +214,14 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
     return f"{one.name} and {baseline.name} show no clear difference ({numbers})."
 
 
-def _counted(count: int, what: str) -> str:
+def counted(count: int, what: str) -> str:
+    """Return so many of what there is: '1 scenario', '8 cases'."""
     return f"{count} {what.removesuffix('s') if count == 1 else what}"
 
 
 def _failed(one: Summary, what: str) -> str:
     parts = [f"{n} {outcome}" for outcome, n in one.outcomes.items() if outcome != "finished"]
-    said = f"{one.name} fails in {one.failures} of {_counted(one.count, what)} ({', '.join(parts)})"
+    said = f"{one.name} fails in {one.failures} of {counted(one.count, what)} ({', '.join(parts)})"
     if what == noun(True):
         return f"{said}."
     low, high = map(in_percent, one.failure_share)
@@ -235,7 +236,7 @@ def _nowhere(none: Sequence[Summary], what: str) -> list[str]:
     verb = "fail" if len(none) > 1 else "fails"
     most = in_percent(none[0].failure_share[1])
     return [
-        f"{names} {verb} in none of {_counted(none[0].count, what)}: in at most {most} of what is drawn so, with 95 % confidence."
+        f"{names} {verb} in none of {counted(none[0].count, what)}: in at most {most} of what is drawn so, with 95 % confidence."
     ]
 
 

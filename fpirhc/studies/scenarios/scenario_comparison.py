@@ -14,7 +14,7 @@ from fpirhc.fields.checked import FoundByName
 from fpirhc.simulation.metrics.base import Column as Number
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.objective import Objective
-from fpirhc.studies.scenarios.paired import Record, Summary, noun
+from fpirhc.studies.scenarios.paired import Record, Summary, counted, noun
 from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, in_percent, line, written_out
 
@@ -76,7 +76,7 @@ class ScenarioComparison(Study, FoundByName):
     units: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        counts = f"{self.count} {noun(self.named)}", f"{len(self.summaries)} controllers", f"seed {self.seed}"
+        counts = counted(self.count, noun(self.named)), f"{len(self.summaries)} controllers", f"seed {self.seed}"
         return line(self, self.problem, *counts, self.verdict[0])
 
     def to_dataframe(self) -> pd.DataFrame:
@@ -113,8 +113,8 @@ def _view(comparison: ScenarioComparison) -> View:
     """Return what is said of paired scenarios."""
     drawn = f", exact parameters within {comparison.percent:g} % of the problem's"
     conditions = (
-        f"{comparison.count} {noun(comparison.named)} of seed {comparison.seed}{'' if comparison.named else drawn}, errors from "
-        f"t = {comparison.measure_from:g} {comparison.time_unit} on."
+        f"{counted(comparison.count, noun(comparison.named))} of seed {comparison.seed}{'' if comparison.named else drawn}, "
+        f"errors from t = {comparison.measure_from:g} {comparison.time_unit} on."
     )
     rank_error = max((one.rank_error for one in comparison.summaries), default=0.0)
     if rank_error:
@@ -168,7 +168,7 @@ def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
         *(Column(f"median {c.short}", None) for c in comparison.columns),
         Column("status", None, left=True),
     )
-    title = f"{comparison.problem}: {comparison.count} {noun(comparison.named)}"
+    title = f"{comparison.problem}: {counted(comparison.count, noun(comparison.named))}"
     table = Table(title, heads, conditions)
     for one in comparison.summaries:
         worst = [_number(c, one.worst_metrics) for c in directed]
