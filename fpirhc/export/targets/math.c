@@ -69,28 +69,44 @@ static pair times(pair a, pair b) {
   return sum(p.high, p.low);
 }
 
-/* exp(x + low) = 1 + r + r c / (2 - c) after r = x - n ln 2; c = r + 2 - r coth(r / 2) = r - r^2/6 + r^4/360 - ..., interpolated at
-   Chebyshev's nodes. */
+/* exp(x + low) 2^-n = 1 + r + r c / (2 - c) after r = x + low - n ln 2; c = r + 2 - r coth(r / 2) = r - r^2/6 + r^4/360 - ..., interpolated
+   at Chebyshev's nodes. */
+static double mantissa_of_exp(double x, double low, int* k) {
+  double n = whole(x * 1.4426950408889634), high = x - n * LN2, rest = n * LN2_REST - low, r = high - rest, z = r * r, c;
+  c = 4.1437682605934066e-08 * z - 1.6534060075471242e-06, c = c * z + 6.613756471649627e-05, c = c * z - 2.7777777777564456e-03;
+  c = r - z * (c * z + 1.6666666666666660e-01), *k = (int)n;
+  return 1 + (high + (r * c / (2 - c) - rest));
+}
+
+/* The same of 708 and more, and of what is not a number. */
+static double far_exponential(double x, double low) {
+  int k;
+  if (x != x) return x;
+  if (x > 709.79) return HUGE_VAL;
+  if (x < -745.2) return 0;
+  x = mantissa_of_exp(x, low, &k);
+  return scaled(x, k);
+}
+
 static double exponential(double x, double low) {
-  double n, high, rest, r, z, c = 4.1437682605934066e-08;
-  int far = ((unsigned long)(bits_of(x) >> 32) & 0x7ffffffful) >= 0x40862000ul; /* 708 and more, or not a number */
-  if (far) {
-    if (x != x) return x;
-    if (x > 709.79) return HUGE_VAL;
-    if (x < -745.2) return 0;
-  }
-  n = whole(x * 1.4426950408889634), high = x - n * LN2, rest = n * LN2_REST - low, r = high - rest;
-  z = r * r, c = c * z - 1.6534060075471242e-06, c = c * z + 6.613756471649627e-05, c = c * z - 2.7777777777564456e-03;
-  c = r - z * (c * z + 1.6666666666666660e-01);
-  r = 1 + (high + (r * c / (2 - c) - rest));
-  return far ? scaled(r, (int)n) : r * power_of_2((int)n);
+  int k;
+  if (!(fabs(x) < 708)) return far_exponential(x, low);
+  x = mantissa_of_exp(x, low, &k);
+  return x * power_of_2(k);
+}
+
+/* Written out: the rest that is 0 needs no instructions. */
+double @name@_exp(double x) {
+  int k;
+  if (!(fabs(x) < 708)) return far_exponential(x, 0);
+  x = mantissa_of_exp(x, 0, &k);
+  return x * power_of_2(k);
 }
 
 /* x = m 2^k with m between sqrt(1/2) and sqrt(2), to six digits, of the bits of a number that has all of its digits. */
 static double parted(unsigned long long bits, int* k) {
-  bits += 0x3ff0000000000000u - 0x3fe6a09e00000000u;
-  *k = (int)(bits >> 52) - 1023;
-  return of_bits((bits & 0xfffffffffffffu) + 0x3fe6a09e00000000u);
+  *k = (int)((bits + 0x3ff0000000000000u - 0x3fe6a09e00000000u) >> 52) - 1023;
+  return of_bits(bits - ((unsigned long long)*k << 52));
 }
 
 /* The same of every number above zero. */
@@ -107,8 +123,6 @@ static int has_no_log(double x, double* value) {
   *value = x > 0 || x != x ? x : x == 0 ? -HUGE_VAL : (x - x) / (x - x);
   return 1;
 }
-
-double @name@_exp(double x) { return exponential(x, 0); }
 
 /* log(1 + f) = 2 atanh(s), s = f / (2 + f) = f - f^2/2 + s (f^2/2 + R); R is interpolated at Chebyshev's nodes. */
 double @name@_log(double x) {
@@ -162,21 +176,27 @@ double @name@_pow(double x, double y) {
   return sign * exponential(p.high, p.low + y * l.low);
 }
 
-/* x less the nearest multiple of pi / 2 as a sum of two, and the quarter turn that it is in. */
-static pair reduced(double x, int* quarter) {
-  static const double LARGE = 1048576.0; /* 2^20: whole turns */
+static const double LARGE = 1048576.0; /* 2^20: whole turns */
+
+/* x less whole turns, where it is large, as a sum of two. */
+static pair unturned(double x) {
   double n;
   pair r, p;
   int k;
   if (fabs(x) > 1e12) x = fmod(x, LARGE * LARGE);
-  *quarter = 0;
   r.high = x, r.low = 0;
-  if (fabs(x) > LARGE) {
-    n = whole(x * (0.63661977236758138 / LARGE)) * LARGE;
-    for (k = 0; k < 4; ++k) p = sum(r.high, -(n * TURN[k])), r.low += p.low, r.high = p.high;
-    r = sum(r.high, r.low);
-  }
-  n = whole(r.high * 0.63661977236758138), *quarter = (int)n & 3; /* below 2^20 */
+  if (fabs(x) <= LARGE) return r;
+  n = whole(x * (0.63661977236758138 / LARGE)) * LARGE;
+  for (k = 0; k < 4; ++k) p = sum(r.high, -(n * TURN[k])), r.low += p.low, r.high = p.high;
+  return sum(r.high, r.low);
+}
+
+/* r less the nearest multiple of pi / 2, and the quarter turn that it is in. */
+static pair reduced(pair r, int* quarter) {
+  double n = whole(r.high * 0.63661977236758138);
+  pair p;
+  int k;
+  *quarter = (int)n & 3; /* below 2^20 */
   if (n == 0) return r;
   r.high -= n * TURN[0]; /* without rounding */
   p = sum(r.high, -(n * TURN[1])), r.low += p.low, r.high = p.high;
@@ -190,8 +210,12 @@ static double wave(double x, int turn) {
   double z, q, value;
   pair r;
   int quarter;
-  if (!(x - x == 0)) return x - x;
-  r = reduced(x, &quarter), quarter += turn, z = r.high * r.high;
+  r.high = x, r.low = 0;
+  if (!(fabs(x) <= LARGE)) {
+    if (!(x - x == 0)) return x - x;
+    r = unturned(x);
+  }
+  r = reduced(r, &quarter), quarter += turn, z = r.high * r.high;
   if (quarter & 1) {
     q = -1.1382614868556325e-11, q = q * z + 2.0876146024689747e-09, q = q * z - 2.7557317270560326e-07;
     q = q * z + 2.4801587298763433e-05, q = q * z - 1.3888888888887395e-03, q = q * z + 4.1666666666666664e-02;
