@@ -16,13 +16,6 @@
 typedef const casadi_real* In;
 typedef casadi_real* Out;
 
-INLINE Truth all_finite(In v, int n) {
-  int i;
-  Mask ok = YES; /* as wide as a number, so that the loop uses wide registers */
-  for (i = 0; i < n; ++i) ok &= fabs(v[i]) <= FINITE; /* false for NaN */
-  return (Truth)ok;
-}
-
 /* fmax and fmin without calls of the library: where one is not a number, the other. */
 INLINE casadi_real larger(casadi_real a, casadi_real b) { return EITHER((a > b) | (b != b), a, b); }
 INLINE casadi_real smaller(casadi_real a, casadi_real b) { return EITHER((a < b) | (b != b), a, b); }

@@ -11,11 +11,17 @@ enum { KEPT, COLD, WARM };               /* how an interior phase gets its slack
 /* What is as long as a plan; it lies in the caller's work, ROOM numbers. */
 typedef struct {
   Point points[2];
-  Duals y, by, trial;
+  Duals y, by;
   Direction move;
   casadi_real next_z[2][COUNT], best_u[N * NU], best_x[(N + 1) * NS], best_z[2][COUNT];
   casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], gaps[N * NS];
-  Scratch scratch;
+  union {
+    casadi_real partials[N * NM]; /* while a plan is expanded */
+    struct {
+      Scratch scratch;
+      Duals trial;
+    } turn;
+  } shared;
 } Room;
 
 typedef char room_fits[sizeof(Room) == ROOM * sizeof(casadi_real) ? 1 : -1];
@@ -26,6 +32,7 @@ typedef struct {
   casadi_real filter[FILTER][2], inside[2][NU], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
   Certificate last;
   int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, rewarms;
+  int known;    /* whether a plan is remembered */
   int descends; /* whether interior plans are rollouts with gaps that lower phi, because the filter gave up */
 } Machine;
 
@@ -256,7 +263,7 @@ static void adopt_costates(Machine* m, casadi_real share) {
 
 /* Judge the plan that was expanded; returns whether it is the new one. */
 static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, In data, In lower, In upper) {
-  Duals* y = &m->room->trial;
+  Duals* y = &m->room->shared.turn.trial;
   casadi_real theta, phi;
   int k;
   if (m->fresh) {
@@ -318,15 +325,15 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
 static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   int ok;
   if (m->phase == PURE) {
-    pure_terms(&m->limits, p, &m->room->y, m->room->g, m->room->weight, m->room->lean);
+    pure_terms(&m->limits, p, &m->room->y, m->room->g, m->last.gap < 1e-6, m->room->weight, m->room->lean);
   } else {
     if (m->slacks != KEPT) put_inside(&m->limits, p, &m->room->y, m->mu, m->slacks == WARM);
     if (m->descends) put_on_path(&m->limits, p, &m->room->y, m->mu, m->slacks == COLD);
     interior_terms(&m->limits, p, &m->room->y, m->mu, m->room->weight, m->room->lean);
     m->slacks = KEPT;
   }
-  ok = m->use_exact && swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 1, data, &m->room->scratch);
-  ok = ok || swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 0, data, &m->room->scratch);
+  ok = m->use_exact && swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 1, data, &m->room->shared.turn.scratch);
+  ok = ok || swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 0, data, &m->room->shared.turn.scratch);
   m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);
@@ -347,17 +354,18 @@ static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
 }
 
 static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In upper) {
-  int k, known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0, has_guess = 0;
+  int k, has_guess = 0;
   In z = memory + N * NU + 2 * N * NS + N * NU * NS;
   set_limits(&m->limits, lower, upper);
+  m->known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0;
   m->stuck = m->again = m->rolled = m->descends = m->filtered = m->raises = m->halvings = m->misses = m->steps = m->rewarms = 0;
   m->price = m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
-  m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
-  for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = known ? z[k] : 0, m->room->y.z[1][k] = known ? z[COUNT + k] : 0;
+  m->last.gap = m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
+  for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = m->known ? z[k] : 0, m->room->y.z[1][k] = m->known ? z[COUNT + k] : 0;
   for (k = 0; k < COUNT; ++k) m->room->y.t[0][k] = m->room->y.t[1][k] = 1, m->room->y.e[0][k] = m->room->y.e[1][k] = 0;
   for (k = 0; k < COUNT; ++k) m->room->next_z[0][k] = m->room->next_z[1][k] = 0; /* limits that are not there stay so */
-  m->start = known ? -1 : 0;
-  if (!known) {
+  m->start = m->known ? -1 : 0;
+  if (!m->known) {
     for (k = 0; k < N * NU; ++k) has_guess |= memory[k] != 0;
     begin_cold(m, p, s0, data, lower, upper, has_guess && all_finite(memory, N * NU) ? memory : 0);
     return;
@@ -396,7 +404,7 @@ static int next_plan(Machine* m, const Point* best, Point* p) {
     deformed(arg, res, 0, 0, 0);
     for (k = 0; k < N * NU; ++k) p->u[k] += made[k];
   }
-  for (k = 0; k < N * NS; ++k) m->room->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
+  for (k = 0; k < N * NS && descends; ++k) m->room->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
   if (descends && !m->fresh) return 1;
   return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure;
 }
@@ -405,19 +413,22 @@ static int next_plan(Machine* m, const Point* best, Point* p) {
 static casadi_real priced_cost(const Limits* limits, const Point* p) {
   int side, i, r, k;
   casadi_real sum = p->value;
-  EACH_LIMIT(limits)
-    if (r >= NU) sum += capacity(r) * larger(-distance(limits, p, side, i, r), 0);
+  EACH_STATE_LIMIT(limits)
+    sum += capacity(r) * larger(-distance(limits, p, side, i, r), 0);
   return sum;
 }
 
-/* The remembered plan, rolled out with its feedback; 0 where there is none, or it is not finite. */
-static int plan_in_force(Machine* m, Point* p, In memory, In s0, In data, In lower, In upper) {
+/* The remembered plan, rolled out with its feedback; 0 where there is none, it is not finite, or it costs as much as the other plan,
+   if any: its derivatives are then not wanted. */
+static int plan_in_force(Machine* m, Point* p, const Point* other, In memory, In s0, In data, In lower, In upper) {
   int k;
-  if (!all_finite(memory, MEMORY) || !(memory[MEMORY - 2] > 0)) return 0;
+  if (!m->known) return 0;
   for (k = 0; k < N * NU; ++k) p->u[k] = memory[k];
   for (k = 0; k < NS; ++k) p->x[k] = s0[k];
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k];
-  return expand(p, memory + N * NU + 2 * N * NS, 1, 0, s0, data, lower, upper, &m->room->scratch);
+  if (!evaluated(p, memory + N * NU + 2 * N * NS, 1, 0, s0, data, lower, upper, m->room->shared.partials)) return 0;
+  if (other && !(priced_cost(&m->limits, p) < priced_cost(&m->limits, other))) return 0;
+  return differentiated(p, data, m->room->shared.partials);
 }
 
 int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
@@ -427,7 +438,9 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   Room* room = (Room*)w;
   Machine m;
   Point *best = room->points, *p = room->points + 1, *other;
-  Certificate c = {0, 0, 0, 0};
+  const Point* certain; /* the plan whose certificate is known */
+  casadi_real left = 0;
+  Certificate c = {0, 0, 0, 0, 0};
   int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, ok = 0, ended = 0;
   (void)iw, (void)mem;
   m.room = room;
@@ -435,27 +448,28 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   begin(&m, best, memory, s0, data, lower, upper);
   for (; posed; ++count) {
     int final = count == ITERATIONS, rolled = next_plan(&m, best, p), accepted;
-    ok = expand(p, m.room->move.k, rolled, m.descends && m.phase == INTERIOR ? m.room->gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), &m.room->scratch);
+    ok = expand(p, m.room->move.k, rolled, m.descends && m.phase == INTERIOR ? m.room->gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), room->shared.partials);
     accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
     if (accepted) other = best, best = p, p = other, m.rolled = rolled && !m.descends;
-    ended = !m.fresh && m.phase == PURE && is_done(&m.last) && returned_left(&m, best) <= TOLERANCE;
+    ended = !m.fresh && m.phase == PURE && is_done(&m.last) && (left = returned_left(&m, best)) <= TOLERANCE;
     if (final || m.stuck || ended) break;
     if (!m.fresh && (accepted || m.again)) m.again = 0, direct(&m, best, s0, data, lower, upper);
   }
+  certain = !m.fresh && m.phase == PURE ? best : 0;
   ok = posed;
   if (posed && (!m.rolled || m.fresh)) {
     *p = *best;
-    ok = expand(p, m.room->move.k, 1, 0, s0, data, lower, upper, &m.room->scratch);
+    ok = expand(p, m.room->move.k, 1, 0, s0, data, lower, upper, room->shared.partials);
     if (ok) best = p;
   }
   if (posed && !ended) {
     p = best == m.room->points ? m.room->points + 1 : m.room->points;
-    if (plan_in_force(&m, p, memory, s0, data, lower, upper) && (!ok || priced_cost(&m.limits, p) < priced_cost(&m.limits, best))) best = p, ok = 1;
+    if (plan_in_force(&m, p, ok ? best : 0, memory, s0, data, lower, upper)) best = p, ok = 1;
   }
   if (ok) {
     casadi_real g[N * NU];
-    c = certified(&m.limits, best, m.room->y.z, g);
-    c.left = returned_left(&m, best);
+    c = best == certain ? m.last : certified(&m.limits, best, m.room->y.z, g);
+    c.left = ended && best == certain ? left : returned_left(&m, best);
     ok = c.error < FINITE;
   }
   /* A call that ends at its most iterations may still get inside, unless multipliers prove that it does not; one that has tried

@@ -100,7 +100,8 @@ def _room(ocp: OptimalControl, measures: Scales) -> int:
     point = 2 * inputs + states + n * ns * (2 + ns + nu) + ns + ns * ns + 1
     direction = 2 * inputs + inputs * ns + 2 * states
     kept = 2 * inputs + 2 * states + 6 * limits + n * ns
-    return 2 * point + 3 * 6 * limits + direction + kept + states * (ns + 1)
+    shared = max(states * (ns + 1) + 6 * limits, n * partial_count(ocp))
+    return 2 * point + 2 * 6 * limits + direction + kept + shared
 
 
 def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:

@@ -15,7 +15,7 @@ typedef struct {
 } Limits;
 
 typedef struct {
-  casadi_real error, left, violation, broken; /* scaled error, stationarity, violation, violation that is not certified */
+  casadi_real gap, error, left, violation, broken; /* largest gap, scaled error, stationarity, violation, and that which is not certified */
 } Certificate;
 
 static const casadi_real state_limits[2][NB + 1] = {STATE_LOWER, STATE_UPPER};
@@ -30,12 +30,14 @@ INLINE casadi_real distance(const Limits* limits, const Point* p, int side, int 
   return SIGN(side) * (entry(p, i, r) - limits->at[side][r]);
 }
 
-/* For every limit that there is: side, stage i, row r, and k = i ROWS + r. */
-#define EACH_LIMIT(limits)                                                         \
+/* For every limit that there is: side, stage i, row r, and k = i ROWS + r. The rows of states are the last. */
+#define EACH_LIMIT_FROM(first, limits)                                             \
   for (side = 0; side < 2; ++side)                                                 \
-    for (r = 0; r < ROWS; ++r)                                                     \
+    for (r = first; r < ROWS; ++r)                                                 \
       if ((limits)->present[side][r])                                              \
         for (i = 0, k = r; i < N; ++i, k += ROWS)
+#define EACH_LIMIT(limits) EACH_LIMIT_FROM(0, limits)
+#define EACH_STATE_LIMIT(limits) EACH_LIMIT_FROM(NU, limits)
 
 static void set_limits(Limits* limits, In lower, In upper) {
   int side, r;
@@ -47,12 +49,13 @@ static void set_limits(Limits* limits, In lower, In upper) {
     }
 }
 
-/* Multipliers of states as they enter the gradient; where a limit is farther than `near` they count as zero. */
+/* Multipliers of states as they enter the gradient, whose other rows stay; where a limit is farther than `near` they count as zero. */
 static void pushes(Out push, const Limits* limits, const Point* p, casadi_real z[2][COUNT], casadi_real near) {
   int side, i, r, k;
-  for (k = 0; k < COUNT; ++k) push[k] = 0;
-  EACH_LIMIT(limits)
-    if (r >= NU && distance(limits, p, side, i, r) <= near) push[k] -= SIGN(side) * between(z[side][k], 0, capacity(r));
+  for (i = 0; i < N; ++i)
+    for (r = NU; r < ROWS; ++r) push[i * ROWS + r] = 0;
+  EACH_STATE_LIMIT(limits)
+    if (distance(limits, p, side, i, r) <= near) push[k] -= SIGN(side) * between(z[side][k], 0, capacity(r));
 }
 
 /* The reduced gradient g by an adjoint sweep. */
@@ -87,7 +90,8 @@ static casadi_real largest_gap(const Point* p) {
 static Certificate certified(const Limits* limits, const Point* p, casadi_real z[2][COUNT], Out g) {
   int side, i, r, k;
   casadi_real push[COUNT];
-  Certificate c = {largest_gap(p), 0, 0, 0};
+  Certificate c = {largest_gap(p), 0, 0, 0, 0};
+  c.error = c.gap;
   pushes(push, limits, p, z, 10 * FINITE);
   adjoint(p, push, g);
   for (k = 0; k < N * NU; ++k) {
@@ -95,9 +99,8 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
     c.error = larger(c.error, fabs(u - between(u - reach(k % NU) * g[k], low, high)) / unit[k % NU]);
     c.left = larger(c.left, fabs(u - between(u - g[k] / curvature[k % NU], low, high)));
   }
-  EACH_LIMIT(limits) {
+  EACH_STATE_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), y = z[side][k];
-    if (r < NU) continue;
     c.violation = larger(c.violation, -d * hard[r - NU]);
     c.error = larger(c.error, reach(r) * larger(-y, 0) / unit[r]);
     if (y >= ENOUGH * capacity(r)) {
@@ -117,8 +120,8 @@ static int cannot_be_kept(const Limits* limits, const Point* p, casadi_real z[2]
   int side, i, r, k, j, l;
   casadi_real push[COUNT], costate[NS], before[NS], sum = 0, size = 0;
   for (k = 0; k < COUNT; ++k) push[k] = 0;
-  EACH_LIMIT(limits) {
-    casadi_real y = r < NU || hard[r - NU] == 0 ? 0 : between(z[side][k], 0, capacity(r));
+  EACH_STATE_LIMIT(limits) {
+    casadi_real y = hard[r - NU] == 0 ? 0 : between(z[side][k], 0, capacity(r));
     casadi_real violated = -y * distance(limits, p, side, i, r);
     push[k] -= SIGN(side) * y, sum += violated, size += fabs(violated);
   }
@@ -151,14 +154,14 @@ static int cannot_be_kept(const Limits* limits, const Point* p, casadi_real z[2]
 static casadi_real outside(const Limits* limits, const Point* p) {
   int side, i, r, k;
   casadi_real worst = 0;
-  EACH_LIMIT(limits)
-    if (r >= NU) worst = larger(worst, -distance(limits, p, side, i, r) * hard[r - NU] / unit[r]);
+  EACH_STATE_LIMIT(limits)
+    worst = larger(worst, -distance(limits, p, side, i, r) * hard[r - NU] / unit[r]);
   return worst;
 }
 
 /* Pure: limits that are active by the sign of gamma z - d are equalities, the others are not there. */
-static void pure_terms(const Limits* limits, const Point* p, Duals* y, In g, Out weight, Out lean) {
-  int side, i, r, k, closed = largest_gap(p) < 1e-6;
+static void pure_terms(const Limits* limits, const Point* p, Duals* y, In g, int closed, Out weight, Out lean) {
+  int side, i, r, k;
   for (k = 0; k < COUNT; ++k) weight[k] = lean[k] = 0;
   EACH_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), *z = &y->z[side][k], kappa = STIFF / reach(r);

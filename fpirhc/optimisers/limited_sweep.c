@@ -26,13 +26,13 @@ static const int place[NB + 1] = PLACES;
 static const casadi_real curvature[NU] = CURVATURE; /* step times curvature of the cost rate */
 static const casadi_real unit[NU + NB + 1] = UNITS, spread[NS] = SPREADS;
 
-/* Expand the plan at its own nodes, or (rolled) at the states that follow from s_0 with u = clip(U + K (x - X)), less the gaps that
-   the plan is to have, if any; 0 when not finite. */
-static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower, In upper, Scratch* s) {
-  int i, j, l, ok;
+/* Evaluate the plan at its own nodes, or (rolled) at the states that follow from s_0 with u = clip(U + K (x - X)), less the gaps that
+   the plan is to have, if any; 0 where a function fails. */
+static int evaluated(Point* p, In k, int rolled, In gaps, In s0, In data, In lower, In upper, Out partials) {
+  int i, j, l;
   In arg[8];
   Out res[8];
-  casadi_real cost, at[NS], partials[NM];
+  casadi_real cost, at[NS];
   for (j = 0; j < NS; ++j) at[j] = s0[j];
   p->value = 0;
   for (i = 0; i < N; ++i) {
@@ -43,11 +43,8 @@ static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower,
     }
     for (j = 0; j < NS && (rolled || i == 0); ++j) x[j] = at[j];
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
-    res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials;
+    res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials + i * NM;
     if (evaluate(arg, res, 0, 0, 0)) return 0;
-    arg[0] = partials, arg[1] = data + i * NT;
-    res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
-    if (linearise(arg, res, 0, 0, 0)) return 0;
     p->value += cost;
     for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j] - (gaps ? gaps[i * NS + j] : 0);
   }
@@ -56,8 +53,25 @@ static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower,
   res[0] = &cost, res[1] = p->tail, res[2] = p->final;
   if (end(arg, res, 0, 0, 0)) return 0;
   p->value += cost;
+  return 1;
+}
+
+/* The derivatives of a plan that has just been evaluated; 0 when it is not finite. */
+static int differentiated(Point* p, In data, In partials) {
+  int i, ok;
+  In arg[8];
+  Out res[8];
+  for (i = 0; i < N; ++i) {
+    arg[0] = partials + i * NM, arg[1] = data + i * NT;
+    res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
+    if (linearise(arg, res, 0, 0, 0)) return 0;
+  }
   ok = all_finite(&p->value, 1) && all_finite(p->f, N * NS) && all_finite(p->ls, N * NS) && all_finite(p->lu, N * NU);
   return ok && all_finite(p->tail, NS) && all_finite(p->a, N * NS * NS) && all_finite(p->b, N * NS * NU);
+}
+
+static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower, In upper, Out partials) {
+  return evaluated(p, k, rolled, gaps, s0, data, lower, upper, partials) && differentiated(p, data, partials);
 }
 
 /* L D L'; 0 when a pivot is not positive. */

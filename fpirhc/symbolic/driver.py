@@ -39,7 +39,6 @@ WORDS = """#if defined(__GNUC__)
 #define INLINE static inline
 #endif
 typedef int Truth;
-typedef long long Mask; /* a truth as wide as a number */
 typedef casadi_real Number; /* of a table */
 #define TABLE static const
 #define YES 1
@@ -54,6 +53,24 @@ typedef casadi_real Number; /* of a table */
 #else
 #define NOT_UNROLLED
 #endif
+#include <stdint.h>
+#include <string.h>
+/* Whether all are at most FINITE, 2^-27 of the largest number. Their exponents say it, without comparisons of numbers: those that
+   are too large carry into the first bit. */
+INLINE Truth all_finite(const casadi_real* v, int n) {
+  int i;
+  uint32_t carried = 0;
+  for (i = 0; i < n; ++i) {
+    uint64_t wide;
+    uint32_t bits;
+    if (sizeof *v == sizeof wide) {
+      memcpy(&wide, v + i, sizeof wide), carried |= ((uint32_t)(wide >> 32) & 0x7fffffffu) + (28ul << 20);
+    } else {
+      memcpy(&bits, v + i, sizeof bits), carried |= (bits & 0x7fffffffu) + (28ul << 23);
+    }
+  }
+  return !(carried >> 31);
+}
 """
 # CasADi lets every argument and result be absent; those of leaves never are.
 _ABSENT = re.compile(r"if \(res\[\d+\]!=0\) |(?<==)(arg\[\d+\])\? (\1\[\d+\]) : 0(?=;)")

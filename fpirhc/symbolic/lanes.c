@@ -11,7 +11,7 @@
 
 typedef double V __attribute__((vector_size(8 * LANES)));
 typedef long long M __attribute__((vector_size(8 * LANES)));
-typedef M Truth, Mask;
+typedef M Truth;
 typedef double Number;
 #define TABLE static const
 #define casadi_real V
@@ -94,3 +94,10 @@ EACH(sqrt) EACH(floor) EACH(ceil) EACH_TWO(copysign) EACH_TWO(fmod)
 #define hypot v_hypot
 #define copysign v_copysign
 #define fmod v_fmod
+
+INLINE Truth all_finite(const casadi_real* v, int n) {
+  int i;
+  Truth ok = YES;
+  for (i = 0; i < n; ++i) ok &= fabs(v[i]) <= FINITE; /* false for NaN */
+  return ok;
+}

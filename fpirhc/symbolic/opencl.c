@@ -11,7 +11,7 @@
 #define NOT_UNROLLED
 #define TABLE __constant
 typedef double V, Number, casadi_real;
-typedef long casadi_int, Mask;
+typedef long casadi_int;
 typedef int M, Truth;
 #define YES 1
 #define NO 0
@@ -23,3 +23,10 @@ typedef int M, Truth;
 static double truth(int m) { return m ? 1.0 : 0.0; }
 static double fetched(__global const double* from) { return *from; }
 static void stored(__global double* to, double a) { *to = a; }
+
+INLINE Truth all_finite(const casadi_real* v, int n) {
+  int i;
+  Truth ok = YES;
+  for (i = 0; i < n; ++i) ok &= fabs(v[i]) <= FINITE; /* false for NaN */
+  return ok;
+}
