@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.plant.integrators import Integrator, RadauIIA, poles, stiffness
+from fpirhc.plant.integrators import Integrator, poles, stiffness
 from fpirhc.plant.maps import poles_over
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, state_slopes
@@ -81,13 +81,14 @@ def advice(setting: str, plant: Plant, integrator: Integrator, step: float, plac
     `setting` is where it is set, such as `HORIZON`.
     """
     implicit = setting.format("RadauIIA()")
+    in_use = setting.format(f"{type(integrator).__name__}()") == implicit
     for method in (integrator, Horizon(stages=1, step=step).discretisation):
         for times in _FINER:
             finer = method.finer(times)
             if finer is not None and step_poles(plant, finer, step, place).follows:
-                other = "" if integrator == RadauIIA() else f", or {implicit} for modes that need not be followed"
+                other = "" if in_use else f", or {implicit} for modes that need not be followed"
                 return f"Use {setting.format(finer)}, which follows every mode{other}."
-    if integrator == RadauIIA():
+    if in_use:
         return f"Shorten the step; no number of sub-steps up to {_FINER[-1]} times that in use follows every mode."
     return f"Use {implicit}; no number of explicit sub-steps up to {_FINER[-1]} times that in use follows every mode."
 
