@@ -175,7 +175,13 @@ def test_a_run_that_fails_costs_more_than_any_metric(task):
     """Between one and two penalties, less if it lasted long; settings that cannot run cost two."""
     aim = objective("max_error.y", task.metrics, task.problem)
     record = {"outcome": "ended early", "error": None, "lasted": 0.25, "metrics": {"max_error": {"y": None}}}
-    finished = {"outcome": "finished", "error": 0.1, "lasted": 1.0, "metrics": {"max_error": {"y": 3e5}}}
+    finished = {
+        "controller": "RHC",
+        "outcome": "finished",
+        "error": 0.1,
+        "lasted": 1.0,
+        "metrics": {"max_error": {"y": 3e5}},
+    }
     assert aim.cost(finished) == 3e5
     assert 3e5 < aim.cost({**record, "lasted": 0.75}) < aim.cost(record) < aim.refused == aim.cost({"skipped": "why"})
 
