@@ -52,7 +52,8 @@ class LyapunovView:
     @property
     def ultimate(self) -> float:
         """Ultimate bound of |S|, when its value at the start of the measured part is forgotten: sup|h| over the rate."""
-        return float(np.linalg.norm(self.response_error[self.since :], axis=1).max()) / self.rate
+        with np.errstate(over="ignore"):  # of a run that diverged
+            return float(np.linalg.norm(self.response_error[self.since :], axis=1).max()) / self.rate
 
     @property
     def bound(self) -> float:

@@ -321,6 +321,8 @@ def test_bound_holds_before_the_transient_is_over():
         f"Lyapunov: |S| at most {view.largest:.3g} rad/s; ultimate bound sup|h| / rate = {view.ultimate:.3g} rad/s, to "
         "which |S| has not come down at the start of the measured part"
     )
+    diverged = replace(view, response_error=np.full((view.since + 2, 1), 1e200))
+    assert np.isinf(diverged.ultimate)  # without a warning
 
 
 def test_view_is_shown_where_there_is_one():

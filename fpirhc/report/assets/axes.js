@@ -22,8 +22,8 @@ const TALL = 20; // largest size that is shown, over the usual one
 function rangeOfValues(ended) {
   return (chart, low, high) => {
     if (low === null) return [0, 1];
-    const [times] = chart.data, { min, max } = chart.scales.x;
-    if (ended(chart) && min <= times[0] && max >= times[times.length - 1]) {
+    const [times] = chart.data, last = times[times.length - 1], { min, max } = chart.scales.x;
+    if (ended(chart) && (min ?? times[0]) <= times[0] && (max ?? last) >= last) { // null: before the first drawing
       const sizes = chart.data.slice(1).flatMap((one, k) => (chart.series[k + 1].show ? one.filter((v) => v !== null).map(Math.abs) : []));
       const most = TALL * sizes.sort((a, b) => a - b)[sizes.length >> 1];
       if (most > 0) [low, high] = [Math.max(low, -most), Math.min(high, most)];
