@@ -15,12 +15,11 @@ import numpy as np
 
 from fpirhc.errors import Mistakes
 from fpirhc.horizon.cost import View
+from fpirhc.horizon.problem import GAP
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.task.limits import Limit, Limits
-
-_GAP = 1e-9  # half width of the bounds of a terminal equality
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ def ends(
 ) -> list[ConstraintState]:
     """State minus reference at the end of the horizon, and zero in all earlier stages.
 
-    The bounds leave a small gap, because an interior-point solver counts a fixed variable as an equation.
+    The bounds, here of a state of size one, leave a small gap: an interior-point solver counts a fixed variable as an equation.
 
     Args:
         last: 1 in the last stage, 0 before.
@@ -94,7 +93,7 @@ def ends(
     places = {e: k for k, e in enumerate(plant.state.elements)}
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     return [
-        ConstraintState(f"{e} at the end", units[e], last * (next_state[places[e]] - target[places[e]]), -_GAP, _GAP)
+        ConstraintState(f"{e} at the end", units[e], last * (next_state[places[e]] - target[places[e]]), -GAP, GAP)
         for e in dict.fromkeys(names)
     ]
 

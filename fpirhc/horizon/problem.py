@@ -20,6 +20,8 @@ from fpirhc.horizon.stage_data import SCALE, STEEPEST, Withheld
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.symbolic.live import LiveNumber, Number
 
+GAP = 1e-9  # half width of the bounds of what the end must meet, in sizes of the state
+_LEAST = 1e-3  # a smaller spread of the reference is no measure of a state
 _POWER_STEPS = 50
 _RUNS_AWAY = 2e3  # times that a motion of the model grows over the horizon
 _MARGIN = 1.1  # a power iteration approaches the eigenvalue from below
@@ -176,16 +178,21 @@ class OptimalControl:
     @property
     def equations(self) -> np.ndarray:
         """Which states have limits that are an equation and no range (ns,): those that are equal, and what the end must meet."""
-        return np.asarray(
-            (self.state_lower == self.state_upper) | (np.arange(self.state.size) >= self.state.size - self.met)
-        )
+        return np.asarray((self.state_lower == self.state_upper) | self._meets)
+
+    @property
+    def _meets(self) -> np.ndarray:
+        return np.arange(self.state.size) >= self.state.size - self.met
 
     @property
     def half_ranges(self) -> np.ndarray:
-        """Half the range of every state's limits (ns,); infinite where a side is free or the limits are an equation."""
+        """Half the range of every state's limits (ns,); infinite where a side is free or the limits are equal.
+
+        What the end must meet has the size of its state, which the gap of its bounds is made of.
+        """
         with np.errstate(invalid="ignore"):
-            half = 0.5 * (self.state_upper - self.state_lower)
-        return np.where(self.equations, np.inf, half)
+            half = 0.5 * (self.state_upper - self.state_lower) / np.where(self._meets, GAP, 1.0)
+        return np.where(self.state_lower == self.state_upper, np.inf, half)
 
     @property
     def hard(self) -> np.ndarray:
@@ -285,6 +292,12 @@ def expand_along(
     final = np.asarray(functions["final"](states[:, stages], data[:, stages]).full())
     a, b, q, s, r = (np.array([stage[k] for stage in derivatives]) for k in range(5))
     return _ReferenceExpansion(a, b, q, s, r, final)
+
+
+def sizes_along(states: np.ndarray) -> np.ndarray:
+    """Return half the spread of every state along the reference and a tenth of its size, (ns,); 1 for one that stays zero."""
+    about = 0.5 * np.ptp(states, axis=1) + 0.1 * np.abs(states).max(axis=1)
+    return np.where(about > 0, np.maximum(about, _LEAST), 1.0)
 
 
 def input_curvature(along: _ReferenceExpansion, step: float) -> np.ndarray:

@@ -28,7 +28,7 @@ from fpirhc.horizon.constraint_states import (
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
-from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
+from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
@@ -108,6 +108,7 @@ def _transcribed(
     functions: dict[object, ca.Function] = {}
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
     lower, upper = hard_state_bounds(limits, plant, {*horizon.margins, *horizon.measured})
+    of_entries = _sizes_of_entries(plant, horizon, limits, nodes[0], len(binding))
     state = _stage_state(plant, bool(free), binding)
     ocp = OptimalControl(
         stages=horizon.stages,
@@ -121,8 +122,8 @@ def _transcribed(
         terms=tuple(stage.terms),
         soft_end=soft_end,
         start=_start(plant, free, len(binding)),
-        state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
-        state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
+        state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding] * of_entries]),
+        state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding] * of_entries]),
         input_lower=nominal(limits).input_bounds(plant)[0],
         input_upper=nominal(limits).input_bounds(plant)[1],
         curvature=input_curvature(along, horizon.step),
@@ -269,6 +270,17 @@ def _stage_functions(stage: _Stage) -> tuple[ca.Function, ...]:
         ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(stage.final)]),
         ca.Function("fpirhc_soft_end", [s, theta], [ca.densify(ca.vertcat(*stage.soft_end))]),
     )
+
+
+def _sizes_of_entries(plant: Plant, horizon: Horizon, limits: Limits, states: np.ndarray, written: int) -> np.ndarray:
+    """What the bounds of the written entries are multiplied by: the size of the state that the end must meet, ones for others.
+
+    `states`: along the reference, from which a size follows where limits do not give it.
+    """
+    half = 0.5 * np.subtract(*reversed(limits.state_bounds(plant)))
+    places = [plant.state.elements.index(e) for e in dict.fromkeys(horizon.terminal)]
+    sizes = np.where(np.isfinite(half) & (half > 0), half, sizes_along(states[: plant.state.size]))[places]
+    return np.concatenate([np.ones(written - len(places)), sizes])
 
 
 def _reach(limits: Limits, plant: Plant) -> ca.DM:

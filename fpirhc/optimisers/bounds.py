@@ -13,12 +13,11 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.problem import OptimalControl, answered_curvature
+from fpirhc.horizon.problem import OptimalControl, answered_curvature, sizes_along
 from fpirhc.horizon.riccati import Expansion, in_reverse
 from fpirhc.optimisers.base import FEASIBLE, KEPT, clip
 from fpirhc.symbolic.expression import FINITE, is_finite
 
-_LEAST = 1e-3  # a smaller spread of the reference is no measure of a state
 _CAPACITY = 1e4  # largest multiplier of a hard limit, in units of cost per unit
 ENOUGH = 0.99  # share of the largest multiplier from which a limit counts as given up
 STIFF = 1e8  # weight of an equality, in units of 1 / gamma
@@ -56,12 +55,8 @@ def scales(ocp: OptimalControl) -> Scales:
 
     gamma = unit^2 / C turns a gradient into a move, and 1e4 C / unit is the largest multiplier that a limit of a state may have.
     """
-    nodes = ocp.nodes[0]
-    size = np.abs(nodes).max(axis=1)
-    about = 0.5 * np.ptp(nodes, axis=1) + 0.1 * size
-    about = np.where(about > 0, np.maximum(about, _LEAST), 1.0)
     range_ = ocp.half_ranges
-    states = np.where(np.isfinite(range_), range_, about)
+    states = np.where(np.isfinite(range_), range_, sizes_along(ocp.nodes[0]))
     places = np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper))
     inputs = _input_units(ocp, states, places)
     cost = float(np.median(_answered_curvature(ocp) * inputs**2))
