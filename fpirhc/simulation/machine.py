@@ -38,7 +38,6 @@ from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _DIVERGES = 1.05  # measured factor from which a cycle counts
-_FLOOR = 1e-18  # square of a change that is no change, in units of the response
 _KEPT = ("watch_saturated", "watch_cycles", "watch_growing", "watch_requests")  # what reaches the next cycle by itself
 _SMALL = 1e-3  # change of the request, as a share of it, that has a slope
 
@@ -117,7 +116,7 @@ def _fit(
     # Before three cycles have been counted there is no pair of changes, and what is remembered of them may be anything.
     summed = forget * past["watch_sums"] + ca.vertcat(ca.dot(change, answer), ca.dot(change, change))
     sums = ca.if_else(past["watch_cycles"] > 2.5, summed, 0)
-    enough = sums[1] > window * _SMALL**2 * ca.dot(last, last) + _FLOOR
+    enough = sums[1] > window * _SMALL**2 * ca.dot(last, last)
     grows = ca.fabs(sums[1] - gain * sums[0]) > _DIVERGES * sums[1]
     growing = ca.if_else(ca.logic_and(enough, grows), _counted(past["watch_growing"], window), 0)
     return {
