@@ -358,7 +358,7 @@ def with_space(unit: str) -> str:
 
 
 SMALL = 1e-6  # last step of Newton's method, relative; the error left is about its square
-NEGLIGIBLE = 1e-3  # share of a guess, or of a unit of an input, beside which a number counts as zero
+NEGLIGIBLE = 1e-3  # share of a guess, or of terms that cancel, beside which a number counts as zero
 ROUNDING = 1e-12  # relative change of what is known that nobody tells from the rounding of its numbers
 
 
@@ -432,7 +432,7 @@ def _all_below(values: Expression, most: Expression) -> Expression:
 
 
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN
-INVERSE_ROUNDING = 1e-15  # relative response error at which it stops, unless a step of 1e-12 stops it before
+INVERSE_ROUNDING = 1e-15  # relative response error at which it stops, unless a step of 1e-12 of an input does before
 NEWTON_ITERATIONS = 50  # CasADi's own largest number, said here because the worst case of an exported step counts it
 
 
@@ -487,38 +487,42 @@ def inverse_of_affine(plant: Motion, response: ca.Function) -> ca.Function:
 def inverse_by_newton(plant: Motion, response: ca.Function) -> ca.Function:
     """Function (state, response, parameters) -> input, found by Newton's method.
 
-    It begins at zero inputs; where these have no effect, as with the square of a current, at one unit of every input.
+    It begins at zero inputs; where these have no effect, as with the square of a current, at one unit of every input: such an input
+    is found where it is not much smaller than its unit.
     """
     x, u, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
-    size = ca.SX.sym("size", r.numel())
-    error = ca.Function("fpirhc_inversion", [u, x, r, p, size], [(response(x, u, p) - r) / size])
+    given = ca.SX.sym("size", r.numel()), ca.SX.sym("unit", u.numel())
+    error = ca.Function("fpirhc_inversion", [u, x, r, p, *given], [(response(x, u * given[1], p) - r) / given[0]])
     options = {"error_on_fail": False, "max_iter": NEWTON_ITERATIONS, "abstol": INVERSE_ROUNDING}
     finder = ca.rootfinder("fpirhc_newton", "fast_newton", error, options)
     xm, rm, pm = (ca.MX.sym(n, s) for n, s in (("x", x.numel()), ("r", r.numel()), ("p", p.numel())))
-    count = len(plant.inputs)
-    gain_at_zero = ca.sparsify(ca.substitute(ca.jacobian(response(x, u, p), u), u, ca.SX.zeros(count)))
-    blind = ca.sprank(gain_at_zero.sparsity()) < count
-    first = ca.DM.ones(count) if blind else ca.DM.zeros(count)
-    sizes = _sizes_of_response(plant, response, first)(xm, rm, pm)
-    root = finder(first, xm, rm, pm, sizes)
-    residual = ca.norm_inf(error(root, xm, rm, pm, sizes))
+    none, one = ca.DM.zeros(u.numel()), ca.DM.ones(u.numel())
+    gain_at_zero = ca.sparsify(ca.substitute(ca.jacobian(response(x, u, p), u), u, none))
+    blind = ca.sprank(gain_at_zero.sparsity()) < u.numel()
+    there, unit = response(x, none, p), ca.SX(one)
+    size = _size(x, r, p, there)
+    if blind:  # as much as nearly no input does, whose effect is a square at least
+        size += NEGLIGIBLE**2 * _finite(ca.fabs(response(x, one, p)), 0)
+    else:  # of the first step, at most 1
+        unit = ca.fmin(1, _finite(ca.fabs(ca.solve(gain_at_zero, r - there)), 1))
+    # Where all is zero, or so small that its square is, zero inputs are the answer.
+    sizes = ca.Function("fpirhc_sizes", [x, r, p], [ca.densify(v + (v**2 <= 0)) for v in (size, unit)])(xm, rm, pm)
+    root = finder(one if blind else none, xm, rm, pm, *sizes)
+    residual = ca.norm_inf(error(root, xm, rm, pm, *sizes))
     # NaN is on neither side of a comparison, so arriving is asked for and not missing.
     lost = ca.logic_not(residual <= INVERSE_TOLERANCE)
-    return ca.Function(
-        "fpirhc_inverse", [xm, rm, pm], [root + graph(nan_where(expression(lost)))], ["x", "r", "p"], ["u"]
-    )
+    column = sizes[1] * root + graph(nan_where(expression(lost)))
+    return ca.Function("fpirhc_inverse", [xm, rm, pm], [column], ["x", "r", "p"], ["u"])
 
 
-def _sizes_of_response(plant: Motion, response: ca.Function, first: ca.DM) -> ca.Function:
-    """Function (state, response, parameters) -> what is large for each response, beside which an error is zero.
+def _size(x: ca.SX, r: ca.SX, p: ca.SX, there: ca.SX) -> ca.SX:
+    """How large each response is: what is asked, what there is without inputs, and a share of the terms that cancel there."""
+    known = ca.vertcat(x, p)
+    terms = ca.mtimes(ca.fabs(ca.jacobian(there, known)), ca.fabs(known))
+    return ca.fabs(r) + ca.fabs(there) + NEGLIGIBLE * _finite(terms, 0)
 
-    It has the unit of the response: what is asked, what there is at the first inputs, and what little a negligible input adds.
-    """
-    x, u, p = plant.symbols()
-    r = ca.SX.sym("r", len(plant.controlled_names))
-    there, slope = (ca.substitute(e, u, first) for e in (response(x, u, p), ca.jacobian(response(x, u, p), u)))
-    effects = [ca.if_else(ca.fabs(e) < FINITE, ca.fabs(e), 0) for e in ca.vertsplit(ca.densify(slope))]
-    size = ca.fabs(r) + ca.fabs(there) + NEGLIGIBLE * ca.vertcat(*map(ca.sum2, effects))
-    # Where all of it is zero, the first inputs answer exactly.
-    return ca.Function("fpirhc_sizes", [x, r, p], [ca.densify(size + (size <= 0))])
+
+def _finite(values: Expression, other: float) -> Expression:
+    """The values, and another one in place of what is not finite."""
+    return ca.vertcat(*(ca.if_else(ca.fabs(v) < FINITE, v, other) for v in ca.vertsplit(ca.densify(values))))

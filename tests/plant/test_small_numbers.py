@@ -14,20 +14,17 @@ from fpirhc.learning.rules.projection import Projection
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False))
 
 
-@pytest.mark.parametrize("size", [1e-12, 1e9])
-def test_an_input_found_by_newtons_method_is_that_of_the_response_in_another_unit(size):
-    def commanded(k: float) -> float:
-        plant = fp.Plant(
-            coordinates={"V": "m^3"},
-            inputs={"u": "1"},
-            order=1,
-            response=lambda q, u, p: {"V": p.k * (u.u + u.u**3)},
-            parameters={"k": fp.Parameter(k, k, "m^3/s")},
-        )
-        return float(plant.equations.inverse(0.0, 2 * k, k))
-
-    assert commanded(1.0) == pytest.approx(1.0)
-    assert commanded(size) == pytest.approx(1.0)
+@pytest.mark.parametrize("unit", [1.0, 1e-15, 1e9])
+@pytest.mark.parametrize("size", [1.0, 1e-12, 1e9])
+def test_an_input_found_by_newtons_method_is_that_of_the_response_in_another_unit(size, unit):
+    plant = fp.Plant(
+        coordinates={"V": "m^3"},
+        inputs={"u": "1"},
+        order=1,
+        response=lambda q, u, p: {"V": p.k * (u.u / unit + (u.u / unit) ** 3)},
+        parameters={"k": fp.Parameter(size, size, "m^3/s")},
+    )
+    assert float(plant.equations.inverse(0.0, 2 * size, size)) == pytest.approx(unit, rel=1e-9, abs=0)
 
 
 @pytest.mark.parametrize("k", [1.0, 1e-12])
@@ -40,6 +37,7 @@ def test_an_input_that_nothing_gives_is_not_a_number_in_any_unit(k):
         parameters={"k": fp.Parameter(k, k, "m^3/s")},
     )
     assert np.isnan(float(plant.equations.inverse(0.0, 0.5 * k, k)))
+    assert abs(float(plant.equations.inverse(0.0, k, k))) < 1e-6
 
 
 def _root(size: float, guess: float, steps: int, root: float = 1.0) -> float:
