@@ -5,8 +5,10 @@ from __future__ import annotations
 import keyword
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from importlib.machinery import PathFinder
-from importlib.resources import files
+from importlib.resources import files as resources
 from pathlib import Path
 
 from fpirhc.baselines.baseline import baseline_path
@@ -29,21 +31,35 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
         folder / f"{name}.py": _template("problem.txt", name),
         folder / f"test_{name}.py": _template("test.txt", name),
     }
-    written: list[Path] = []
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for path, text in texts.items():
-            # Exclusive: a file or link that is there already is never written to.
-            with path.open("x", encoding="utf-8") as file:
-                written.append(path)
-                file.write(text)
+        with kept_when_whole(folder) as written:
+            folder.mkdir(parents=True, exist_ok=True)
+            for path, text in texts.items():
+                # Exclusive: a file or link that is there already is never written to.
+                with path.open("x", encoding="utf-8") as file:
+                    written.append(path)
+                    file.write(text)
     except OSError as error:
-        for path in written:
-            path.unlink(missing_ok=True)
         if isinstance(error, FileExistsError) and error.filename != str(folder):
             raise OutputError(f"'{error.filename}' exists already and is kept; choose another name or --dir") from None
         raise not_writable(folder, error, "--dir") from None
     return tuple(written)
+
+
+@contextmanager
+def kept_when_whole(folder: Path) -> Iterator[list[Path]]:
+    """Files that are added to the list, and folders that the body makes, are removed where it fails or is interrupted."""
+    files: list[Path] = []
+    folders = [one for one in (baseline_path(folder / "x").parent, folder, *folder.parents) if not one.exists()]
+    try:
+        yield files
+    except BaseException:
+        for file in files:
+            file.unlink(missing_ok=True)
+        for one in folders:
+            with suppress(OSError):  # it was not made, or holds what others wrote
+                one.rmdir()
+        raise
 
 
 def first_baseline(problem_file: Path) -> Path:
@@ -72,7 +88,7 @@ def _taken(name: str) -> str:
     """Reason why a well-formed name cannot be used; empty for a usable name."""
     if keyword.iskeyword(name) or keyword.issoftkeyword(name):
         return "it is a word of Python"
-    if name.lower().startswith("test_") or name.lower() in ("test", "conftest"):
+    if re.fullmatch(r"test_.*|.*_test|test|conftest", name.lower()):
         return "pytest would take the problem file for a test"
     # Without the current folder: a problem file in it is not an installed module.
     installed = [p for p in sys.path if p and Path(p).resolve() != Path.cwd()]
@@ -89,6 +105,7 @@ def _usable(name: str) -> str:
     if not plain:
         return _FALLBACK
     candidate = plain if plain[0].isalpha() else f"plant_{plain}"
+    candidate = re.sub(r"(^|_)test$", r"\1plant", candidate)
     return f"my_{candidate}" if _taken(candidate) else candidate
 
 
@@ -98,4 +115,4 @@ def _shown(name: str) -> str:
 
 
 def _template(file: str, name: str) -> str:
-    return files("fpirhc.scaffold").joinpath(file).read_text(encoding="utf-8").replace("NAME", name)
+    return resources("fpirhc.scaffold").joinpath(file).read_text(encoding="utf-8").replace("NAME", name)

@@ -79,6 +79,18 @@ def test_new_in_another_project_goes_there_first(folder, capsys, monkeypatch):
     ]
 
 
+def test_new_that_is_interrupted_leaves_nothing(folder, monkeypatch):
+    """Else its own files are in the way of the next attempt; what others wrote stays."""
+
+    def stopped(problem):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fpirhc.scaffold.first_baseline", stopped)
+    (folder / "old").mkdir()
+    assert [main(["new", "arm", "--dir", place]) for place in ("new/arms", "old")] == [130, 130]
+    assert [path.name for path in folder.rglob("*")] == ["old"]
+
+
 def test_new_into_a_file(folder, capsys):
     """A folder that cannot be made: exit code 3 and what to do."""
     (folder / "taken").write_text("")
@@ -107,6 +119,7 @@ def test_new_into_a_file(folder, capsys):
         ("json", "my_json"),
         ("two_mass", "my_two_mass"),
         ("test_arm", "my_test_arm"),
+        ("x_test", "x_plant"),
         ("x" * 300, "x" * 52),
     ],
 )

@@ -19,12 +19,15 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
     from fpirhc.baselines.baseline import check_inside
     from fpirhc.errors import OutputError
-    from fpirhc.scaffold import create_problem, first_baseline
+    from fpirhc.scaffold import create_problem, first_baseline, kept_when_whole
 
-    problem, test = create_problem(options.name, Path(options.dir))
-    print(f"wrote {problem}\nwrote {test}")
-    print("measuring the baseline: every controller, with several seeds and ways of computing", flush=True)
-    print(f"wrote {first_baseline(problem)}")
+    folder = Path(options.dir)
+    with kept_when_whole(folder) as files:
+        problem, test = create_problem(options.name, folder)
+        files += [problem, test]
+        print("measuring the baseline: every controller, with several seeds and ways of computing", flush=True)
+        baseline = first_baseline(problem)
+    print(f"wrote {problem}\nwrote {test}\nwrote {baseline}")
     print("next:")
     try:
         check_inside(problem, Path())
@@ -50,5 +53,8 @@ VERB = Verb(
         ("fpirhc compare my_arm.py", "the next step"),
         ('fpirhc accept my_arm.py --reason "..."', "when its new numbers are right"),
     ),
-    notes="A file that exists already is never written to. After a change of my_arm.py run: python -m pytest test_my_arm.py",
+    notes="""
+A file that exists already is never written to, and no file stays of a command that is interrupted.
+After a change of my_arm.py run: python -m pytest test_my_arm.py
+""",
 )
