@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import pytest
@@ -27,3 +28,11 @@ def shipped(*long: str) -> list[Any]:
     slow = {*long, *(name for names in ALIKE.values() for name in names)}
     assert slow | {*ALIKE} <= {*shipped_problems()}
     return [pytest.param(n, marks=[pytest.mark.slow] if n in slow else ()) for n in sorted(shipped_problems())]
+
+
+def slow_but(values: Iterable[Any], *quick: Any) -> list[Any]:
+    """The values as parameters: all but the quick ones, which stand for their kind, with the mark of the slow lane."""
+    values = list(values)
+    assert {*quick} <= {*values}
+    marks = [() if v in quick else (pytest.mark.slow,) for v in values]
+    return [pytest.param(*(v if isinstance(v, tuple) else (v,)), marks=m) for v, m in zip(values, marks, strict=True)]

@@ -54,6 +54,7 @@ def rms_and_movement(controller) -> tuple[float, float]:
     return metrics.rms_error["y"], metrics["total_variation"]["delta"]
 
 
+@pytest.mark.slow
 def test_review_refusal_and_report_name_the_same_gain(folder, capsys):
     """-2 for a wrong sign, for a gain beyond its limit, and for the gain in use."""
     own = answer(capsys, REFERENCED)
@@ -96,7 +97,12 @@ def test_with_the_recommended_gain_the_wheel_moves_as_without_adaptation():
 
 @pytest.mark.parametrize(
     ("effective", "verdict", "recommended"),
-    [(0.4, "unknown", None), (1.6, "yes", -1.66), (1.8, "caution", -1.66), (2.4, "no", -1.66)],
+    [
+        (0.4, "unknown", None),
+        pytest.param(1.6, "yes", -1.66, marks=pytest.mark.slow),
+        (1.8, "caution", -1.66),
+        pytest.param(2.4, "no", -1.66, marks=pytest.mark.slow),
+    ],
 )
 def test_the_gain_of_a_plain_form(folder, capsys, effective, verdict, recommended):
     """Its whole loop has the limit 1.66 in the box, where its map alone has 2.

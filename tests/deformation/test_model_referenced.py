@@ -104,7 +104,9 @@ def test_all_forms_have_the_same_edge(form):
 AMPLIFIED = {"freeway_economic": 1e-6, "freeway_coordinated": 1e-4}
 
 
-@pytest.mark.parametrize("name", shipped("building", "chain_of_masses"))
+@pytest.mark.parametrize(
+    "name", shipped("building", "chain_of_masses", "anaesthesia", "noisy_motor", "delayed_mass", "freeway")
+)
 def test_exact_model_is_left_alone(name):
     """On every shipped problem, behind its sensors and dead time, quanta included: no state changes beyond rounding."""
     task: Any = fp.load_problem(name)
@@ -122,6 +124,7 @@ def test_exact_model_is_left_alone(name):
     assert np.abs(run - plain).max() <= AMPLIFIED.get(name, 1e-9) * np.abs(plain).max()
 
 
+@pytest.mark.slow
 def test_plain_form_does_not_leave_an_exact_model_alone():
     """What the form is for: two_link_arm under RHC and leaking_tanks, an exact model, gain -.5."""
     for name, least in (("two_link_arm", 0.05), ("leaking_tanks", 0.02)):

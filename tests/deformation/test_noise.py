@@ -89,6 +89,7 @@ def test_filter_buys_tracking_at_the_same_chatter(ringing, published):
     assert max(predicted / np.array(list(BUDGET.values()))) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_floor_is_what_noise_leaves_of_tracking():
     """With a fast iteration the error that noise adds is the predicted floor, to 20 %."""
     suggestion, _, _, errors = ran(6.0, True)
@@ -116,6 +117,7 @@ def test_no_gain_within_a_budget_is_told_apart_from_no_gain_at_all():
             _largest_within(always(steps), np.array([1.0]), 1.0)
 
 
+@pytest.mark.slow
 def test_a_suggestion_that_a_run_speaks_against_says_so():
     """The plain form disturbs a right model, the more the smaller its gain; with the wrong one every gain within a budget helps."""
     assert not fp.suggest(noisy(), planning(), chatter=BUDGET).harm

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, NotSupported, OutputError
@@ -68,7 +69,7 @@ def output(program: Path, *arguments: object) -> str:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_but(CASES, "torque", "state limits", "map"))
 def test_a_replay_with_faults_is_the_stepper_bit_by_bit(name, tmp_path):
     """Commands, memory and trace of 2000 cycles, by every compiler here, and with sanitizers; no warning of the strict ones."""
     exported(name, tmp_path, cycles=2000)
@@ -292,7 +293,7 @@ int main(void) {
 
 @needs_compiler
 @pytest.mark.parametrize("real", ["double", "float"])
-@pytest.mark.parametrize("name", ["torque", "outputs"])
+@pytest.mark.parametrize("name", slow_but(["torque", "outputs"], "outputs"))
 def test_what_is_no_number_passes_no_gate_in_either_type(name, real, tmp_path):
     """Every input, NaN and both infinities: a skipped cycle with the last command and a memory of numbers.
 

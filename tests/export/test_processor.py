@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 import fpirhc.export.processor
@@ -73,7 +74,7 @@ def lines_of(folder: Path) -> str:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["torque", pytest.param("plan", marks=pytest.mark.slow), "tanks", "map", "motor"])
+@pytest.mark.parametrize("name", slow_but(("torque", "plan", "tanks", "map", "motor"), "torque", "motor"))
 def test_a_loop_with_the_program_is_the_run(name, tmp_path):
     """Every state and command, twice from the start: what differs is the last digits of exp and the like.
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.export.device import Device
@@ -156,7 +157,7 @@ def back(device: Device) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_but(CASES, "outputs", "map", "plan"))
 def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, tmp_path):
     """Cycles of three controllers in any order, settings that change in between, samples with faults: bits, statuses, refusals."""
     random = np.random.default_rng(seed)
@@ -199,7 +200,7 @@ def test_bare_instances_answer_as_the_bare_step(name, seed, tmp_path):
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("bare", [False, True], ids=["gated", "bare"])
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_but(CASES, "outputs", "torque"))
 def test_a_float_export_is_near_the_double_one(name, bare, seed, tmp_path):
     """A thousandth of the largest command; what is no number is a bad sample in both, and nothing stays behind it."""
     random = np.random.default_rng(seed)

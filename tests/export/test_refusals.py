@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 from first_files import messages_of
+from kinds import slow_but
 
 from fpirhc.cli.main import main
 from fpirhc.export import binaries
@@ -59,7 +60,7 @@ noisy_motor RHC+FPI --to arduino =>
 """)
 
 
-@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("row", slow_but(ROWS, *(row for row in ROWS if not row.endswith("RHC+FPI --to arduino"))))
 def test_what_is_refused_says_why_and_what_to_do(row, tmp_path, monkeypatch, capsys):
     """Exit code 2, or 3 for a folder; one line, and nothing is written."""
     if row.endswith("--to arduino") and shutil.which("avr-gcc") is None:

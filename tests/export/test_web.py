@@ -53,6 +53,7 @@ def answers(text: str) -> str:
     return found[1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 def test_with_functions_of_its_own_c_has_the_same_bits_at_the_lowest_and_the_highest_level(tmp_path):
     """exp, log and the like come with the export, so that levels and machines do not decide over digits."""

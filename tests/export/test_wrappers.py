@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
@@ -236,7 +237,7 @@ int main() {
 
 @needs_compiler
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
-@pytest.mark.parametrize("release", INTERFACES)
+@pytest.mark.parametrize("release", slow_but(INTERFACES, list(INTERFACES)[-1]))
 def test_a_plugin_of_ros2_control_answers_as_the_stepper_bit_by_bit(release, tmp_path):
     """Names of interfaces, a rate that is not the period's, a gain outside its bounds, a number that another thread holds."""
     device = exported(tmp_path, "ros2_control")

@@ -134,6 +134,7 @@ def test_second_derivatives_in_parts_are_those_of_the_stage(ocp, hessian):
     assert counted[ca.OP_DIV] <= operations(whole)[ca.OP_DIV]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 def test_the_directions_of_a_large_stage_run_side_by_side():
     """Five masses have 24 directions: loops over all of them, in the plain iteration and with a wall, do what the graph does."""

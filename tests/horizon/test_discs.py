@@ -54,6 +54,7 @@ def discs(discretisation):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discretisation", [fp.RungeKutta4(4)])
 def test_bounded_linear_quadratic_plans_give_the_loop_of_ipopt(discretisation):
     """One iteration per plan, inputs at their bounds: every plan is converged, and the loop is that of IPOPT."""

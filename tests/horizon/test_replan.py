@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from chains import chain
+from kinds import slow_but
 from plants import pendulum
 from scipy.optimize import minimize
 
@@ -87,13 +88,13 @@ def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=
 @pytest.mark.parametrize(
     ("replan", "lengths", "rate", "fastest"),
     [  # every two of the settings meet
-        ("stage", (), 0.0, np.inf),
+        pytest.param("stage", (), 0.0, np.inf, marks=pytest.mark.slow),
         ("stage", GROWING, RATE, np.inf),
-        ("stage", (), 0.0, FASTEST),
-        ("cycle", GROWING, 0.0, np.inf),
-        ("cycle", (), RATE, np.inf),
+        pytest.param("stage", (), 0.0, FASTEST, marks=pytest.mark.slow),
+        pytest.param("cycle", GROWING, 0.0, np.inf, marks=pytest.mark.slow),
+        pytest.param("cycle", (), RATE, np.inf, marks=pytest.mark.slow),
         ("cycle", GROWING, 0.0, FASTEST),
-        (3, (), 0.0, np.inf),
+        pytest.param(3, (), 0.0, np.inf, marks=pytest.mark.slow),
         (3, GROWING, RATE, np.inf),
         (3, (), 0.0, FASTEST),
     ],
@@ -253,7 +254,9 @@ TASKS = {
 }
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize(
+    "name", slow_but(TASKS, "limits of rates", "blocks", "lengths, limits", "lengths, Radau", "dead time")
+)
 def test_what_a_problem_can_have_goes_with_a_plan_in_every_cycle(name):
     """Errors are not larger than with a plan per stage; a rate that is limited from plan to plan jumps less."""
     problem = TASKS[name]()

@@ -97,6 +97,7 @@ def test_a_limit_that_the_wrong_model_breaks_is_kept_with_margins():
     assert beyond(problem, fp.tightened(problem, adaptive())) <= 1e-6
 
 
+@pytest.mark.slow
 def test_margins_keep_the_limits_of_a_plant_by_its_outputs():
     """The same carriage with its place as an output needs nearly the same margins, and keeps its track with them."""
     in_place = replace(carriage(), duration=5.0)
@@ -141,7 +142,7 @@ def test_margins_verified_on_a_box_of_parameters_serve_a_plant_in_it():
 
 
 def test_mistakes_are_named():
-    problem = replace(carriage(), duration=1.2)
+    problem = replace(carriage(), duration=0.6)
     free = replace(problem, limits=fp.Limits())
     with pytest.raises(InvalidProblem, match="no hard limits of states"):
         fp.tightened(free, adaptive())

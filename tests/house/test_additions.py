@@ -167,6 +167,7 @@ def test_compare_runs_members_from_abroad(abroad: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_check_measures_members_from_abroad(abroad: Path) -> None:
     """A baseline is written and checked, with the plan metrics of the wrapped controller."""
     written = run(

@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from kinds import shipped
 from on_problem import named
 from wrong.tables import CONTROLLERS as WRONG_CONTROLLERS
 from wrong.tables import LOUD
@@ -35,7 +36,6 @@ from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.members import FAMILIES, Example, examples, member_classes
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Equations
-from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.tracking.base import Tracking
@@ -285,7 +285,24 @@ def name_of(example: Any) -> str:
     return one.controller or type(one.value).__name__
 
 
-@pytest.mark.parametrize("example", CONTROLLERS, ids=name_of)
+OWN_KIND = (
+    "ADRC",
+    "Cascade",
+    "ComputedTorque",
+    "ExactModel",
+    "PID",
+    "Predicted",
+    "RecedingHorizon",
+    "slots",
+    "L1 adaptive",
+)
+
+
+@pytest.mark.parametrize(
+    "example",
+    [pytest.param(one, marks=[] if name_of(one) in OWN_KIND else pytest.mark.slow) for one in CONTROLLERS],
+    ids=name_of,
+)
 def test_controller_laws(example):
     """Limits, bad measurements, and one command however it is computed; C is compared where it compiles quickly."""
     controller, problem = on_problem(example)
@@ -391,7 +408,7 @@ def test_wrong_controllers_are_caught(wrong, law):
 # Plants
 
 
-@pytest.mark.parametrize("name", shipped_problems())
+@pytest.mark.parametrize("name", shipped())
 def test_plant_laws(name):
     problem = fp.load_problem(name).problem
     box = {e: (v - 0.1, v + 0.1) for e, v in zip(problem.plant.state.elements, problem.start_state, strict=True)}

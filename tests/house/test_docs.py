@@ -27,6 +27,7 @@ NEEDED = {  # page -> packages of an extra
     "outside-arm": ("mujoco",),
     "outside-quadrotor": ("rotorpy",),
 }
+LONG = ("beside-acados", "beside-do-mpc", "probe", "optimiser")  # each as long as all others together
 PAGES = sorted(p for p in DOCS.rglob("*.md") if "_build" not in p.parts)
 
 
@@ -40,7 +41,11 @@ def blocks(page: Path) -> list[str]:
 
 
 CODE = [
-    pytest.param(p, marks=[pytest.mark.outside] * (p.stem.startswith("outside")), id=p.stem) for p in PAGES if blocks(p)
+    pytest.param(
+        p, marks=[pytest.mark.outside] * p.stem.startswith("outside") + [pytest.mark.slow] * (p.stem in LONG), id=p.stem
+    )
+    for p in PAGES
+    if blocks(p)
 ]
 
 

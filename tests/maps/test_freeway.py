@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.plant.maps import over
@@ -146,7 +147,7 @@ def test_a_metered_ramp_saves_time() -> None:
 # The time spent
 
 
-@pytest.mark.parametrize("which", ["ipopt", "shipped", "one start"])
+@pytest.mark.parametrize("which", slow_but(("ipopt", "shipped", "one start"), "shipped"))
 def test_an_economic_plan_is_the_published_run(which: str) -> None:
     """The rates of 17 minutes and the time spent after 96 steps of sym-metanet's metering, which IPOPT solves there.
 

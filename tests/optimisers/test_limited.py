@@ -12,6 +12,7 @@ from foreign import FOREIGN, first_states
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judging import Judge
+from kinds import slow_but
 from plants import known
 
 import fpirhc as fp
@@ -49,7 +50,7 @@ def tolerance_of(ocp):
     return 1e-7 * float((0.5 * (ocp.input_upper - ocp.input_lower)).min())
 
 
-@pytest.mark.parametrize("name", OPTIMA)
+@pytest.mark.parametrize("name", slow_but(OPTIMA, *list(OPTIMA)[::2]))
 def test_horizons_of_other_people_are_solved_from_nothing(name):
     """IPOPT's cost, inside all limits, and stationary to a judge that knows neither sweeps nor multipliers."""
     ocp, data, first = first_horizon(name)

@@ -97,7 +97,11 @@ def test_all_backends_drive_the_same_loop(optimiser):
 
 @pytest.mark.parametrize(
     "nominal",
-    [fp.FromMeasurement(), fp.FromMeasurementTracked(fp.Exponential(rate=6.0)), fp.FromPlan(fp.Exponential(rate=6.0))],
+    [
+        pytest.param(fp.FromMeasurement(), marks=pytest.mark.slow),
+        pytest.param(fp.FromMeasurementTracked(fp.Exponential(rate=6.0)), marks=pytest.mark.slow),
+        fp.FromPlan(fp.Exponential(rate=6.0)),
+    ],
     ids=lambda n: type(n).__name__,
 )
 def test_every_variant_is_cured_by_adaptation(nominal):

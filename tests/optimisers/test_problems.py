@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kinds import slow_but
 from test_certificate import PROBLEMS, first_horizon
 
 import fpirhc as fp
@@ -53,7 +54,7 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
         assert costs[0] <= 1.01 * costs[1]
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", slow_but(PROBLEMS, "two_mass", "cart_pole"))
 def test_iterations_in_closed_loop(name):
     """Converged to 1e-6 of the input's range, the median plan needs at most six iterations; limits become active."""
     problem = fp.load_problem(name).problem

@@ -41,6 +41,7 @@ def test_a_loop_with_a_wrong_model_is_ipopts_loop():
     assert both.own.loop.violation == pytest.approx(both.rival.loop.violation, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_loop_whose_calls_end_too_early_misses_the_bars():
     """One iteration is too few for most of its plans, and for the certificate of an infeasible horizon."""
     case, ocp, optimiser = oscillator()

@@ -44,7 +44,10 @@ def test_a_step_with_twenty_stages_needs_no_more(name, states, most):
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize(("name", "states"), [case[:2] for case in CASES[:2]], ids=["plain", "state limits"])
+@pytest.mark.parametrize(
+    ("name", "states"),
+    [pytest.param(*CASES[0][:2], id="plain", marks=pytest.mark.slow), pytest.param(*CASES[1][:2], id="state limits")],
+)
 def test_a_step_behind_its_gate_touches_no_more_than_it_says(name, states, tmp_path):
     """In no branch of the gate is something written behind the end, or overwritten.
 
@@ -96,6 +99,7 @@ def test_the_first_plan_of_a_run_is_not_compiled(monkeypatch):
 # Compiled loops for one machine and for every machine of its architecture: the same numbers
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 def test_a_library_for_every_machine_has_the_numbers_of_one_for_this_machine(tmp_path, monkeypatch):
     """A chain of four masses has enough states for Jacobians with all directions side by side, which are apart from the loops."""

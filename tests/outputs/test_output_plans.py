@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import output_plans as study
 import pytest
+from kinds import slow_but
 from own_nmpc import FINE, equations, own_run, runge_kutta
 from plants import simulated
 from scipy.integrate import solve_ivp
@@ -55,7 +56,7 @@ def test_plans_of_a_wrong_model_are_those_of_an_independent_controller(name: str
     assert np.abs((run["command"] - own.commands) / study.spans(problem)).max() < 1e-3
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", slow_but(RMS, "growth"))
 def test_with_adaptation_the_plant_does_what_the_plan_foresaw(name: str) -> None:
     problem = study.PLANTS[name]()
     adaptive = study.judged(problem, study.ways(problem)["RHC+FPI, model-referenced"])

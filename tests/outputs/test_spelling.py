@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import tasks
 from forms import named_again, with_arguments
+from kinds import slow_but
 from on_problem import on_problem
 from plants import simulated
 
@@ -63,7 +64,7 @@ LOOPS: dict[str, Callable[[], tuple[Controller, fp.Problem]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", slow_but(LOOPS, *list(LOOPS)[::2]))
 def test_coordinates_as_outputs_change_no_signal(name: str) -> None:
     """Of any controller, bit by bit. A schedule of slots gives every output a reference, and every coordinate at its time."""
     controller, problem = LOOPS[name]()
@@ -198,7 +199,7 @@ REPLANNING = {
 }
 
 
-@pytest.mark.parametrize("way", REPLANNING)
+@pytest.mark.parametrize("way", slow_but(REPLANNING, "own"))
 @pytest.mark.parametrize("name", PLANTS)
 def test_adaptive_plans_on_a_plant_are_those_on_the_plant_in_its_outputs(name: str, way: str) -> None:
     wrong = np.random.default_rng(1).uniform(0.6, 1.6, 3)

@@ -256,6 +256,7 @@ def test_other_seeds_are_tried_where_they_change_a_run(noise, runs):
     assert len(plant._seeds(1)) == runs
 
 
+@pytest.mark.slow
 def test_no_neighbour_of_the_choice_is_better():
     """On a plant with limits that the estimate lacks the best predicted share is too large; trials walk to the best."""
     task = fp.load_problem("van_der_pol")
@@ -272,6 +273,7 @@ def test_no_neighbour_of_the_choice_is_better():
     assert errors["chosen"] == min(errors.values())
 
 
+@pytest.mark.slow
 def test_what_a_record_does_not_bound_is_adapted_by_trials_alone():
     """Forty cycles are a tenth of what a lag of .3 s takes: nothing is proposed untried."""
     problem = replace(body_problem(1.0, 0, 0.3, 0.05), duration=2.0)
@@ -386,6 +388,7 @@ def test_a_sign_that_is_not_certain_is_asked_again_louder(monkeypatch):
     assert 0 < found.gain["q"]["q"].low <= 0.3 <= found.gain["q"]["q"].high
 
 
+@pytest.mark.slow
 def test_coupled_bodies_are_offered_a_gain_matrix():
     """Directions with gains of 1.3 and .2: the matrix is the inverse of the gains, and not behind the best single number."""
     problem = replace(body_problem([[0.8, 0.6], [0.5, 0.7]], 0, 0.0, 0.02), duration=2.0)
@@ -401,6 +404,7 @@ def test_coupled_bodies_are_offered_a_gain_matrix():
     assert min(found.trials[name].error for name in weighted) <= min(single)
 
 
+@pytest.mark.slow
 def test_a_model_that_is_not_affine_in_its_input_has_a_choice():
     """The model is 20 tan(u / 20): no inverse in symbols is needed where all coordinates are controlled."""
     problem = body_problem(1.6, 0, 0.0, 0.02)

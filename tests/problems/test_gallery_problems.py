@@ -13,6 +13,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from kinds import slow_but
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 
@@ -137,6 +138,7 @@ def test_the_cell_has_no_singular_voltages(voltage, gate, rate):
     assert (rates[2] - rates[0]) / 2e-5 == pytest.approx(rate / 20, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_spikes_are_counted_and_suppressed():
     """On the wave the cell fires without adaptation and not with it; kept silent it does not fire at all."""
 
@@ -215,6 +217,7 @@ def test_it_breaks_away_at_the_static_friction(force, slides):
         assert displacement == pytest.approx(-1.5e-4 * np.log(1 - force / 1.5), rel=0.02)
 
 
+@pytest.mark.slow
 def test_sub_steps_follow_the_bristles():
     """The plant's own integrator against SciPy's Radau over a reversal with the command of a run: within 1 % of its rms error."""
     name, controller = "stick_slip", "RHC+FPI"
@@ -230,6 +233,7 @@ def test_sub_steps_follow_the_bristles():
     assert abs(now[0] - state[end, 0]) < 0.01 * rms(name, controller)
 
 
+@pytest.mark.slow
 def test_an_explicit_stage_of_10_ms_diverges_and_review_says_so():
     """The exact model's bristles move at 1 000 per second: without sub-steps no plan has digits, which is refused."""
     fine = task("stick_slip")
@@ -323,7 +327,9 @@ def test_a_gentle_gain_is_worse_than_none_at_the_plans_own_rate(name):
     assert rms(name, "RHC+FPI, gentle, model-referenced") < 0.1 * rms(name, "RHC")
 
 
-@pytest.mark.parametrize("name", [*GALLERY, "anaesthesia", "anaesthesia_stimulated"])
+@pytest.mark.parametrize(
+    "name", slow_but((*GALLERY, "anaesthesia", "anaesthesia_stimulated"), "anaesthesia", "turbojet", "tumour")
+)
 def test_the_form_that_comes_first_is_as_good_as_the_published_one(name):
     """Within a twentieth of the plain form's error, or below it."""
     assert isinstance(task(name).controllers[SAFE].deformation, fp.ModelReferenced)
@@ -401,6 +407,7 @@ def test_the_ball_rolls_as_lagrange_has_it():
         np.testing.assert_allclose([found["x'"], found["y'"]], expected, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_camera_serves_a_rival_better_than_the_iteration():
     """Both leave less than a fourth of the error. Were accelerations known at once, a larger gain would beat the rival."""
     errors = {
@@ -454,6 +461,7 @@ def test_the_house_loses_what_it_is_given():
     assert held == pytest.approx(problem.period * given, abs=0.01 * problem.period * run["command.heat"].sum())
 
 
+@pytest.mark.slow
 def test_a_review_of_whole_portions_is_what_runs_show():
     """A rounded dose has no slope, and its linear loop is that of the mouse alone, which grows: runs of both forms decide."""
     one = task("tumour_portions")

@@ -9,6 +9,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
@@ -111,7 +112,7 @@ THEIRS = {"none 0": 0.04166036, "none 1": 0.02800689, "none 2": 0.02528741, "non
 THEIRS |= {"force 0": 0.04961751, "force 1": 0.0371662, "force 2": 0.12900266}
 
 
-@pytest.mark.parametrize("case", THEIRS)
+@pytest.mark.parametrize("case", slow_but(THEIRS, "none 0", "force 2"))
 def test_incremental_inversion_here_is_the_benchmarks(task, beside, case):
     """Within 12 %: a tenth is what other motor noise does to it."""
     del beside
@@ -126,7 +127,10 @@ def test_incremental_inversion_here_is_the_benchmarks(task, beside, case):
 
 
 @pytest.mark.parametrize(
-    "case", ["none 0", "wind 1", "force 2", "torque 0", "payload 3", "efficiency 4", "uncertainty 5"]
+    "case",
+    slow_but(
+        ("none 0", "wind 1", "force 2", "torque 0", "payload 3", "efficiency 4", "uncertainty 5"), "wind 1", "payload 3"
+    ),
 )
 def test_adaptation_flies_a_trial_of_every_family(task, case):
     """At one gain, at most half of the error of the law alone, and below 6 cm."""

@@ -112,6 +112,7 @@ def test_a_form_inside_wrappers_is_told_too():
     assert mirror.lag == LAG
 
 
+@pytest.mark.slow
 def test_review_judges_the_stated_lag():
     """A rate that leaves no room for the lag is called so, for a form that does not pair through it."""
     one, plain = problem(lag={"u": LAG}), fp.Affine(gain=-1.0)

@@ -98,6 +98,7 @@ def test_data_of_the_charts_is_complete(comparison):
     json.dumps(data, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_predicted_band_is_drawn_around_the_distance_from_the_models_run():
     """The headline's adaptive controller has a chart more: the distance is that of the run, and inside the band."""
     track = fp.Exponential(rate=6.0)

@@ -46,6 +46,7 @@ def share(problem: fp.Problem, optimiser: Optimiser) -> float:
     return float(np.mean(run["status"] == Status.NOT_CONVERGED))
 
 
+@pytest.mark.slow
 def test_too_few_iterations_are_found_and_the_named_number_suffices():
     """A tolerance of 1e-6 N m: the run agrees with the answer, before the advice and after it."""
     problem, few = pendulum(), fp.FixedPoint(iterations=1, tolerance=1e-6)

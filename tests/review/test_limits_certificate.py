@@ -113,7 +113,7 @@ def stays_inside(name: str, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("name", "plants"),
-    [(name, 300) for name in ("body", "tanks")]
+    [(name, 100) for name in ("body", "tanks")]
     + [pytest.param(name, 10_000, marks=pytest.mark.slow) for name in DURATIONS],
 )
 def test_no_plant_of_the_box_leaves_its_certificate(name, plants):

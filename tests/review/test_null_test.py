@@ -61,6 +61,7 @@ def rms(problem: fp.Problem, controller: fp.RecedingHorizon | fp.ComputedTorque)
     return float(np.sqrt(np.mean(run["error"][run.time >= problem.measure_from] ** 2)))
 
 
+@pytest.mark.slow
 def test_a_period_that_is_long_against_the_plant_fails():
     """P T = 0.43: the plain form takes the drift within a cycle for an error. The answer has the errors that runs show."""
     problem = drifting(0.005)

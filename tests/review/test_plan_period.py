@@ -52,11 +52,11 @@ def movement(problem: fp.Problem, controller: Any) -> float:
     ("load", "controller", "duration", "up"),
     [
         (lambda: tasks.two_mass, "RHC", 3.0, True),
-        (lambda: tasks.leaking_tanks, "RHC", None, True),
+        pytest.param(lambda: tasks.leaking_tanks, "RHC", None, True, marks=pytest.mark.slow),
         (lambda: abroad.load("flexible_servo"), "RHC+FPI", None, False),
         pytest.param(lambda: tasks.hodgkin_huxley_silent, "RHC offset-free", None, True, marks=pytest.mark.slow),
         (lambda: tasks.leaking_tanks, "RHC offset-free", None, True),
-        (lambda: tasks.tumour, "RHC offset-free", None, True),
+        pytest.param(lambda: tasks.tumour, "RHC offset-free", None, True, marks=pytest.mark.slow),
     ],
     ids=["two_mass", "leaking_tanks", "servo with adaptation", "silent cell", "observed tanks", "tumour"],
 )

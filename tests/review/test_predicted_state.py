@@ -94,6 +94,7 @@ def test_review_names_a_prediction_that_knows_it():
     assert answer.numbers["error with ByModel(residual_time=0.08)"] < 0.01 * answer.numbers["error"]
 
 
+@pytest.mark.slow
 def test_review_keeps_a_prediction_that_is_right():
     late = 0.08
     right = mass(late).with_exact(np.zeros(1))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from chains import chain
 from forms import named_again
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import least_product
@@ -43,7 +44,7 @@ def increment(map_):
     return fp.Increment(map_, cycles=0)
 
 
-@pytest.mark.parametrize("gain", [-0.5, -1.5])
+@pytest.mark.parametrize("gain", slow_but([-0.5, -1.5], -1.5))
 @pytest.mark.parametrize("form", [lambda m: m, increment], ids=["plain", "increment"])
 @pytest.mark.parametrize("which", ["CTC", "RHC"])
 def test_recursion_predicts_the_loop(which, form, gain):
@@ -266,6 +267,7 @@ def test_majorant_is_the_largest_error_of_all_signs():
     assert (bound[last] <= (np.abs(factors[last]) @ bound[last - 1] + np.abs(parts[last])) * (1 + 1e-9)).all()
 
 
+@pytest.mark.slow
 def test_box_widens_the_tube():
     """With a box of parameters the tube is the largest of its draws, so nowhere narrower."""
     problem, selection = (

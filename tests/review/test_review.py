@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from kinds import shipped
+from kinds import shipped, slow_but
 from random_plants import dies_out, random_case
 from reviewed import PERIOD, about, answer, answers, mass, torque
 
@@ -102,7 +102,7 @@ def test_own_loops_are_those_beside_the_ideal_one():
     assert own_loops(grid, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-6))).reason
 
 
-@pytest.mark.parametrize("cycles", [0, 1, 2, 5])
+@pytest.mark.parametrize("cycles", slow_but([0, 1, 2, 5], 0, 2))
 def test_dead_time_limit_is_where_the_loop_leaves_the_unit_circle(cycles):
     """Unpaired, a lambda < 2 sin(pi / (2 (2 d + 1))), here with the slow outer loop in place; the gain question says the same."""
     problem = mass(dead_time=fp.DeadTime(inputs={"u": cycles * PERIOD}))
@@ -260,9 +260,19 @@ def test_values_that_make_no_sense_are_refused():
 
 # They differentiate plans of 10 ms and more; the journey below reviews dead time, and others of their kind are quicker.
 LONG = ("anaesthesia", "building", "chain_of_masses", "delayed_mass", "diabetes", "freeway", "leaking_tanks")
+LONG += (
+    "noisy_motor",
+    "stick_slip",
+    "tumour",
+    "turbojet",
+    "two_link_arm",
+    "van_der_pol",
+    "freeway_metering",
+    "cart_pole",
+)
 
 
-@pytest.mark.parametrize("name", shipped(*LONG, "noisy_motor", "two_link_arm"))
+@pytest.mark.parametrize("name", shipped(*LONG))
 def test_every_shipped_problem_can_be_reviewed(name, capsys):
     """Through the command line: one JSON object, every answer with its facts, and the exit code that its verdicts ask for."""
     task = fp.load_problem(name)

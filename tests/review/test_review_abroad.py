@@ -55,6 +55,7 @@ def test_zeros_of_the_tanks_are_those_of_johansson(variant, zero, verdict):
     assert one.evidence.startswith("stable" if zero < 0 else "unstable")
 
 
+@pytest.mark.slow
 def test_tanks_are_ready_and_their_run_agrees():
     """Every answer about RHC+FPI is yes or advice, and the run is better by a factor."""
     answers = {a.question: a.verdict for a in reviewed("quadruple_tank")}
@@ -71,6 +72,7 @@ def test_tanks_are_ready_and_their_run_agrees():
 # The flexible servo
 
 
+@pytest.mark.slow
 def test_the_servo_has_nothing_to_adapt():
     """The Jacobian is 1, the load's parameters are named, and adaptation does not lower the response error."""
     review = {a.question: a for a in reviewed("flexible_servo")}
@@ -81,6 +83,7 @@ def test_the_servo_has_nothing_to_adapt():
     assert review["Does adaptation lower the response error?"].verdict == "no"
 
 
+@pytest.mark.slow
 def test_the_weighed_change_of_the_voltage_leaves_no_answer_out():
     """The cost weighs the change of the voltage: margins, rates and convergence have numbers.
 
@@ -138,7 +141,7 @@ def test_minutes_are_minutes():
 # The half-rule model of Skogestad's process
 
 
-@pytest.mark.parametrize(("gain", "stable"), [(-1.9, True), (-2.4, False)])
+@pytest.mark.parametrize(("gain", "stable"), [(-1.9, True), pytest.param(-2.4, False, marks=pytest.mark.slow)])
 def test_the_limit_of_the_gain_is_that_of_a_run_without_the_valve(gain, stable):
     """The limit holds for every plant of the box, so also for the right model; the lag of the valve alone doubles it."""
     limit = about("half_rule", "gain admissible")
@@ -160,6 +163,7 @@ def test_the_loop_without_prediction_is_refused_before_a_run():
     assert about("half_rule", "margin", "RHC").verdict == "yes"
 
 
+@pytest.mark.slow
 def test_a_lag_that_is_stated_costs_nothing_with_the_right_model():
     """What is equal is said to be equal, and not by how many billionths it differs."""
     null = about("half_rule", "right model alone")
@@ -170,6 +174,7 @@ def test_a_lag_that_is_stated_costs_nothing_with_the_right_model():
 # What a review says of the reactor and of a cart behind a dead time with a user's own map, against runs
 
 
+@pytest.mark.slow
 def test_the_reactor_drifts_within_a_cycle():
     """0.43 of the jacket's pole passes in a cycle: with its exact model C_b is thousands of times worse with adaptation.
 
@@ -192,7 +197,12 @@ def test_the_reactor_drifts_within_a_cycle():
 
 
 @pytest.mark.parametrize(
-    ("name", "verdict"), [("unpaired", "unknown"), ("RHC+FPI", "no"), ("RHC+FPI, increment", "yes")]
+    ("name", "verdict"),
+    [
+        pytest.param("unpaired", "unknown", marks=pytest.mark.slow),
+        pytest.param("RHC+FPI", "no", marks=pytest.mark.slow),
+        ("RHC+FPI, increment", "yes"),
+    ],
 )
 def test_a_map_of_one_s_own_behind_a_dead_time(name, verdict):
     """Unpaired its gain is beyond 2 sin(pi / 18); paired, the plain form is too slow for the plan; the increment converges.

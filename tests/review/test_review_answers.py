@@ -704,6 +704,7 @@ def test_a_form_that_leaves_a_right_model_alone_is_not_told_to_use_one(null, sai
     assert said in answer.change
 
 
+@pytest.mark.slow
 def test_a_right_model_that_costs_more_than_the_wrong_one_is_a_no():
     """A map too narrow for its requests: 4.3 m on its own model, where the wrong model costs centimetres without adaptation."""
     task = fp.load_problem("two_mass")

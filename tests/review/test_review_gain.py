@@ -18,6 +18,7 @@ from fpirhc.review.review import predict
 PLANNED = "RHC+FPI, gentle"
 
 
+@pytest.mark.slow
 def test_a_gentle_gain_is_worse_than_none_and_what_would_do():
     """Daily doses with gain -0.3: no, and no benefit; the named gain and the named forms converge."""
     gentle = tasks.tumour_daily.controllers[PLANNED]
@@ -75,6 +76,7 @@ def test_a_gain_inside_its_limits_with_which_the_loop_diverges_is_too_small():
     assert errors[0] > 20 * errors[1]
 
 
+@pytest.mark.slow
 def test_a_loop_that_diverges_with_every_gain_says_where_to_look():
     """A dead time that nobody told: neither the gain in use nor half of its limit converges."""
     motor = fp.load_problem("problems/noisy_motor.py")

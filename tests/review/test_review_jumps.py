@@ -9,10 +9,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from kinds import shipped
 from plants import heavy
 
 import fpirhc as fp
-from fpirhc.problem_files.shipped import shipped_problems
 from fpirhc.review.grid import review_grid
 from fpirhc.review.questions.reference import jumps, reference_free_of_jumps
 
@@ -88,6 +88,6 @@ def test_a_review_answers_no_and_gives_a_filtered_set_point_that_is_free_of_jump
     assert np.isfinite(np.array(state(1.5)[1])).all()
 
 
-@pytest.mark.parametrize("name", shipped_problems())
+@pytest.mark.parametrize("name", shipped())
 def test_shipped_references_have_no_jumps(name):
     assert jumps(fp.load_problem(name).problem) == []

@@ -153,6 +153,7 @@ def test_blocks_have_a_feedback():
     assert sizes[1] < 0.5 * sizes[0]
 
 
+@pytest.mark.slow
 def test_a_plan_that_also_begins_anew_is_linearised_where_it_is_solved():
     """`freeway_economic` takes the cheaper of two plans, and has none where the queue of its reference is too long.
 
@@ -175,6 +176,7 @@ def test_a_plan_that_also_begins_anew_is_linearised_where_it_is_solved():
     assert (ahead - behind) / 2 == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_cycles_that_are_skipped_have_no_linear_loop():
     """Where the model asks for more than the road carries, the last command is held: that is no loop without feedback."""
     task = fp.load_problem("freeway_economic")

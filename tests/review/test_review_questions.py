@@ -9,6 +9,7 @@ import abroad
 import casadi as ca
 import numpy as np
 import pytest
+from kinds import slow_but
 from plants import heavy
 from reviewed import answer
 
@@ -156,7 +157,7 @@ def test_advice_for_a_controller_without_a_map_names_no_gain():
     assert (one.verdict, one.change) == ("caution", "Weigh the inputs more.")
 
 
-@pytest.mark.parametrize("name", ["delayed_mass", "two_link_arm"])
+@pytest.mark.parametrize("name", slow_but(["delayed_mass", "two_link_arm"], "two_link_arm"))
 def test_a_map_has_all_cycles_between_two_plans_for_a_jump_of_the_plan(name: str):
     """Plans every 20 and 10 cycles move the request by more than a step of the map; no run without that bound is better."""
     task = fp.load_problem(name)

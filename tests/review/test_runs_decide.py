@@ -27,6 +27,7 @@ def of_the_ball() -> dict[str, Answer]:
     return answers("ball_on_plate", "RHC+FPI")
 
 
+@pytest.mark.slow
 def test_a_gain_that_helps_is_admissible_though_the_recommended_one_does_harm(of_the_ball):
     """Half of the limit of its model, which has no servos, is a hundred times the gain in use, with which nine tenths are gone."""
     one = of_the_ball[GAIN]

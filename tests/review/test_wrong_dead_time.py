@@ -102,6 +102,7 @@ def test_plans_with_another_dead_time_are_those_that_are_built_with_it():
         assert loop.delayed(late, 2).radius == pytest.approx(built.radius, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_what_survives_is_ready_and_what_grows_is_not():
     """The plant's dead time is one cycle longer than believed: no with certainty, and ready with an uncertainty of five."""
     for form in (fp.Increment, fp.Paired):
@@ -140,6 +141,7 @@ def two_masses(second: int) -> fp.Problem:
     )
 
 
+@pytest.mark.slow
 def test_dead_times_that_differ_are_judged():
     """Told each its own: yes and borne. Told the longer one for both: the shorter channel is wrong by seven cycles, and no."""
     law = fp.Exponential(rate=2.0)
@@ -176,7 +178,7 @@ def test_an_input_without_dead_time_beside_one_with():
     np.testing.assert_allclose(arriving[:, 0], run["command"][:, 0], rtol=1e-12)
 
 
-@pytest.mark.parametrize(("weight", "verdict"), [(1e4, "yes"), (3e4, "no")])
+@pytest.mark.parametrize(("weight", "verdict"), [(1e4, "yes"), pytest.param(3e4, "no", marks=pytest.mark.slow)])
 def test_the_loop_is_asked_and_not_the_iteration_alone(weight, verdict):
     """A plan that predicts over 60 cycles, 66 or 54 in truth: the leaky iteration is stable, the eager plan loses with it.
 
@@ -269,6 +271,7 @@ def test_scenarios_draw_the_dead_time():
     assert {tuning._scenario(k).problem.dead_time.inputs["u"] for k in range(8)} == {20 * PERIOD}
 
 
+@pytest.mark.slow
 def test_a_loop_that_grows_too_slowly_for_a_short_run_is_no_yes():
     """Plans that are stiffer than the shipped ones swing at 66 cycles: a run of 2 s shows .043 m, and one of 12 s .072."""
     task = fp.load_problem("delayed_mass")

@@ -29,7 +29,7 @@ from fpirhc.review.review import predict
 from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.summary import written_out
 
-QUICK = ("cruise", "conical_tank", "magnet", "masses", "stocking")
+QUICK = ("conical_tank", "stocking")
 INVERTED = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in PLANTS if name != "ball_and_beam"
 ]

@@ -77,6 +77,7 @@ def test_the_verdict_says_so_of_a_run_whose_status_is_ok(task):
     assert compared[EXACT].metrics.statuses["OK"] > 0.7 * compared[EXACT].run.cycles
 
 
+@pytest.mark.slow
 def test_a_limit_of_the_level_is_what_helps(task):
     """What the sentence advises: with levels of at least a millimetre in the plan, the exact model fills the tank again."""
     kept = replace(

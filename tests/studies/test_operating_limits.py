@@ -130,7 +130,14 @@ def pendulum() -> fp.Problem:
 
 @pytest.mark.parametrize(
     ("problem", "controller"),
-    [(pump, LAW), (pump, ADAPTIVE), (trolley, LAW), (trolley, ADAPTIVE), (pendulum, LAW), (pendulum, ADAPTIVE)],
+    [
+        pytest.param(pump, LAW, marks=pytest.mark.slow),
+        (pump, ADAPTIVE),
+        pytest.param(trolley, LAW, marks=pytest.mark.slow),
+        (trolley, ADAPTIVE),
+        (pendulum, LAW),
+        pytest.param(pendulum, ADAPTIVE, marks=pytest.mark.slow),
+    ],
 )
 def test_limits_agree_with_the_margins_of_the_review(problem, controller):
     """One input, one gain: the factor of the plant's gain and the latency at which runs fail are the margins within 10 %."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.cli.main import main
@@ -39,6 +40,7 @@ def pump(exact: float = 1.0, **more) -> Task:
     return Task("pump", Path(__file__), "A pump", "", problem, {"law": LAW})
 
 
+@pytest.mark.slow
 def test_the_search_finds_the_edge_that_theory_gives_and_drawn_plants_nearly_do():
     found = robust_boxes(pump(), compiled=False)
     (box,) = found.boxes
@@ -65,7 +67,7 @@ def test_a_search_of_a_box_without_draws_in_its_corner_finds_the_plant_that_fail
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("noisy", slow_but([False, True], True))
 def test_plants_side_by_side_have_the_box_of_plants_one_after_the_other(noisy, monkeypatch):
     """What a sentence says is run by itself then: less than half the draws of one box, the search's plants among them.
 

@@ -240,6 +240,7 @@ def test_how_much_to_raise_the_scale_is_twice_what_is_needed():
     assert "raise its scale" not in judged(replace(deformation, scale=1.25 * needed * 1e-3)).verdict[0]
 
 
+@pytest.mark.slow
 def test_steps_of_a_plan_are_followed_until_the_next_plan():
     """Two masses, a plan every 10 cycles: the scale that the sentence asks for is enough, and half of it is too."""
     task = fp.load_problem("two_mass")

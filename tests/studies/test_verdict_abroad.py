@@ -31,6 +31,7 @@ def cstr() -> Comparison:
     return compared("cstr", "RHC", "RHC+FPI")
 
 
+@pytest.mark.slow
 def test_reactor_whose_only_weighted_output_is_lost(cstr):
     """C_b, the only weighted output, goes from 7e-6 to 0.39 mol/l: that is worse, though the jacket's error is smaller."""
     first = cstr.findings[0]
@@ -113,6 +114,7 @@ def test_own_map_in_the_wrong_form_is_worse_and_the_right_form_is_named():
     assert cart.null.harmful
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_too_fast_for_a_wrong_model_is_named_by_review_and_verdict():
     """Tanks of 2.3 times their area: three times the error of RHC, and a loop with a pole of 1.35; with a third of the drift a
     seventeenth, and every pole inside.
@@ -160,6 +162,7 @@ def test_at_the_same_rate_and_with_the_same_information_it_is_parity():
     assert 0.5 < slow < 2
 
 
+@pytest.mark.slow
 def test_a_process_behind_a_dead_time_and_a_lag_is_better_and_predicting_alone_is_not():
     """Half the error with a gain that is 40 % wrong; the null test leaves the lag's own error as it is."""
     process = compared("half_rule")

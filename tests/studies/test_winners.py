@@ -26,6 +26,7 @@ def test_limits_of_the_gain():
     assert found["V"] < found["G"] < 1.1 * found["V"] < 0.1 * found["-"]
 
 
+@pytest.mark.slow
 def test_a_latency_leaves_the_iteration_level_until_it_diverges():
     found = winners.errors(1.0, (0.5, 1.0), (3, 8), "F", seeds=(0,))
     assert found[0.5, 3]["F"] == pytest.approx(found[0.5, 8]["F"], rel=0.15)
@@ -34,6 +35,7 @@ def test_a_latency_leaves_the_iteration_level_until_it_diverges():
     assert math.isinf(found[1.0, 8]["F"])
 
 
+@pytest.mark.slow
 def test_the_page_has_the_maps_of_the_script():
     """Every row and column of the script has a cell, and one row is made again."""
     page = winners.PAGE.read_text(encoding="utf-8")

@@ -174,6 +174,7 @@ def test_shortest_memory_runs():
     assert np.isfinite(result["desired"]).all()
 
 
+@pytest.mark.slow
 def test_deformation_serves_the_law():
     """On the seed problem with its wrong model beta = 0.7 leaves less error than the exponential law of the same rate."""
     task = replace(fp.load_problem("two_mass").problem, duration=3.0, measure_from=2.0)
