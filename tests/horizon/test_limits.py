@@ -186,7 +186,7 @@ def test_the_end_is_met_in_every_unit():
         data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate).full()
         plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6 * unit), np.zeros(ocp.state.size), data)
         assert plan.status == fp.Status.OK
-        return float(plan.cost), np.abs(plan.states[:2, -1] / unit - (1, 0)).max()
+        return known(plan.cost), np.abs(plan.states[:2, -1] / unit - (1, 0)).max()
 
     (cost, _), *others = map(cost_and_miss, (1.0, 1e-6, 1e6))
     assert [miss for _, miss in others] == pytest.approx([0, 0], abs=1e-5)
