@@ -142,7 +142,7 @@ def test_margins_verified_on_a_box_of_parameters_serve_a_plant_in_it():
 
 
 def test_mistakes_are_named():
-    problem = replace(carriage(), duration=0.6)
+    problem = replace(carriage(), duration=1.2)
     free = replace(problem, limits=fp.Limits())
     with pytest.raises(InvalidProblem, match="no hard limits of states"):
         fp.tightened(free, adaptive())
