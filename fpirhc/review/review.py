@@ -106,7 +106,8 @@ def schedule_stable(problem: Problem, controller: Controller) -> Answer | None:
     except FpirhcError as error:
         return Answer(QUESTION, Verdict.UNKNOWN, str(error))
     if floquet.radius is None:
-        return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {floquet.reason}", "Use a periodic schedule.")
+        change = "" if floquet.period else "Use a periodic schedule."
+        return Answer(QUESTION, Verdict.UNKNOWN, f"no Floquet radius: {floquet.reason}", change)
     text = (
         f"near the set-point errors change by {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}"
     )

@@ -144,11 +144,11 @@ def _is_span(span: object) -> bool:
 
 
 def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mistakes: Mistakes) -> None:
-    """Note coordinates that have no slot, and slots that are never active."""
+    """Note coordinates that have no slot; where there are none, slots that are never active."""
     coordinates = list(visited)
     mistakes.unknown(f"{owner}: coordinate", coordinates, names)
     for name in names:
-        if name not in coordinates:
+        if name not in coordinates and set(coordinates) <= set(names):
             mistakes.add(f"{owner}: slot '{name}' is never active; give it time, or leave the slot out")
 
 
@@ -180,6 +180,7 @@ def _timed(
 
 
 _STILL = 1e-6  # size of a derivative, relative to its terms, that counts as zero
+_SAMPLES = 100  # instants at which the reference is looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,21 +249,35 @@ def linear_modes(
 
 def _set_point(problem: Problem, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray] | str:
     plant = problem.plant
-    reference_end = problem.reference.function(plant)(problem.duration)
-    motion, response = (np.asarray(v.full()).ravel() for v in reference_end)
-    moving = [abs(v) for e, v in zip(plant.output.elements, motion, strict=True) if "'" in e]
-    if max([*moving, *np.abs(response)]) > _STILL:
+    if not _rests(problem):
         return f"the reference still moves at its end, t = {problem.duration:g} {problem.time_unit}"
-    state = reference_states(problem, 2)[:, -1]
-    x, u, p = plant.symbols()
-    rate = plant.equations.rate(x, u, p)
-    function = ca.Function("fpirhc_rate", [x, u, p], [rate, ca.densify(ca.jacobian(rate, u))])
-    free, gain = (np.asarray(v.full()) for v in function(state, np.zeros(u.numel()), parameters))
+    states = reference_states(problem, _SAMPLES)
+    state = states[:, -1]
+    known = x, u, p = plant.symbols()
+    rate = plant.equations.rate(*known)
+    sizes = ca.mtimes(ca.fabs(ca.jacobian(rate, ca.vertcat(*known))), ca.fabs(ca.vertcat(*known)))
+    function = ca.Function("fpirhc_rate", [x, u, p], [rate, *map(ca.densify, (ca.jacobian(rate, u), sizes))])
+    free, gain, _ = (np.asarray(v.full()) for v in function(state, np.zeros(u.numel()), parameters))
     command = np.linalg.lstsq(gain, -free, rcond=None)[0].ravel()
-    residual = np.abs(np.asarray(function(state, command, parameters)[0].full())).max()
-    if not residual <= _STILL * (1 + np.abs(free).max()):
-        return f"the reference's last point is no equilibrium: no input brings |x'| below {residual:.3g}"
+    residual, _, terms = (np.abs(np.asarray(v.full()).ravel()) for v in function(state, command, parameters))
+    slow = np.abs(states).max(axis=1) / problem.duration
+    if not (residual <= _STILL * (np.nan_to_num(terms) + slow)).all():
+        return f"the reference's last point is no equilibrium: no input brings |x'| below {residual.max():.3g}"
     return state, command
+
+
+def _rests(problem: Problem) -> bool:
+    """Whether every derivative at the reference's end is small beside its largest value and the quantity's size over the run."""
+    plant, times = problem.plant, np.linspace(0.0, problem.duration, _SAMPLES)
+    function = problem.reference.function(plant).map(_SAMPLES)
+    motion, response = (np.abs(np.asarray(v.full())) for v in function(times[None, :]))
+    elements = dict(zip(plant.output.elements, motion, strict=True))
+    highest = {name + "'" * order: row for (name, order), row in zip(plant.chains.items(), response, strict=True)}
+    return all(
+        row[-1] <= _STILL * (row.max() + elements[e.rstrip("'")].max() / problem.duration ** e.count("'"))
+        for e, row in {**elements, **highest}.items()
+        if "'" in e
+    )
 
 
 def _mode(
@@ -325,8 +340,11 @@ class ByError(Schedule):
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
         mistakes.unknown("ByError: weight of coordinate", self.weights, names)
+        misspelt = set(self.weights) - set(names)
         for name in names:
             weight = self.weights.get(name)
+            if weight is None and misspelt:
+                continue
             if not (_is_number(weight) and weight > 0):
                 mistakes.add(f"ByError: the weight of '{name}' must be a positive number, got {weight!r}")
         _check_choice("ByError", self.dwell, self.hysteresis, problem, mistakes)

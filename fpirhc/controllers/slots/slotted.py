@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Annotated
 
 import casadi as ca
@@ -46,7 +47,7 @@ from fpirhc.fields.kinds import Accuracy, CountOrZero, NotNegative, Range
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of, response_age
-from fpirhc.plant.motion import time_signal
+from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.sensing.base import spline_weights
 from fpirhc.sensing.positions import PositionDifference
 from fpirhc.status import Status
@@ -106,12 +107,30 @@ class Slotted(Controller):
 
     def floquet(self, problem: Problem) -> Floquet:
         """Return the stability of the schedule, with ideal deformations and the plant's exact parameters."""
-        return radius_of(problem, self.channels(problem), self.schedule, self.blend)
+        return _radius_of(problem, self.channels(problem), self.schedule, self.blend)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
+        return (*self._late(problem), self._stability(problem))
+
+    def _late(self, problem: Problem) -> list[str]:
+        """Sentences about slots for which a run is too short."""
+        names, unit = [s.coordinate for s in self.slots], problem.time_unit
+        shortest, sequence = min(self.schedule.dwells(names, problem).values()), self.schedule.sequence(problem)
+        end = f"and the run ends at {problem.duration:g} {unit}"
+        if not sequence and len(names) > 1 and shortest >= problem.duration:
+            return [f"one slot alone gets a turn: it lasts {shortest:g} {unit}, {end}"]
+        starts = accumulate((duration for _, duration in sequence), initial=0.0)
+        turns = zip(sequence, starts, strict=False)
+        return [
+            f"slot '{name}' gets no turn: it would begin at {at:g} {unit}, {end}"
+            for (name, _), at in turns
+            if at >= problem.duration
+        ]
+
+    def _stability(self, problem: Problem) -> str:
         floquet = self.floquet(problem)
         if floquet.radius is None:
-            return (f"no Floquet radius: {floquet.reason}",)
+            return f"no Floquet radius: {floquet.reason}"
         alone = ", ".join(
             f"{name} {round(growth_of(problem.plant)(values).max(), 6) + 0.0:.3g}"
             for name, values in floquet.eigenvalues.items()
@@ -119,7 +138,7 @@ class Slotted(Controller):
         verb = "shrink" if floquet.radius < 1 else "grow"
         return (
             f"Floquet radius {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}: near the set-point errors "
-            f"of ideal slots {verb} (largest real part in each slot alone, 1/{problem.time_unit}: {alone})",
+            f"of ideal slots {verb} (largest real part in each slot alone, 1/{problem.time_unit}: {alone})"
         )
 
     def channels(self, problem: Problem) -> list[Channel]:
@@ -133,6 +152,15 @@ class Slotted(Controller):
             InvalidProblem: mistakes of slots and schedule, all together; a slot that lasts too long.
             NotContractive: the gain of a deformation has the wrong sign or is too large at the start.
         """
+        self._check_parts(problem)
+        self._check_blank(problem)
+        channels = self.channels(problem)
+        for one in channels:
+            _check_gain(problem, one)
+        self._check_growth(problem, channels)
+
+    def _check_parts(self, problem: Problem) -> None:
+        """Raise with all mistakes of slots and schedule, which is not asked about slots that the plant does not know."""
         mistakes = Mistakes("Slotted")
         names = [s.coordinate for s in self.slots]
         if not names:
@@ -141,14 +169,9 @@ class Slotted(Controller):
             mistakes.add(f"coordinate '{name}' has more than one slot; give it one, which the schedule may repeat")
         for slot in self.slots:
             _check_slot(problem, slot, mistakes)
-        if names:
+        if names and set(names) <= set(followed_units(problem.plant)):
             self.schedule.check(list(dict.fromkeys(names)), problem, mistakes)
         mistakes.raise_if_any()
-        self._check_blank(problem)
-        channels = self.channels(problem)
-        for one in channels:
-            _check_gain(problem, one)
-        self._check_growth(problem, channels)
 
     def _check_blank(self, problem: Problem) -> None:
         """Raise where a slot that adapts is over before its map learns."""
@@ -374,17 +397,16 @@ def floquet_radius(problem: Problem, slots: Sequence[Slot], schedule: Schedule, 
         blend: time constant of the offset at a switch, s; 0 leaves the offset out.
 
     Raises:
-        InvalidName: a coordinate or an input of a slot is unknown.
-        InvalidProblem: the order of a slot is not the model's.
-        NotInvertible: an input has no effect on the coordinate of its slot.
-        NotSupported: a deformation that a slot does not support.
+        InvalidField: a value of the wrong kind.
+        InvalidProblem: mistakes of slots and schedule, all together.
     """
-    channels = [channel(problem, slot, k) for k, slot in enumerate(slots)]
-    return radius_of(problem, channels, schedule, blend)
+    ideal = Slotted(slots, schedule, blend).with_deformation(Identity())
+    ideal._check_parts(problem)
+    return ideal.floquet(problem)
 
 
-def radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule, blend: float) -> Floquet:
-    """Return the same as `floquet_radius`, for slots that are already on the plant."""
+def _radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule, blend: float) -> Floquet:
+    """The same as `floquet_radius`, for slots that are already on the plant."""
     modes, reason = linear_modes(problem, channels, problem.plant.exact, blend)
     names = [c.slot.coordinate for c in channels]
     eigenvalues = {name: mode.eigenvalues for name, mode in zip(names, modes, strict=False)}
