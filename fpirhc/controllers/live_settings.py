@@ -26,7 +26,7 @@ from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
-from fpirhc.symbolic.live import PREFIX, copied, live_number, not_live
+from fpirhc.symbolic.live import ANEW, PREFIX, copied, live_number, not_live
 from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, paths_to
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -118,7 +118,8 @@ class LiveSettings:
         if elsewhere or not all(self._same_with(path, share, composite, compose) for share in _NUDGES):
             loop = f"the loop of {type(self.controller).__name__}"
             raise not_live(
-                [path], f"{loop} does not use it, or uses only numbers that are computed from it while it is built"
+                [path],
+                f"{loop} does not use it, or uses only numbers that are computed from it while it is built; {ANEW}",
             )
 
     def _same_with(
@@ -143,9 +144,11 @@ class LiveSettings:
             return error
         lost = [path for path in self.start if f"{PREFIX}{path}" in str(error)]
         if lost:
-            what = "a part of the loop that is built by itself needs its number"
-            return not_live(lost[:1], what, " here")
-        return not_live(self.start, f"the loop cannot be built with them ({error})", " together")
+            return not_live(lost[:1], f"a part of the loop that is built by itself needs its number; {ANEW}", " here")
+        together = " together" if len(self.start) > 1 else ""
+        if isinstance(error, TypeError):  # the words of numpy or CasADi for a number that it was not given
+            return not_live(self.start, f"a number is needed while the loop is built; {ANEW}", together)
+        return not_live(self.start, f"the loop cannot be built like that ({error})", together)
 
     def held(self, blocks: Sequence[Block]) -> list[Delay]:
         """Return the settings and derived numbers that some blocks read, as constants of a memory."""
@@ -270,7 +273,7 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
         return ends
     if isinstance(content, bool) or (isinstance(content, int | float) and _is_structure(owner, path)):
         what = f"{content!r} is a whole number or a switch, or stands for one, and decides what the loop is made of"
-        raise not_live([path], f"{what}; build one loop for each")
+        raise not_live([path], f"{what}; {ANEW}")
     if not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
         hint = "give it a number first" if content is None else f"go on with one of: {ways}"
@@ -335,7 +338,9 @@ def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:
     """Raise where a Function holds the number NaN: CasADi makes it of a symbol that is turned into a number."""
     for block in composite.blocks:
         if holds_nan(block.function):
-            raise not_live(paths, f"block '{block.name}' turns one of them into a number, which is NaN", " together")
+            raise not_live(
+                paths, f"block '{block.name}' turns one of them into a number, which is NaN; {ANEW}", " together"
+            )
 
 
 def _differences(before: object, after: object, path: str = "") -> Iterator[str]:

@@ -30,6 +30,7 @@ class SymbolicNumber(ABC):  # noqa: B024 -- a marker without methods
     """
 
 
+ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 PREFIX = "setting."  # of the names of signals that are settings
 DERIVED = "derived."  # of the paths of numbers that Python computes from settings
 T = TypeVar("T")
@@ -156,7 +157,7 @@ class LiveNumber(SymbolicNumber):
         self._refuse("its number in a text")
 
     def _refuse(self, what: str) -> NoReturn:
-        raise not_live(self.paths, f"{what} is needed while the loop is built", " here")
+        raise not_live(self.paths, f"{what} is needed while the loop is built; {ANEW}", " here")
 
 
 Number = float | LiveNumber  # a field that may be live
