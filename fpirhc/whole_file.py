@@ -1,8 +1,10 @@
-"""Files that are complete or not there: reports, results, baselines, runs."""
+"""Files that are complete or not there: reports, results, baselines, runs; and folders that hold something or are not there."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from fpirhc.errors import OutputError
@@ -27,3 +29,15 @@ def write_whole(content: str | bytes, path: Path, what: str) -> None:
             raise
     except OSError as error:
         raise OutputError(f"cannot write the {what} to '{path}': {error.strerror}") from None
+
+
+def missing_folders(folder: Path) -> list[Path]:
+    """Return those of a folder and its parents that are not there, the innermost first."""
+    return [one for one in (folder, *folder.parents) if not one.exists()]
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove the folders that are empty, the innermost first."""
+    for folder in folders:
+        with suppress(OSError):  # it is not there, or holds something
+            folder.rmdir()

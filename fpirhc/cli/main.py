@@ -8,7 +8,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 
-from fpirhc.cli.output import closed_by_reader, crash, interrupted, of_a_problem_file, silence_output
+from fpirhc.cli.output import closed_by_reader, crash, interrupted, of_a_problem_file, remove_unused, silence_output
 from fpirhc.cli.verb import DEBUG, GROUPS, ExitCode, Known, Parser, aligned, known, shipped, table
 from fpirhc.summary import printable
 
@@ -30,6 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             traceback.print_exc()
         return _ended_by(error)
+    finally:
+        remove_unused()
 
 
 def _ended_by(error: BaseException) -> int:

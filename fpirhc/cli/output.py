@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from fpirhc.studies.view import View
 
+_MADE: list[Path] = []  # folders that this command has made, the innermost first
 RESULTS = "results.json"  # what --json prints, beside every report
 
 
@@ -31,8 +32,10 @@ def results_folder(wanted: str | None, *default: str) -> Path:
 def output_folder(folder: Path) -> Path:
     """Create a folder for results before anything runs, so that a wrong path fails at once."""
     from fpirhc.errors import not_writable
+    from fpirhc.whole_file import missing_folders
 
     try:
+        _MADE.extend(missing_folders(folder))
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / ".fpirhc-probe"
         probe.touch()
@@ -40,6 +43,14 @@ def output_folder(folder: Path) -> Path:
     except OSError as error:
         raise not_writable(folder, error, "--out") from None
     return folder
+
+
+def remove_unused() -> None:
+    """Remove the folders for results that this command has made and written nothing to."""
+    from fpirhc.whole_file import remove_empty
+
+    remove_empty(_MADE)
+    _MADE.clear()
 
 
 def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:

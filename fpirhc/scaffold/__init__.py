@@ -6,7 +6,7 @@ import keyword
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from importlib.resources import files as resources
 from pathlib import Path
@@ -16,6 +16,7 @@ from fpirhc.baselines.check import accept
 from fpirhc.errors import InvalidName, OutputError, not_writable
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.problem_files.shipped import shipped_problems
+from fpirhc.whole_file import missing_folders, remove_empty
 
 _LONGEST = 60  # characters of a name
 _FALLBACK = "my_plant"
@@ -50,15 +51,13 @@ def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
 def kept_when_whole(folder: Path) -> Iterator[list[Path]]:
     """Files that are added to the list, and folders that the body makes, are removed where it fails or is interrupted."""
     files: list[Path] = []
-    folders = [one for one in (baseline_path(folder / "x").parent, folder, *folder.parents) if not one.exists()]
+    folders = missing_folders(baseline_path(folder / "x").parent)
     try:
         yield files
     except BaseException:
         for file in files:
             file.unlink(missing_ok=True)
-        for one in folders:
-            with suppress(OSError):  # it was not made, or holds what others wrote
-                one.rmdir()
+        remove_empty(folders)
         raise
 
 
