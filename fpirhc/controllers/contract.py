@@ -246,6 +246,19 @@ class Undeformed(Controller, ABC):
         return Identity()
 
 
+class PairedAtOnce(Undeformed, ABC):
+    """Contract: a controller that takes a response for that of the last command, also behind dead time."""
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        late = nominal(problem.dead_time)
+        age = late.measurement + max(late.inputs.values(), default=0.0)
+        text = (
+            f"{type(self).__name__} takes a response for that of the last command, and it is that of a command {age:.3g} "
+            f"{problem.time_unit} older: dead time is not compensated"
+        )
+        return (text,) if age else ()
+
+
 @dataclass(frozen=True)
 class ControllerWrapper(Controller, ABC):
     """Contract: a controller around another one, with its deformation."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -63,6 +64,9 @@ def test_indi_is_the_iteration_of_unit_gain(limits):
     """The law u + G^-1 (d - f) and the affine map of unit gain, with a wrong model, also where commands are clipped."""
     problem = swing(limits=fp.Limits(inputs={"torque": limits}))
     assert_same(problem, fp.rivals.INDI(TRACK), iterated(1.0))
+    late = replace(problem, dead_time=fp.DeadTime({"torque": 0.02}, measurement=0.01))
+    assert fp.rivals.INDI(TRACK).notes(problem) == ()
+    assert "a command 0.03 s older: dead time is not compensated" in fp.rivals.INDI(TRACK).notes(late)[0]
 
 
 @pytest.mark.parametrize("bandwidth", [50.0, 400.0])

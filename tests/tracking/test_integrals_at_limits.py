@@ -43,8 +43,9 @@ def last(problem: fp.Problem, controller: Controller, signal: str) -> float:
         fp.ComputedTorque(fp.ShiftPolynomial(poles=0.96, step=0.02)),
         fp.Slotted(slots=[fp.Slot("x", LAW)], schedule=fp.Periodic({"x": 1.0}), blend=0.1),
         fp.PID({"x": 2.0}, {"x": 1.0}),
+        fp.rivals.LyapunovMRAC(2.0, adaptation=1.0),
     ],
-    ids=["exponential", "shift polynomial", "slot", "PID"],
+    ids=["exponential", "shift polynomial", "slot", "PID", "gains"],
 )
 def test_the_error_takes_an_integral_out_of_a_limit(controller):
     """A bumpless start from far above loads the integral with heat; the falling error then asks for more than there is, too late.
@@ -62,8 +63,12 @@ def test_an_integral_goes_no_further_into_a_limit(controller):
 
 @pytest.mark.parametrize(
     "controller",
-    [fp.ComputedTorque(LAW), fp.PID(dict.fromkeys("ab", 2.0), dict.fromkeys("ab", 1.0))],
-    ids=["law", "PID"],
+    [
+        fp.ComputedTorque(LAW),
+        fp.PID(dict.fromkeys("ab", 2.0), dict.fromkeys("ab", 1.0)),
+        fp.rivals.LyapunovMRAC(2.0, adaptation=10.0),
+    ],
+    ids=["law", "PID", "gains"],
 )
 def test_a_limit_of_one_coordinate_stops_no_other_integral(controller):
     """The integral of b takes its load off also while a asks for what its input cannot give."""

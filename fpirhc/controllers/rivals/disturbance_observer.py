@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import command_before, law_blocks, like
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import PairedAtOnce
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
@@ -22,7 +22,7 @@ from fpirhc.tracking.base import Tracking
 
 
 @dataclass(frozen=True)
-class DisturbanceObserver(Undeformed):
+class DisturbanceObserver(PairedAtOnce):
     """Inverse dynamics less the observed disturbance at the input. Dead time is not compensated.
 
     Args:

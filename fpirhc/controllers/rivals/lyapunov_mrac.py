@@ -128,14 +128,17 @@ class LyapunovMRAC(Undeformed):
         return Block("law", Layout((*reads, *before)), Layout(writes), step, opaque=plant.equations.inverse_opaque)
 
     def _adapt_block(self, plant: Plant, period: float, sign: int) -> Block:
-        """Block that steps the gains, except while the command is clipped."""
+        """Block that steps the gains, except those of an input that the rule moves further into its limit."""
 
         def step(s: Signals) -> dict[str, Expression]:
-            rule = sign * self.adaptation * ca.vec(ca.mtimes(s._pull, s._regressor.T))
+            pull = sign * s._pull
+            # No side of a comparison where a command is not a number, so that its gains stay too.
+            counts = pull * (s.command_unclipped - s.command) <= 0
+            rule = self.adaptation * ca.vec(ca.mtimes(pull, s._regressor.T))
             change = rule - self.leakage * (s._gains_used - s._gains_first)
-            return {"gains": s._gains_used + period * ca.if_else(s.clipped, 0, change)}
+            return {"gains": s._gains_used + period * ca.if_else(ca.repmat(counts, s._regressor.numel()), change, 0)}
 
-        reads = Layout((scalar("clipped"), *_adapted(plant)))
+        reads = Layout((like(plant.input, "command_unclipped"), plant.input, *_adapted(plant)))
         return Block("adapt", reads, Layout((_gains(plant, "gains"),)), step)
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import PairedAtOnce
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import Duration, Positive, Range
 from fpirhc.members import Example
@@ -25,7 +25,7 @@ MOST = 20_000  # cycles of a period: each is one number per coordinate in the co
 
 
 @dataclass(frozen=True)
-class RepetitiveControl(Undeformed):
+class RepetitiveControl(PairedAtOnce):
     """Inverse dynamics of a request that is learned from period to period. Dead time is not compensated.
 
     Args:
