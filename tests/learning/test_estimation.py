@@ -50,6 +50,7 @@ def task(plant: fp.Plant, **changes) -> fp.Problem:
 
 
 RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-6))
+IDLE = replace(spring(), response=lambda q, v, u, p: {"y": u.u - p.k * q.y})
 SPRING = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
 MASS = {"m": fp.Uncertain(0.2, 5.0, 0.5)}
 NOISE = {"y": 0.1}
@@ -347,6 +348,12 @@ TWO_TASK = fp.Problem(
         (task(spring()), fp.RecursiveLeastSquares({"q": SPRING["k"]}, NOISE, 1.0), InvalidProblem, "'q' is unknown"),
         (task(spring()), fp.RecursiveLeastSquares(SPRING, {}, 1.0), InvalidProblem, "add 'y'"),
         (
+            task(IDLE),
+            fp.RecursiveLeastSquares(SPRING, NOISE, 1.0),
+            InvalidProblem,
+            "'b' does not enter the response of 'y'",
+        ),
+        (
             task(spring(believed=(20.0, 1.0))),
             fp.MovingHorizon(SPRING, NOISE, 5, 1.0),
             InvalidProblem,
@@ -422,3 +429,10 @@ def test_where_offset_free_control_is_the_better_choice():
     assert result["RHC offset-free"] <= 1.3 * result["RHC exact model"]
     assert result["RHC offset-free"] < 0.05 * result["RHC"]
     assert result["RHC+FPI"] > 0.5 * result["RHC"]
+
+
+def test_an_estimate_that_changes_no_command_is_noted():
+    learner = fp.RecursiveLeastSquares(SPRING, NOISE, 1.0)
+    idle, used = fp.PID({"y": 1.0}), fp.ComputedTorque(fp.Exponential(rate=1.0))
+    assert "learns changes no command: PID uses no model" in fp.Estimating(idle, learner).notes(task(spring()))[0]
+    assert fp.Estimating(used, learner).notes(task(spring())) == ()

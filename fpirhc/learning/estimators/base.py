@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
@@ -132,8 +132,9 @@ class Learner(ParameterEstimator):
         return tuple(self.parameters)
 
     def check(self, problem: Problem) -> None:
-        """Raise if names do not fit the plant, or an approximate value lies outside its bounds."""
+        """Raise if names do not fit the plant, an approximate value lies outside its bounds, or a parameter has no effect."""
         _check_names(type(self).__name__, problem.plant, self.parameters, self.noise)
+        _check_effects(type(self).__name__, problem.plant, self.parameters)
 
     def residual(self, plant: Plant) -> ca.Function:
         """Return the Function of `residual_function` in units of the noise."""
@@ -154,6 +155,20 @@ def _check_names(owner: str, plant: Plant, parameters: Mapping[str, Uncertain], 
     for name in plant.controlled_names:
         if name not in noise:
             mistakes.add(f"noise: the response of '{name}' has no deviation; add '{name}': ...")
+    mistakes.raise_if_any()
+
+
+def _check_effects(owner: str, plant: Plant, parameters: Iterable[str]) -> None:
+    x, u, p = plant.symbols()
+    effects = ca.jacobian_sparsity(plant.equations.controlled_response(x, u, p), p)
+    reaching = {plant.parameter.elements[k] for k in effects.get_triplet()[1]}
+    mistakes = Mistakes(owner)
+    for name in parameters:
+        if name not in reaching:
+            responses = " and ".join(f"'{c}'" for c in plant.controlled_names)
+            mistakes.add(
+                f"parameters: '{name}' does not enter the response of {responses}, which it is learned from; leave it out"
+            )
     mistakes.raise_if_any()
 
 

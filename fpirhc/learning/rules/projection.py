@@ -31,8 +31,8 @@ class Projection(Rule):
 
     Args:
         gain: gamma, between 0 and 2.
-        dead_zone: |h| over all responses below which the estimate stays, in their unit; above it the step grows as
-            (|h| - dead_zone) / |h|.
+        dead_zone: |h| = sqrt(sum h_k^2) below which the estimate stays, with every h_k in the unit of its response; where these are
+            several, the one with the largest numbers decides. Above it the step grows as (|h| - dead_zone) / |h|.
 
     References:
         G. C. Goodwin, K. S. Sin, Adaptive Filtering, Prediction and Control, Prentice-Hall 1984, ch. 3 (projection, dead zone).
