@@ -24,6 +24,7 @@ from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import derivative_unit, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
 from fpirhc.symbolic.live import PREFIX
@@ -78,8 +79,16 @@ class Channel:
         return Signal(self.wire(name), elements)
 
 
+# a controller is asked for its response, its checks and its blocks, and its schedule for every slot in turn
+_CHANNELS: Latest[Channel] = Latest(16)
+
+
 def channel(problem: Problem, slot: Slot, number: int) -> Channel:
     """Return the slot on the problem's plant."""
+    return _CHANNELS.of((problem, slot), (number,), lambda: _channel(problem, slot, number))
+
+
+def _channel(problem: Problem, slot: Slot, number: int) -> Channel:
     plant = problem.plant
     chain = output_chain(plant, slot.coordinate, slot.input)
     if slot.order is not None and slot.order != chain.order:
