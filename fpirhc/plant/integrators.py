@@ -138,7 +138,7 @@ class Cvodes(Integrator):
     """SUNDIALS CVODES.
 
     Args:
-        tolerance: relative and absolute.
+        tolerance: relative, and absolute in the size of every state: |x_i| + T |f_i| + T^2 |(df/dx f)_i| of the cycle T, at most 1.
     """
 
     tolerance: Accuracy = 1e-10
@@ -151,15 +151,22 @@ class Cvodes(Integrator):
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period` seconds."""
         rate = plant.equations.forced_rate
-        x, u, p, w = _symbols(rate)
-        data = ca.vertcat(u, p, w)
-        options = {"reltol": self.tolerance, "abstol": self.tolerance}
-        solver = ca.integrator(
-            "fpirhc_cvodes", "cvodes", {"x": x, "p": data, "ode": rate(x, u, p, w)}, 0.0, period, options
-        )
-        xm, um, pm, wm = (ca.MX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
-        x_next = solver(x0=xm, p=ca.vertcat(um, pm, wm))["xf"]
-        return ca.Function("fpirhc_cvodes_step", [xm, um, pm, wm], [x_next], ["x", "u", "p", "w"], ["x_next"])
+        x, u, p, w = symbols = _symbols(rate)
+        size, options = ca.SX.sym("size", x.numel()), {"reltol": self.tolerance, "abstol": self.tolerance}
+        moved = {"x": x, "p": ca.vertcat(u, p, w, size), "ode": rate(size * x, u, p, w) / size}
+        solver = ca.integrator("fpirhc_cvodes", "cvodes", moved, 0.0, period, options)
+        xm, *given = (ca.MX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
+        sizes = _sizes(rate(*symbols), symbols, period)(xm, *given)
+        x_next = sizes * solver(x0=xm / sizes, p=ca.vertcat(*given, sizes))["xf"]
+        return ca.Function("fpirhc_cvodes_step", [xm, *given], [x_next], ["x", "u", "p", "w"], ["x_next"])
+
+
+def _sizes(rate: ca.SX, symbols: tuple[ca.SX, ...], period: float) -> ca.Function:
+    """Function (state, input, parameters, forcing) -> what is large for each state in a cycle, at most 1, without a derivative."""
+    x = symbols[0]
+    size = ca.fabs(x) + period * ca.fabs(rate) + period**2 * ca.fabs(ca.jtimes(rate, x, rate))
+    column = ca.densify(ca.if_else(size > 0, ca.fmin(size, 1), 1))
+    return ca.Function("fpirhc_cvodes_sizes", list(symbols), [column], {"is_diff_out": [False], "never_inline": True})
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,14 @@ def test_runge_kutta_agrees_with_cvodes():
     np.testing.assert_allclose(fine, truth, rtol=1e-8, equal_nan=False)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-9])
+def test_cvodes_keeps_its_tolerance_in_every_unit(unit):
+    """A spring of rate 1: cos t of where it was let go."""
+    spring = fp.Plant({"y": "m"}, {"u": "N"}, {}, lambda q, v, u, p: {"y": u.u - q.y})
+    after = fp.Cvodes().step(spring, 1.0)([unit, 0.0], [0.0], [], [0.0])
+    np.testing.assert_allclose(after.full().ravel() / unit, [np.cos(1), -np.sin(1)], rtol=1e-8)
+
+
 def test_forcing_adds_to_the_response():
     """A forcing w on a free double integrator moves it by w t^2 / 2."""
     plant = pendulum()
