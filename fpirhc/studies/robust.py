@@ -17,6 +17,7 @@ from fpirhc.controllers.contract import Controller, believing
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import AboveZero, Accuracy, Seed
+from fpirhc.plant.motion import with_space
 from fpirhc.plant.plant import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting
@@ -47,6 +48,7 @@ class Counterexample:
 
     parameters: Mapping[str, float]  # its exact parameters, by name
     dead_times: Mapping[str, float]  # by path, in the unit of time; empty where they are the problem's
+    units: Mapping[str, str]  # of both, by the same names
     why: str  # it fails
     from_percent: int  # the smallest box, in whole percent, at whose edge in this direction a plant fails
 
@@ -352,7 +354,11 @@ class _Plants:
             holds, fails = (holds, middle) if self._point(middle, failing.shares, noise).why else (middle, fails)
         values = self._exact(percent, failing.shares)
         parameters = dict(zip(self._parameters, map(float, values), strict=True))
-        return Counterexample(parameters, self._other_dead_times(percent, failing.shares), failing.point.why, fails)
+        dead_times = self._other_dead_times(percent, failing.shares)
+        units = {name: one.unit for name, one in self._parameters.items()} | dict.fromkeys(
+            dead_times, self._problem.time_unit
+        )
+        return Counterexample(parameters, dead_times, units, failing.point.why, fails)
 
     def _other_dead_times(self, percent: int, shares: np.ndarray) -> dict[str, float]:
         plant = self._plant(percent, shares)
@@ -439,7 +445,8 @@ def _sentences(result: RobustBoxes) -> Iterator[str]:
 
 def _plant(example: Counterexample) -> str:
     values = ", ".join(
-        f"{name} = {number(value)}" for name, value in {**example.parameters, **example.dead_times}.items()
+        f"{name} = {number(value)}{with_space(example.units[name])}"
+        for name, value in {**example.parameters, **example.dead_times}.items()
     )
     return f"{values} ({example.why}); in this direction plants fail from {example.from_percent} % on"
 

@@ -518,7 +518,7 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
     """The request is 4.667 sin 3t: 14 per second."""
     one = slew(mass(), ratio * 14.0 * PERIOD)
     assert one.verdict == verdict
-    assert one.evidence == f"the request changes by up to 14 per s, the map by {ratio * 14:.3g}"
+    assert one.evidence == f"the request changes by up to 14 m/s^3, the map by {ratio * 14:.3g} m/s^3"
     assert one.numbers == {"needed": pytest.approx(14.0, rel=1e-3), "limit": pytest.approx(ratio * 14.0), "jump": 0.0}
     change = f"Raise the map's scale at least {2 / ratio:.2g} times."
     assert one.change == ("" if verdict == "yes" else change)
@@ -527,7 +527,7 @@ def test_a_map_is_fast_enough_at_twice_the_speed(ratio, verdict):
 def test_a_map_without_bound_is_fast_enough(grid):
     """The affine map takes a step of any size."""
     one = slew_enough(grid, fp.Affine(-0.5), grid.problem.plant.approximate, None)
-    assert (one.verdict, one.evidence) == ("yes", "the request changes by up to 14 per s; the map's step has no bound")
+    assert (one.verdict, one.evidence) == ("yes", "the request changes by up to 14 m/s^3; the map's step has no bound")
 
 
 def test_disturbances_ask_for_speed_as_well():
@@ -593,7 +593,7 @@ def test_a_start_off_the_reference_asks_for_speed():
     plan = linear(np.diag([0.5, 0.5]), np.eye(2), np.array([[6.0, 0.0]]), np.array([0, 1]), PERIOD)
     one = slew(mass(start={"q": 1.0, "q'": 1.5}), 1.0, plan)
     assert one.numbers["needed"] == pytest.approx(20.0)
-    assert one.evidence.startswith("the request changes by up to 20 per s after the start, the map")
+    assert one.evidence.startswith("the request changes by up to 20 m/s^3 after the start, the map")
     near = slew(mass(start={"q": 0.5, "q'": 1.5}), 1.0, plan)
     assert near.numbers["needed"] == pytest.approx(14.0, rel=1e-3)
     assert "after the start" not in near.evidence
@@ -624,7 +624,7 @@ def test_at_rest_nothing_is_asked_for():
     still = fp.Trajectory(lambda t: {"q": 0 * t})
     one = slew(replace(mass(start={"q": 0.0}), reference=still), 1.0)
     assert one.verdict == "yes"
-    assert one.evidence == "the request changes by up to 0 per s, the map by 10"
+    assert one.evidence == "the request changes by up to 0 m/s^3, the map by 10 m/s^3"
 
 
 # The commands

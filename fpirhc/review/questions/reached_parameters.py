@@ -15,6 +15,8 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
+from fpirhc.plant.chain import controlled_unit
+from fpirhc.plant.motion import with_space
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, each, inner_places
 from fpirhc.review.question import Answer, Case, ControllerQuestion, Verdict, by_run
@@ -39,7 +41,7 @@ def reaches_parameters(case: Case) -> Answer:
     numbers = {"wrong": float(len(wrong)), "reached": float(len(reached))}
     numbers |= {f"effect_{name}": size for name, size in sizes.items()}
     idle = _without_task(plant, case.grid.inner, missed)
-    text = "; ".join([*_reached(sizes), *_missed(missed, idle)])
+    text = "; ".join([*_reached(plant, sizes), *_missed(missed, idle)])
     if reached and not max(sizes.values()):
         change = "It corrects them off the reference: after a start or a disturbance."
         return Answer(REACHED, Verdict.CAUTION, text, change, numbers)
@@ -75,10 +77,11 @@ def _wrong(plant: Plant, believed: np.ndarray) -> list[int]:
 _NOTHING = 1e-9  # of the largest effect, below which an effect is rounding
 
 
-def _reached(sizes: dict[str, float]) -> list[str]:
+def _reached(plant: Plant, sizes: dict[str, float]) -> list[str]:
+    unit = with_space(controlled_unit(plant))
     ordered = sorted(sizes.items(), key=lambda pair: -pair[1])
     least = _NOTHING * max(sizes.values(), default=0.0)
-    shown, idle = [f"{v:.3g} ({n})" for n, v in ordered if v > least], [n for n, v in ordered if v <= least]
+    shown, idle = [f"{v:.3g}{unit} ({n})" for n, v in ordered if v > least], [n for n, v in ordered if v <= least]
     said = ["the response changes by up to " + ", ".join(shown)] if shown else []
     return (
         [*said, f"along the reference the response is the same for all values of {', '.join(idle)}"] if idle else said

@@ -21,7 +21,7 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Increment
 from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.chain import response_units
+from fpirhc.plant.chain import controlled_unit
 from fpirhc.plant.motion import with_space
 from fpirhc.review.prediction import (
     TRIED,
@@ -204,10 +204,8 @@ def _no_gain(text: str, numbers: dict[str, float]) -> Answer:
 
 def _with_unit(case: Case, error: float, scale: float) -> str:
     """A response error in its unit, where all controlled responses have one and the same."""
-    plant = case.problem.plant
-    units = {u for n, u in zip(plant.chains, response_units(plant), strict=True) if n in plant.controlled_names}
     size = beside(error, scale)
-    return f"{size}{with_space(units.pop())}" if len(units) == 1 and size == f"{error:.3g}" else size
+    return f"{size}{with_space(controlled_unit(case.problem.plant))}" if size == f"{error:.3g}" else size
 
 
 def rms(nominal: NominalRun, errors: ResponseErrors) -> float:

@@ -14,8 +14,8 @@ import numpy as np
 from fpirhc.contraction.delayed import basin_of_plain_form
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue
-from fpirhc.plant.chain import derivatives_function
-from fpirhc.plant.motion import controlled_places
+from fpirhc.plant.chain import controlled_unit, derivatives_function
+from fpirhc.plant.motion import controlled_places, with_space
 from fpirhc.review.grid import ReviewGrid, below_responses, state_slopes
 from fpirhc.review.loops import is_planned
 from fpirhc.review.prediction import errors_without_adaptation, response_errors
@@ -46,12 +46,13 @@ def slew_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarray
     steady = sum(d.slew * effect(grid, name) for name, d in problem.disturbances.items())
     needed, step = speed + steady, deformation.largest_step()
     numbers = {"needed": needed, "limit": step / problem.period, "jump": sudden}
-    text = f"the request changes by up to {needed:.3g} per {problem.time_unit}"
+    rate = with_space(controlled_unit(problem.plant, 1))
+    text = f"the request changes by up to {needed:.3g}{rate or f' per {problem.time_unit}'}"
     if after_start == speed > 0:
         text += " after the start"
     if not math.isfinite(step):
         return Answer(SLEW, Verdict.YES, f"{text}; the map's step has no bound", "", numbers)
-    text += f", the map by {step / problem.period:.3g}"
+    text += f", the map by {step / problem.period:.3g}{rate}"
     if sudden:
         cycles = math.ceil(sudden / step)
         text += f"; a jump of a disturbance takes the map {cycles} cycle{'s' * (cycles > 1)}"
@@ -130,7 +131,8 @@ def range_enough(grid: ReviewGrid, deformation: Deformation, believed: np.ndarra
     requests = grid.requests(believed)
     largest = float(np.nan_to_num(np.linalg.norm(np.hstack([requests, grid.responses]), axis=1)).max())
     ratio = size / max(largest, 1e-300)
-    text = f"{name} {size:.3g} is {ratio:.3g} times the largest request and response, {largest:.3g}"
+    unit = with_space(controlled_unit(grid.problem.plant))
+    text = f"{name} {size:.3g} is {ratio:.3g} times the largest request and response, {largest:.3g}{unit}"
     change = f"Use {name} = {_ROOM * largest:.2g} or more."
     return Answer(RANGE, graded(ratio, _ROOM), text, change, {"ratio": ratio})
 
@@ -155,7 +157,9 @@ def comes_back(case: Case) -> Answer | None:
     (rate, poles), period = law, case.problem.period
     basin = basin_of_plain_form(step, poles, rate, period, eigenvalue=eigenvalue)
     ratio = basin / max(error, 1e-300)
-    text = f"errors up to {error:.3g} are predicted; it comes back from a single one of {basin:.3g}, {ratio:.3g} times as large"
+    unit = with_space(controlled_unit(case.problem.plant))
+    text = f"errors up to {error:.3g}{unit} are predicted; "
+    text += f"it comes back from a single one of {basin:.3g}{unit}, {ratio:.3g} times as large"
     text += "" if ratio >= _WANTED else f", where {_WANTED:g} times are wanted, because errors that last add up"
     numbers = {"error": error, "basin": basin}
     unsure = ratio > _LASTING or not deformation.iteration.constant
