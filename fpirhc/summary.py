@@ -101,8 +101,13 @@ def printable(text: str) -> str:
 
 
 def number(value: float) -> str:
-    """Return a number in four digits."""
-    return f"{value:.4g}"
+    """Return a number in four digits as people write it, see `written_out`."""
+    return written_out(value, 4)
+
+
+def behind_equals(value: float, digits: int = 4) -> str:
+    """Return a number as it stands behind '=', where thousands stay together."""
+    return written_out(value, digits).replace(" ", "")
 
 
 def in_percent(share: float) -> str:

@@ -16,7 +16,7 @@ from fpirhc.baselines.judging import OUTCOME, Judgement, Row
 from fpirhc.baselines.measuring import Number
 from fpirhc.errors import OutputError
 from fpirhc.report.terminal import say, show_table
-from fpirhc.summary import Column, Table
+from fpirhc.summary import Column, Table, written_out
 
 _ALWAYS = "rms_error"  # what a summary shows also where it holds, unless the problem has a headline metric
 _NAMED = 3  # consequences of a setting that are named
@@ -97,7 +97,7 @@ def show_baseline(baseline: Baseline, path: str, headline: str = "") -> None:
             if value.loose:
                 loose.append(f"{name}: {metric}")
             if value.loose or _speaks(metric, headline):
-                band = f"\u00b1 {value.band:.2g}"
+                band = f"\u00b1 {written_out(value.band, 2)}"
                 table.add([clean(name), clean(metric), number(value.value), band, _source(value)])
         for metric, why in one.not_compared.items():
             _say(f"not compared: {clean(name)}, {clean(metric)} ({clean(why)})")
@@ -181,12 +181,12 @@ def number(value: Number | None) -> str:
     """Return a value as text for a table."""
     if value is None:
         return "-"
-    return clean(value) if isinstance(value, str) else f"{value:.7g}"
+    return clean(value) if isinstance(value, str) else written_out(value, 7)
 
 
 def cells(row: Row) -> tuple[str, ...]:
     """Return the entries of one row, in the order of HEADS."""
-    band = "exact" if row.band is None else f"\u00b1 {row.band:.2g}"
+    band = "exact" if row.band is None else f"\u00b1 {written_out(row.band, 2)}"
     names = clean(row.controller), clean(row.metric)
     return *names, row.verdict, change(row.change), number(row.old), number(row.new), band
 

@@ -27,7 +27,7 @@ from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.studies.comparison.changes import Outcome
-from fpirhc.summary import Column, Table, printable
+from fpirhc.summary import Column, Table, number, printable, written_out
 
 if TYPE_CHECKING:
     from fpirhc.simulation.metrics import Metrics
@@ -270,7 +270,7 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
         for text in one.plan.reasons():
             say(f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
-            say(f"{one.name}: soft limit '{name}' costs {price:.4g}")
+            say(f"{one.name}: soft limit '{name}' costs {number(price)}")
         if one.plan.overflow():
             say(f"{one.name}: {one.plan.overflow()}")
         if one.plan.status != Status.OK:
@@ -280,11 +280,15 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
 
 def _plan_row(solved: Solved) -> list[str]:
     plan, known = solved.plan, solved.certificate
-    bounds = [f"{known.factor:.3f}", f"{known.input_error:.1e}", f"{known.suboptimality:.1e}"] if known else ["-"] * 3
+    bounds = (
+        [f"{known.factor:.3f}", written_out(known.input_error, 2), written_out(known.suboptimality, 2)]
+        if known
+        else ["-"] * 3
+    )
     return [
         solved.name,
-        "-" if plan.cost is None else f"{plan.cost:.7g}",
-        "-" if plan.stationarity is None else f"{plan.stationarity:.0e}",
+        "-" if plan.cost is None else written_out(plan.cost, 7),
+        "-" if plan.stationarity is None else written_out(plan.stationarity, 1),
         f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
         *bounds,
         plan.status.name.lower().replace("_", " "),

@@ -16,6 +16,7 @@ from fpirhc.controllers.contract import tracking_law
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import derivative_unit, followed_units, with_space
 from fpirhc.simulation.run import Run
+from fpirhc.summary import behind_equals, written_out
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Feedback
 
@@ -66,7 +67,8 @@ class LyapunovView:
         first = float(np.sqrt(2 * self.function[self.since]))
         unit = with_space(self.unit) if self.unit else " (coordinates of several units)"
         text = (
-            f"Lyapunov: |S| at most {self.largest:.3g}{unit}; ultimate bound sup|h| / rate = {self.ultimate:.3g}{unit}"
+            f"Lyapunov: |S| at most {written_out(self.largest)}{unit}; "
+            f"ultimate bound sup|h| / rate = {behind_equals(self.ultimate, 3)}{unit}"
         )
         return (
             text

@@ -31,7 +31,7 @@ from fpirhc.studies.scenarios.bench import ranges, relative_error
 from fpirhc.studies.scenarios.dead_times import DeadTimes
 from fpirhc.studies.scenarios.draws import SEARCHING, draws_differ
 from fpirhc.studies.view import Progress, Study, View, circumstances
-from fpirhc.summary import Column, Table, in_percent, line, number
+from fpirhc.summary import Column, Table, behind_equals, in_percent, line
 from fpirhc.task.problem import Problem
 
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
@@ -445,7 +445,7 @@ def _sentences(result: RobustBoxes) -> Iterator[str]:
 
 def _plant(example: Counterexample) -> str:
     values = ", ".join(
-        f"{name} = {number(value)}{with_space(example.units[name])}"
+        f"{name} = {behind_equals(value)}{with_space(example.units[name])}"
         for name, value in {**example.parameters, **example.dead_times}.items()
     )
     return f"{values} ({example.why}); in this direction plants fail from {example.from_percent} % on"

@@ -31,7 +31,7 @@ from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.view import Progress, Study, View, circumstances
-from fpirhc.summary import Column, Table, in_percent, line, number
+from fpirhc.summary import Column, Table, behind_equals, in_percent, line, number
 from fpirhc.symbolic.paths import names_in
 from fpirhc.task.cases import PARAMETERS, START, Cases
 from fpirhc.task.problem import Problem
@@ -280,7 +280,7 @@ def _checked_axes(task: Task, axes: Sequence[Axis]) -> frozenset[str]:
         with mistakes.caught():
             if axis.path in of_cases:
                 ends = (axis.values[0], axis.values[-1])
-                _Values({f"{axis.path} = {number(v)}": {axis.path: v} for v in ends}).check(task.problem)
+                _Values({f"{axis.path} = {behind_equals(v)}": {axis.path: v} for v in ends}).check(task.problem)
             else:
                 _check_controllers(task, axis, words)
     mistakes.raise_if_any()
@@ -515,7 +515,7 @@ def _extremes(result: Sweep, one: SweepMap) -> list[str]:
         return ["none", "", ""]
     best = np.unravel_index(int(np.argmin(one.values)), one.values.shape)
     at = ", ".join(
-        f"{axis.path} = {number(axis.values[k])}"
+        f"{axis.path} = {behind_equals(axis.values[k])}"
         for axis, k in zip(result.axes, best, strict=True)
         if axis.path not in one.without
     )

@@ -25,7 +25,7 @@ from fpirhc.plant.motion import disturbed, followed, followed_units, with_exact_
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.plant.plant_check import unsolved
 from fpirhc.sensing.sensing import Sensing
-from fpirhc.summary import line, number, table
+from fpirhc.summary import behind_equals, line, number, table
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
@@ -604,4 +604,4 @@ def _interval(ends: tuple[float, float], unit: str) -> str:
 
 
 def _values(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {number(value)}" for name, value in values.items())
+    return ", ".join(f"{name} = {behind_equals(value)}" for name, value in values.items())

@@ -85,7 +85,7 @@ def _probed(controllers: Mapping[str, Controller]) -> tuple[str, Controller]:
 
 def _show(title: str, answer: Probe) -> None:
     from fpirhc.report.terminal import say, show_table
-    from fpirhc.summary import Column, Table
+    from fpirhc.summary import Column, Table, written_out
 
     estimates = Table(title, [Column("estimate", left=True), Column("value (interval)")])
     for estimate, value in answer.facts:
@@ -94,7 +94,7 @@ def _show(title: str, answer: Probe) -> None:
     if answer.trials:
         tried = Table("trials on the plant", [Column("candidate", left=True), Column("error"), Column("worst")])
         for candidate, one in answer.trials.items():
-            tried.add([candidate, f"{one.error:.3g}", f"{one.worst:.3g}"])
+            tried.add([candidate, written_out(one.error), written_out(one.worst)])
         show_table(tried)
         say("Errors are those with adaptation over those of the controller alone.")
     for note in answer.notes:

@@ -27,7 +27,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import say, show_table
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.view import to_json
-    from fpirhc.summary import Column, Table
+    from fpirhc.summary import Column, Table, written_out
 
     if options.out is not None and options.out.resolve() == options.recording.resolve():
         raise InvalidValue(f"--out {options.out} is the recording itself, which would be lost; name another file")
@@ -40,7 +40,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     heads = ("rms difference", "largest", "at time")
     table = Table(f"{task.name}: {options.controller}, replayed", [Column("input", left=True), *map(Column, heads)])
     for name, (rms, largest, at) in answer.differences().items():
-        table.add([name, f"{rms:.3g}", f"{largest:.3g}", f"{at:g}"])
+        table.add([name, written_out(rms), written_out(largest), written_out(at, 6)])
     if answer.recorded is not None:
         show_table(table)
     say(f"{len(answer.times)} cycles: " + ", ".join(f"{count} {status}" for status, count in answer.statuses.items()))

@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
 
 def _show(tuning: Tuning, saved: Path) -> None:
     from fpirhc.report.terminal import say, show_harm, show_table
-    from fpirhc.summary import Column, Table
+    from fpirhc.summary import Column, Table, number
 
     title = (
         f"{tuning.problem}: {tuning.trials} trials each, seed {tuning.seed}, {tuning.conditions}, cost: {tuning.metric}"
@@ -93,9 +93,9 @@ def _show(tuning: Tuning, saved: Path) -> None:
         show_harm(entry.harm)
     table = Table(title, [Column(head) for head in ("controller, setting", "before", "after", "failed")])
     for entry in tuning.entries:
-        table.add([f"{entry.name}: cost", f"{entry.cost_before:.4g}", f"{entry.cost:.4g}", str(entry.failed)])
+        table.add([f"{entry.name}: cost", number(entry.cost_before), number(entry.cost), str(entry.failed)])
         for path, value in entry.settings.items():
-            table.add([f"  {path}", f"{entry.before[path]:.4g}", f"{value:.4g}", ""])
+            table.add([f"  {path}", number(entry.before[path]), number(value), ""])
     show_table(table)
     if tuning.untouched:
         say(f"not tuned: {', '.join(tuning.untouched)}")
