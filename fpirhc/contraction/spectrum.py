@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count, Seed
@@ -340,7 +340,7 @@ def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepor
 def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
     """Return the report of `check_gain`; where `check_gain` raises, a report with `contractive` False and the same text."""
     gain = deformation.effective_gain()
-    name, own = _own_gain(deformation)
+    name, own = own_gain(deformation)
     predicted = predicted_factor(spectrum.eigenvalues, gain)
     try:
         linear = linear_limit(spectrum.eigenvalues)
@@ -353,7 +353,7 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
     own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
     contractive, within = linear[0] < gain < linear[1], sector[0] < gain < sector[1]
     admissible = _admissible(name, own_linear, own_sector)
-    what = f"{type(deformation).__name__}({name}={own:.4g})"
+    what = with_its_gain(deformation)
     verdict = _verdict(what, predicted, within, admissible) if contractive else ""
     return ContractionReport(
         predicted=predicted,
@@ -380,12 +380,6 @@ def _fault(gain: float, linear: tuple[float, float], predicted: float) -> str:
     return f"is too large: errors grow by the factor {predicted:.3g} per cycle"
 
 
-def _own_gain(deformation: Deformation) -> tuple[str, float]:
-    """The gain that the user sets, by name; the effective gain for a map that has none."""
-    own = getattr(deformation, deformation.gain_name, None)
-    return ("effective gain", deformation.effective_gain()) if own is None else (deformation.gain_name, float(own))
-
-
 def _scaled(limit: tuple[float, float], factor: float) -> tuple[float, float]:
     ends = sorted(end * factor + 0.0 for end in limit)
     return ends[0], ends[1]
@@ -397,10 +391,10 @@ def _size(limit: tuple[float, float]) -> float:
 
 def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float]) -> str:
     sign = "positive" if sum(linear) > 0 else "negative"
-    bounds = f"{_size(linear):.3g} (linear limit: small errors converge)"
+    bounds = f"0 < |{name}| < {_size(linear):.3g}"
     if not np.isclose(_size(linear), _size(sector)):
-        bounds += f" and < {_size(sector):.3g} (sector limit: by itself it converges from errors of any size)"
-    return f"a {sign} {name}, 0 < |{name}| < {bounds}"
+        bounds += f", and below {_size(sector):.3g} to converge from errors of any size"
+    return f"a {sign} {name}, {bounds}"
 
 
 def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.contraction.delayed import limit_behind_weights
 from fpirhc.contraction.spectrum import Spectrum, assess_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
-from fpirhc.deformation.base import Deformation, Iteration, against_wrappers
+from fpirhc.deformation.base import Deformation, Iteration, against_wrappers, own_gain, with_its_gain
 from fpirhc.errors import NotContractive
 from fpirhc.plant.maps import against_parts
 from fpirhc.symbolic.evaluate import Latest
@@ -131,38 +131,35 @@ def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
 
 def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> str:
     """What is wrong with a gain that is beyond the limit of the plant itself."""
-    gain = abs(deformation.effective_gain())
-    name, value = _named_gain(deformation)
+    name = own_gain(deformation)[0]
     values = spectrum.eigenvalues.ravel()
     largest = values[np.argmax(np.abs(values))]
     value_text = f"{largest.real if largest.imag == 0 else largest:.3g}"
     return (
-        f"{type(deformation).__name__}({name}={value:.4g}): the iteration converges only for effective gains below {limit:.3g}, "
-        f"and this one is {gain:.3g} (the largest eigenvalue of the response Jacobian at the start is {value_text}); use "
-        f"0 < |{name}| < {limit / gain * abs(value):.3g}. To see what happens beyond: BeyondLimit(map)"
+        f"{with_its_gain(deformation)} is too large, and runs in BeyondLimit(map) alone; use 0 < |{name}| < "
+        f"{_in_own(deformation, limit):.3g}, where the iteration converges: the largest eigenvalue of the response Jacobian at "
+        f"the start is {value_text}"
     )
 
 
-def _named_gain(deformation: Deformation) -> tuple[str, float]:
-    """The gain as the user wrote it, with the name of its field; the effective gain of a map without one."""
-    own = getattr(deformation, deformation.gain_name, None)
-    return (deformation.gain_name, float(own)) if own is not None else ("effective gain", deformation.effective_gain())
-
-
 def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing: float | None) -> str:
-    gain, estimator = abs(deformation.effective_gain()), problem.sensing.estimator
-    name, value = _named_gain(deformation)
+    name, estimator = own_gain(deformation)[0], problem.sensing.estimator
     delay = problem.response_delay
     reasons = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
     pole = deformation.iteration.error_pole
     reasons += [f"the error is filtered with the pole {pole:g}"] if pole else []
-    remedies = [f"0 < |{name}| < {limit / gain * abs(value):.3g}"] if limit else []
+    remedies = [f"0 < |{name}| < {_in_own(deformation, limit):.3g}"] if limit else []
     remedies += [f"Paired(map, cycles={pairing:.4g})"] if pairing is not None else []
     remedies += ["a shorter window or time constant"]
     return (
-        f"{type(deformation).__name__}({name}={value:.4g}): {' and '.join(reasons)}, so the iteration converges only for "
-        f"effective gains below {limit:.3g}, and this one is {gain:.3g}; use {', or '.join(remedies)}"
+        f"{with_its_gain(deformation)}: {' and '.join(reasons)}, so the iteration does not converge with this {name}; what "
+        f"helps: {', or '.join(remedies)}"
     )
+
+
+def _in_own(deformation: Deformation, limit: float) -> float:
+    """The size of the deformation's own gain at an effective gain."""
+    return abs(limit / deformation.effective_gain() * own_gain(deformation)[1])
 
 
 def _at_start(problem: Problem, deformation: Deformation) -> Spectrum | None:

@@ -291,6 +291,19 @@ def innermost(deformation: Deformation) -> Deformation:
     return own
 
 
+def own_gain(deformation: Deformation) -> tuple[str, float]:
+    """Return the gain that the user sets, by name; the effective gain of a map that has none."""
+    own = getattr(deformation, deformation.gain_name, None)
+    return ("effective gain", deformation.effective_gain()) if own is None else (deformation.gain_name, float(own))
+
+
+def with_its_gain(deformation: Deformation) -> str:
+    """Return a deformation as text, with what it is around and the gain alone: 'ModelReferenced(Affine(gain=-0.5))'."""
+    *around, own = [type(one).__name__ for one in _chain(deformation)]
+    name, value = own_gain(deformation)
+    return f"{''.join(f'{one}(' for one in around)}{own}({name}={value:.4g}){')' * len(around)}"
+
+
 def _chain(deformation: Deformation | None) -> Iterator[Deformation]:
     """Yield a deformation and those inside it, the outermost first."""
     while deformation is not None:

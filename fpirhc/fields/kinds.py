@@ -316,7 +316,8 @@ class Entries(Expected):
             yield f"[{shortened(key)}]", self.value, entry
 
     def completed(self, part: object) -> str:
-        return "give it a name: {'name': ...}" if accepts(self.value, part) else ""
+        one = shortened(part) if isinstance(part, int | float | tuple | str) else f"{type(part).__name__}(...)"
+        return f"write {{'NAME': {one}}} with the name of what it belongs to" if accepts(self.value, part) else ""
 
 
 @dataclass(frozen=True)

@@ -255,7 +255,7 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
 
 @contextmanager
 def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[None]:
-    """Add the recommended gain to a refusal of the controller's gain within it."""
+    """Put the recommended gain in place of the limit of the iteration in a refusal of the controller's gain within it."""
     try:
         yield
     except NotContractive as error:
@@ -264,7 +264,7 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
         advice = review.recommended_for(problem, controller)
         if advice is None:
             raise
-        raise NotContractive(f"{error}; {advice.text}") from None
+        raise NotContractive(f"{str(error).partition('; use ')[0]}; {advice.text}") from None
 
 
 @contextmanager

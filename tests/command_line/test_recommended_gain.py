@@ -67,7 +67,7 @@ def test_review_refusal_and_report_name_the_same_gain(folder, capsys):
     Path("car.py").write_text(STEERING.replace(old, old.replace("-0.8", "0.8")))
     assert main(["compare", "car.py"]) == 2
     refused = capsys.readouterr().err
-    assert f"controller '{REFERENCED}': Affine" in refused.replace("ModelReferenced(gain", "Affine(gain")
+    assert f"controller '{REFERENCED}': ModelReferenced(Affine(gain=0.8)) has" in refused
     assert refused.replace("\n", " ").count(sentence) == 1
     assert main(["run", "car.py", REFERENCED]) == 2
     assert sentence in capsys.readouterr().err.replace("\n", " ")

@@ -175,7 +175,7 @@ measured after the end
     measure_from must lie in [0, 0.2), got 5.0
 disturbance without a name
   measure_from=0.05 -> disturbances=fp.Sine(0.1, 1.0)
-    expected {name: a Disturbance}, got a value of the class Sine; give it a name: {'name': ...}
+    expected {name: a Disturbance}, got a value of the class Sine; write {'NAME': Sine(...)} with the name of what it belongs to
 disturbance as a number
   measure_from=0.05 -> disturbances={"torque": 0.5}
     expected a Disturbance, got 0.5; one of ColouredNoise, Formula, Noise

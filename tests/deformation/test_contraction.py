@@ -171,7 +171,7 @@ def test_known_limits_of_the_sigmoid() -> None:
     assert report.own_linear_limit == pytest.approx((-3.3607, 0.0), abs=1e-3)
     assert report.own_sector_limit == pytest.approx((-2.8210, 0.0), abs=1e-3)
     assert report.within_sector
-    assert "sector" in report.text
+    assert "below 2.82 to converge from errors of any size" in report.text
 
 
 def test_between_sector_and_linear_limit_is_a_warning() -> None:
@@ -200,8 +200,7 @@ def test_wrong_sign_in_words() -> None:
         check_gain(Sigmoid(gain=0.5), Spectrum(np.array([[1.5, 1.3]])))
     assert str(caught.value) == (
         "Sigmoid(gain=0.5) has the wrong sign, so every cycle enlarges the error; use a negative gain, "
-        "0 < |gain| < 3.36 (linear limit: small errors converge) and < 2.82 (sector limit: by itself it "
-        "converges from errors of any size)"
+        "0 < |gain| < 3.36, and below 2.82 to converge from errors of any size"
     )
 
 

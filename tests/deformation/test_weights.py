@@ -80,7 +80,7 @@ def test_a_gain_that_converges_with_its_weights_alone_is_not_refused():
     with pytest.raises(NotContractive, match="wrong sign"):
         fp.simulate(problem, replace(controller, deformation=fp.Affine(gain=0.5)), seed=0, compiled=False)
     large = fp.Affine(gain=-0.9, weights=(1.0, 19.0))
-    with pytest.raises(NotContractive, match=r"converges only for effective gains below 0\.28"):
+    with pytest.raises(NotContractive, match=r"use 0 < \|gain\| < 0\.559, where"):
         fp.simulate(problem, replace(controller, deformation=large), seed=0, compiled=False)
 
 

@@ -96,8 +96,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "a dead time without its input": (
         lambda: outside(dead_time=0.02),
-        "ExternalPlant.dead_time: expected {name: a finite number of at least 0}, got 0.02; give it a name: "
-        "{'name': ...}",
+        "ExternalPlant.dead_time: expected {name: a finite number of at least 0}, got 0.02; write "
+        "{'NAME': 0.02} with the name of what it belongs to",
     ),
     "a start that returns nothing": (
         lambda: run(outside(body=body(Silent))),

@@ -16,7 +16,7 @@ from fpirhc.contraction.delayed import two_cycle_amplitudes, two_cycle_limit
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import resolved
-from fpirhc.deformation.base import Deformation, innermost
+from fpirhc.deformation.base import Deformation, innermost, own_gain
 from fpirhc.errors import FpirhcError
 from fpirhc.review.grid import is_late, review_grid
 from fpirhc.review.loops import LoopsByGain, largest_product
@@ -169,8 +169,7 @@ def _with_margins(loops: LoopsByGain, gain: float) -> float:
 
 
 def _own_per_effective(deformation: Deformation) -> float:
-    own = getattr(deformation, deformation.gain_name, None)
-    return 1.0 if own is None else float(own) / deformation.effective_gain()
+    return own_gain(deformation)[1] / deformation.effective_gain()
 
 
 def gain_advice(case: Case, boxed: Spectrum, null: Answer | None) -> Recommended:

@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse_without, resolved, without_deformation
-from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.deformation.base import Deformation, own_gain, with_inner
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotContractive, nearest
 from fpirhc.fields.checked import FoundByName, checked_call
@@ -135,8 +135,7 @@ def _within_budget(
         size, ringing = sought(0.0), 0.0  # with small eigenvalues of coupled responses a filter makes the loop grow
     pole = filter_pole(size * largest, ringing)
     deformation = _with(ready.deformation, sign * size, pole)
-    own = getattr(deformation, deformation.gain_name, None)
-    name, value = ("effective gain", sign * size) if own is None else (deformation.gain_name, float(own))
+    name, value = own_gain(deformation)
     predicted = dict(zip(problem.plant.inputs, map(float, noisy.steps(sign * size, pole)), strict=True))
     floor = noisy.errors(sign * size, pole, problem)
     return Suggestion(deformation, sign * size, pole, name, value, predicted, floor)

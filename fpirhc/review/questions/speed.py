@@ -7,7 +7,7 @@ import numpy as np
 from fpirhc.contraction.delayed import bearable_lag, least_product
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import tracking_law
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, own_gain
 from fpirhc.plant.maps import response_age
 from fpirhc.review.grid import ReviewGrid
 from fpirhc.review.loops import is_planned
@@ -54,8 +54,8 @@ def faster(case: Case, factor: float, otherwise: str) -> str:
 def gain_times(deformation: Deformation, factor: float) -> str:
     """Return the map's own gain times a factor as text, 'gain = -1.2'."""
     larger = deformation.with_effective_gain(factor * deformation.effective_gain())
-    own = getattr(larger, larger.gain_name, None)
-    return f"effective gain = {larger.effective_gain():.3g}" if own is None else f"{larger.gain_name} = {own:.3g}"
+    name, value = own_gain(larger)
+    return f"{name} = {value:.3g}"
 
 
 def bears_lag(case: Case) -> Answer | None:
