@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import json
 import os
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -68,24 +69,47 @@ def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:
         show(view, report)
 
 
-def table_writer(form: str | None) -> Callable[[DataFrame, Path], None]:
-    """Return a function that writes a table to a path whose suffix becomes that of the form; it writes nothing without a form.
+def table_writer(form: str | None) -> Callable[[Iterable[DataFrame], Path], None]:
+    """Return a function that writes a table in parts to a path whose suffix becomes that of the form, or nothing without one.
 
-    Units, `attrs["units"]` by column, stand behind the names of a CSV file: 'rms_error.q1 [m]'. A Parquet file keeps attributes.
+    Units, `attrs["units"]` by column, stand behind the names of a CSV file: 'rms_error.q1 [m]'. A Parquet file has attributes, and
+    every part is a row group of its own.
     """
     from fpirhc.errors import NotInstalled
-    from fpirhc.whole_file import write_whole
+    from fpirhc.whole_file import whole_file
 
     if form == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise NotInstalled("--format parquet needs pyarrow, which is not installed: pip install 'fpirhc[parquet]'")
 
-    def write(table: DataFrame, path: Path) -> None:
+    def write(parts: Iterable[DataFrame], path: Path) -> None:
         if form is not None:
-            named = table.rename(columns={name: f"{name} [{unit}]" for name, unit in table.attrs["units"].items()})
-            content = named.to_csv(index=False) if form == "csv" else table.to_parquet(index=False)
-            write_whole(content, path.with_suffix(f".{form}"), "table")
+            with whole_file(path.with_suffix(f".{form}"), "table") as file:
+                {"csv": _write_csv, "parquet": _write_parquet}[form](parts, file)
 
     return write
+
+
+def _write_csv(parts: Iterable[DataFrame], file: IO[bytes]) -> None:
+    for k, part in enumerate(parts):
+        named = part.rename(columns={name: f"{name} [{unit}]" for name, unit in part.attrs["units"].items()})
+        file.write(named.to_csv(index=False, header=k == 0).encode())
+
+
+def _write_parquet(parts: Iterable[DataFrame], file: IO[bytes]) -> None:
+    import pyarrow as pa
+    from pyarrow.parquet import ParquetWriter
+
+    begun = None
+    for part in parts:
+        table = pa.Table.from_pandas(part, schema=begun and begun.schema, preserve_index=False)
+        if begun is None:
+            # a column of words that has none so far; pandas keeps attributes under this name
+            words = [pa.field(f.name, pa.string()) if pa.types.is_null(f.type) else f for f in table.schema]
+            attributes = {b"PANDAS_ATTRS": json.dumps(part.attrs).encode()}
+            begun = ParquetWriter(file, pa.schema(words, {**table.schema.metadata, **attributes}))
+        begun.write_table(table.cast(begun.schema))
+    if begun:
+        begun.close()
 
 
 _NO_NUMBERS = {

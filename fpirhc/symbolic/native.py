@@ -63,11 +63,16 @@ def find_compiler() -> str | None:
 
 
 def machine_facts() -> dict[str, str]:
-    """Return what decides the last bits of numbers on this machine, apart from packages: compiler, C library, wide registers."""
+    """Return what decides the last bits of numbers here, apart from packages: compiler, its flags, C library, wide registers.
+
+    Levels of optimisation are left out, because they change no bit.
+    """
     compiler = find_compiler()
+    flags = [flag for flag in shlex.split(os.environ.get("FPIRHC_CFLAGS", "")) if not flag.startswith("-O")]
     lines = _version(compiler).splitlines() if compiler else []
     return {
         "compiler": lines[0] if lines else "none",
+        "flags": " ".join(flags) or "none",
         "C library": " ".join(platform.libc_ver()).strip(),
         "wide registers": " ".join(flag for flag in ("avx2", "fma", "avx512f") if f" {flag} " in _processor())
         or "none",

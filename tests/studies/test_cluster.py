@@ -23,7 +23,6 @@ from fpirhc.studies.scenarios.cluster import Cluster, run_jobs
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
-from fpirhc.symbolic.native import machine_facts
 
 distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 NAMES = ["CTC", "CTC+FPI (eq 6)"]
@@ -99,7 +98,7 @@ def test_a_scheduler_that_dies_ends_the_study_and_the_next_one_goes_on(tmp_path:
 def test_a_worker_with_another_compiler_is_refused(
     tmp_path: Path, two_workers: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "machine_facts", lambda: {"compiler": "cc 1.0"})
+    monkeypatch.setattr("fpirhc.studies.scenarios.fingerprint.machine_facts", lambda: {"compiler": "cc 1.0"})
     with pytest.raises(
         FpirhcError, match=r"a worker would compute other numbers: compiler is .* there and 'cc 1.0' here"
     ):
@@ -110,8 +109,8 @@ def test_a_worker_without_the_file_has_its_content(tmp_path: Path) -> None:
     path = fp.load_problem("two_mass").path
     elsewhere, greeting = opening_of(tmp_path / "two_mass.py")
     here, _ = opening_of(path)
-    content, facts = path.read_bytes(), {**greeting, **machine_facts()}
-    records = [run_jobs(json.dumps(o), content, facts, [[([0], "CTC")]])[0] for o in (elsewhere, here)]
+    content = path.read_bytes()
+    records = [run_jobs(json.dumps(o), content, greeting, [[([0], "CTC")]])[0] for o in (elsewhere, here)]
     assert records[0] == records[1]
     assert records[0][0][0]["outcome"] == "finished"
 

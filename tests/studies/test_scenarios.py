@@ -236,6 +236,26 @@ def test_a_figure_of_which_more_is_better_keeps_its_sign_in_files(task, tmp_path
     assert told["difference"]["high"] > 0
 
 
+def test_a_table_in_parts_is_the_table(task, tmp_path):
+    """All parts have the same columns and kinds of numbers, so that a file is written part by part and need not fit into memory."""
+    study = fp.compare_scenarios(task, count=3, folder=tmp_path, **SETTINGS)
+    whole, parts = study.to_dataframe(), list(study.frames(rows=2))
+    assert [len(part) for part in parts] == [2] * (len(whole) // 2) + [1] * (len(whole) % 2)
+    assert all((part.dtypes == whole.dtypes).all() and part.attrs == whole.attrs for part in parts)
+    pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), whole)
+    assert whole["rms_error.y"].notna().all()
+
+
+def test_other_flags_of_the_compiler_are_other_numbers(task, tmp_path, monkeypatch):
+    """Levels of optimisation are not."""
+    fp.compare_scenarios(task, count=2, folder=tmp_path, **SETTINGS)
+    monkeypatch.setenv("FPIRHC_CFLAGS", "-O1")
+    fp.compare_scenarios(task, count=3, folder=tmp_path, **SETTINGS)
+    monkeypatch.setenv("FPIRHC_CFLAGS", "-O1 -mfma")
+    with pytest.raises(OutputError, match='flags was "none", is "-mfma"'):
+        fp.compare_scenarios(task, count=4, folder=tmp_path, **SETTINGS)
+
+
 def test_a_run_that_failed_has_nothing_of_what_is_to_be_large():
     """Of nothing it is infinitely many times more, and of something none."""
     figure = Objective(fp.Metric("inside", lambda problem, run: 1.0, better="larger"))

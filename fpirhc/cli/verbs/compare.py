@@ -193,7 +193,7 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")
     if options.format:
-        write_table(comparison.to_dataframe(), folder / "scenarios")
+        write_table(comparison.frames(), folder / "scenarios")
     publish(comparison.view, render_scenarios(comparison), folder, as_json=options.json)
     return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
 

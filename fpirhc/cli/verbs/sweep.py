@@ -34,7 +34,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     folder = results_folder(options.out, task.name, "_".join(["sweep", *(axis.path for axis in axes)]))
     with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
         result = sweep(task, axes, folder=folder, **study_settings(VERB, options, "metric"), progress=progress)
-    write_table(result.to_dataframe(), folder / "sweep")
+    write_table([result.to_dataframe()], folder / "sweep")
     save_figure(sweep_figure(result), folder / "sweep.png")
     publish(result.view, render_sweep(result), folder, as_json=options.json)
     return ExitCode.FINISHED

@@ -32,7 +32,6 @@ from typing import Any, Self
 from fpirhc.errors import FpirhcError, InvalidValue, WorkerDied, package
 from fpirhc.fields.user_code import users_level
 from fpirhc.studies.scenarios.worker import Job, Study, answered, study
-from fpirhc.symbolic.native import machine_facts
 
 _NONE = object()  # no job is left
 AHEAD = 2  # jobs that a worker has at once, so that it never waits for the next one
@@ -252,7 +251,7 @@ class Cluster:
     def __init__(self, address: str, opening: Mapping[str, Any], greeting: Mapping[str, Any], count: int) -> None:
         self._opening = json.dumps(opening)
         self._content = Path(opening["path"]).read_bytes()
-        self._greeting = {**greeting, **machine_facts()}
+        self._greeting = greeting
         self._dask = package("distributed", "cluster", "--cluster")
         self._stack = contextlib.ExitStack()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what is lost is said by errors here
@@ -346,7 +345,7 @@ def run_jobs(
             ready = _study(opening, content)
         except FpirhcError as error:
             return [[{"error": f"a worker cannot load the problem: {error}"}]], 0.0
-        other = _differences(greeting, {**ready.greeting, **machine_facts()})
+        other = _differences(greeting, ready.greeting)
         if other:
             return [[{"error": f"a worker would compute other numbers: {other}"}]], 0.0
         begin = time.perf_counter()

@@ -15,9 +15,10 @@ from fpirhc.describe import describe
 from fpirhc.problem_files.neighbours import neighbours
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.scenarios.bench import Conditions
+from fpirhc.symbolic.native import machine_facts
 from fpirhc.task.problem import Problem
 
-FORMAT = 7  # of records and of these facts
+FORMAT = 8  # of records and of these facts
 
 
 def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
@@ -39,6 +40,7 @@ def fingerprint(task: Task, conditions: Conditions) -> dict[str, Any]:
         **{name: version(name) for name in ("fpirhc", "casadi", "numpy")},
         "python": ".".join(platform.python_version_tuple()[:2]),  # which writes the code of functions its own way
         "machine": platform.machine(),
+        **machine_facts(),
     }
 
 

@@ -6,8 +6,10 @@ import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import zip_longest
+from itertools import chain, islice, zip_longest
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from fpirhc.errors import InvalidName, nearest
 from fpirhc.fields.checked import FoundByName
@@ -28,6 +30,7 @@ _MEANING = (
     "and where the reference is held that of the plant left alone, has diverged; a run that ended early counts as worse than every "
     "other run."
 )
+_FIELDS = ("scenario", "name", "group", "controller", "mismatch", "outcome", "error", "lasted", "stop")
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
 
@@ -86,17 +89,28 @@ class ScenarioComparison(Study, FoundByName):
         """
         import pandas as pd
 
-        rows = [
-            {
-                **{name: one for name, one in record.items() if name not in ("metrics", "pictures")},
-                **_flat(record["metrics"]),
-            }
-            for some in self.records.values()
-            for record in some
-        ]
-        frame = pd.DataFrame(rows)
-        frame.attrs["units"] = {name: unit for name, unit in self.units.items() if unit not in ("", "1")}
-        return frame
+        frames = list(self.frames())
+        whole = pd.concat(frames, ignore_index=True)
+        whole.attrs = frames[0].attrs
+        return whole
+
+    def frames(self, rows: int = 10_000) -> Iterator[pd.DataFrame]:
+        """Return `to_dataframe` in parts of so many rows, for a study that is larger than the memory; one part may be empty."""
+        import pandas as pd
+
+        names = dict.fromkeys(name for record in self._every() for name in _flat(record["metrics"]))
+        left, first = self._every(), True
+        while (part := list(islice(left, rows))) or first:
+            fields = {name: [one[name] for one in part] for name in _FIELDS}
+            numbers = [_flat(one["metrics"]) for one in part]
+            metrics = {name: np.array([some.get(name) for some in numbers], dtype=float) for name in names}
+            frame = pd.DataFrame({**fields, **metrics}).astype({"error": float})
+            frame.attrs["units"] = {name: unit for name, unit in self.units.items() if unit not in ("", "1")}
+            yield frame
+            first = False
+
+    def _every(self) -> Iterator[Record]:
+        return chain.from_iterable(self.records.values())
 
     @property
     def view(self) -> View:
