@@ -30,7 +30,7 @@ from fpirhc.optimisers.base import Optimiser, judge
 from fpirhc.optimisers.nlp import (
     MultipleShooting,
     interleave,
-    program,
+    scaled_solver,
     separate,
     shift_dynamics,
     shift_variables,
@@ -117,7 +117,7 @@ def follow(optimiser: Optimiser, ocp: OptimalControl, function: ca.Function) -> 
 
 def rival(optimiser: MultipleShooting, ocp: OptimalControl, options: dict[str, object]) -> Callable:
     """The same around CasADi's solver alone, warm-started with its shifted variables and multipliers."""
-    made = ca.nlpsol("fpirhc_rival", optimiser.plugin, program(ocp), {**optimiser.options(ocp), **options})
+    made = scaled_solver("fpirhc_rival", optimiser.plugin, ocp, {**optimiser.options(ocp), **options})
     solver = Evaluator(made)
     place = {made.name_in(k): k for k in range(made.n_in())}
     result = {made.name_out(k): k for k in range(made.n_out())}

@@ -199,11 +199,16 @@ def _state_violation(ocp: OptimalControl, states: ca.MX, factors: np.ndarray | N
 
 
 def counted(ocp: OptimalControl, violation: ca.MX, states: ca.MX) -> ca.MX:
-    """Return the violation that the status counts, which is larger for limits so close together that `FEASIBLE` means nothing."""
-    enlarged = FEASIBLE / np.minimum(FEASIBLE, _SHARE * ocp.half_ranges)
-    if not (enlarged > 1).any():
-        return violation
-    return _state_violation(ocp, states, enlarged)
+    """Return the violation that the status counts, as a multiple of what is kept of limits of size one."""
+    times = FEASIBLE / kept(ocp)
+    return violation if (times == 1).all() else _state_violation(ocp, states, times)
+
+
+def kept(ocp: OptimalControl) -> np.ndarray:
+    """Return the violation of every state's limits that counts as kept (ns,), by half its range; `FEASIBLE` where that is 1."""
+    half = ocp.half_ranges
+    about = np.minimum(FEASIBLE * np.maximum(half, 1), _SHARE * half)
+    return np.where(np.isfinite(half), about, FEASIBLE)
 
 
 def paid(ocp: OptimalControl) -> ca.Function:
@@ -239,11 +244,11 @@ def judge(ocp: OptimalControl) -> ca.Function:
 
 def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -> ca.MX:
     """The part that can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
-    rows = []
-    for k in range(ocp.state.size):
+    rows, none = [], ca.MX.zeros(1, ocp.stages)
+    for k, near in enumerate(kept(ocp).tolist()):
         row, values = states[k, 1:], multipliers[k, :]
-        at_upper = row >= ocp.state_upper[k] - FEASIBLE if ocp.state_upper[k] < FINITE else ca.MX.zeros(1, ocp.stages)
-        at_lower = row <= ocp.state_lower[k] + FEASIBLE if ocp.state_lower[k] > -FINITE else ca.MX.zeros(1, ocp.stages)
+        at_upper = row >= ocp.state_upper[k] - near if ocp.state_upper[k] < FINITE else none
+        at_lower = row <= ocp.state_lower[k] + near if ocp.state_lower[k] > -FINITE else none
         valid = ca.if_else(at_upper, ca.fmax(values, 0), 0) + ca.if_else(at_lower, ca.fmin(values, 0), 0)
         # fmax and fmin would hide NaN.
         rows.append(valid + ca.if_else(ca.fabs(values) <= FINITE, 0, values))

@@ -2,6 +2,7 @@
 
     variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F(s_i, u_i) = 0,
 
+Solvers judge what is small by absolute numbers, so they see every variable, constraint and the cost in a unit of its own size.
 Theory: docs/theory-plants.md.
 """
 
@@ -10,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -30,6 +31,7 @@ from fpirhc.optimisers.base import (
     shift,
     status_of,
 )
+from fpirhc.optimisers.bounds import scales
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal
@@ -121,15 +123,15 @@ class MultipleShooting(Optimiser):
         s0, data, lower, upper, memory = arguments = call_arguments(ocp, self.memory(ocp).size)
         remembered = layout.split(memory)
         start, states = self._guess(ocp)(*arguments)
-        solution = ca.nlpsol("fpirhc_shooting_solver", self.plugin, program(ocp), self.options(ocp))(
+        solution = scaled_solver("fpirhc_shooting_solver", self.plugin, ocp, self.options(ocp))(
             x0=interleave(states, start),
             p=ca.vec(data),
             lbx=interleave(_stage_bounds(ocp, s0, ocp.state_lower), ca.repmat(lower, 1, n)),
             ubx=interleave(_stage_bounds(ocp, s0, ocp.state_upper), ca.repmat(upper, 1, n)),
             lbg=0,
             ubg=0,
-            lam_x0=_usable(remembered["plan_variable_multipliers"]),
-            lam_g0=_usable(remembered["plan_dynamics_multipliers"]),
+            lam_x0=remembered["plan_variable_multipliers"],
+            lam_g0=remembered["plan_dynamics_multipliers"],
         )
         inputs = clip(separate(ocp, solution["x"])[1], lower, upper)
         multipliers = separate(ocp, solution["lam_x"])[0][:, 1:] * int(ocp.bounds_states)
@@ -197,21 +199,57 @@ def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
     return ca.vec(shift(stages, ocp))
 
 
-def program(ocp: OptimalControl) -> dict[str, ca.MX]:
-    """Return the program as CasADi's `nlpsol` takes it, with the data of all stages as its parameter."""
+class Units(NamedTuple):
+    """What a program is divided by."""
+
+    variables: ca.DM | float = 1.0
+    constraints: ca.DM | float = 1.0
+    cost: float = 1.0
+
+
+def units(ocp: OptimalControl) -> Units:
+    """Return the units of `bounds.scales`, so that a program sees numbers of size one.
+
+    A state without limits has at most the one that a unit of the inputs in all stages moves it by.
+    """
+    measures, n = scales(ocp), ocp.stages
+    slopes = np.abs(ocp.along.sensitivity()).reshape(n, ocp.state.size, n, ocp.input.size)
+    moved = n * (slopes.max(axis=(0, 2)) @ measures.inputs)
+    small = ~np.isfinite(ocp.half_ranges) & (moved > 0) & (moved < measures.states)
+    states, inputs = ca.DM(np.where(small, moved, measures.states)), ca.DM(measures.inputs)
+    every = ca.vertcat(ca.repmat(ca.vertcat(states, inputs), n), states)
+    return Units(every, ca.repmat(states, n), measures.cost)
+
+
+def scaled_solver(name: str, plugin: str, ocp: OptimalControl, options: Options) -> ca.Function:
+    """Return CasADi's `nlpsol` of the program, which sees it in units of `units`; what it takes and returns has those of `ocp`."""
+    w, g, cost = by = units(ocp)
+    made = ca.nlpsol(f"{name}_scaled", plugin, program(ocp, by), options)
+    given = {key: ca.MX.sym(key, made.sparsity_in(key)) for key in made.name_in()}
+    scaled = {**given, **{key: given[key] / w for key in ("x0", "lbx", "ubx")}}
+    scaled |= {key: given[key] / g for key in ("lbg", "ubg")}
+    scaled |= {key: _usable(given[key] * unit / cost) for key, unit in (("lam_x0", w), ("lam_g0", g))}
+    found = made(**scaled)
+    own = {"x": w, "g": g, "f": cost, "lam_x": cost / w, "lam_g": cost / g}
+    results = [found[key] * own.get(key, 1.0) for key in made.name_out()]
+    return ca.Function(name, list(given.values()), results, made.name_in(), made.name_out())
+
+
+def program(ocp: OptimalControl, by: Units = Units()) -> dict[str, ca.MX]:  # noqa: B008
+    """Return the program as CasADi's `nlpsol` takes it, divided by its units, with the data of all stages as its parameter."""
     n = ocp.stages
     w, flat = ca.MX.sym("w", sizes(ocp)[0]), ca.MX.sym("p", ocp.data.size * (n + 1))
-    states, inputs = separate(ocp, w)
+    states, inputs = separate(ocp, w * by.variables)
     data = ca.reshape(flat, ocp.data.size, n + 1)
     costs, _ = ocp.stage_cost.map(n)(states[:, :n], inputs, data[:, :n])
     value = ca.sum2(costs) + ocp.terminal_cost(states[:, n], data[:, n])
     next_states = ocp.dynamics.map(n)(states[:, :n], inputs, data[:, :n])
-    return {"x": w, "p": flat, "f": value, "g": ca.vec(states[:, 1:] - next_states)}
+    return {"x": w, "p": flat, "f": value / by.cost, "g": ca.vec(states[:, 1:] - next_states) / by.constraints}
 
 
 def _gauss_newton_hessian(ocp: OptimalControl) -> ca.Function:
     """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block, with both triangles."""
-    nlp = program(ocp)
+    nlp = program(ocp, units(ocp))
     hessian, _ = ca.hessian(nlp["f"], nlp["x"])
     weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", sizes(ocp)[1])
     inputs = [nlp["x"], nlp["p"], weight, multipliers]
@@ -243,12 +281,9 @@ class Ipopt(MultipleShooting):
 
     plugin = "ipopt"
 
-    def options(self, ocp: OptimalControl) -> Options:
-        narrowest = float(np.min(ocp.half_ranges[ocp.half_ranges > 0], initial=1.0))
+    def options(self, ocp: OptimalControl) -> Options:  # noqa: ARG002
         return {
             **_QUIET,
-            # by itself it relaxes limits by 1e-8, however small they are
-            "ipopt.bound_relax_factor": 1e-8 * min(1.0, narrowest),
             "ipopt.sb": "yes",
             "ipopt.print_level": 0,
             "ipopt.tol": self.accuracy,
