@@ -325,7 +325,7 @@ def mismatch_figure(comparison: ScenarioComparison) -> Drawing:
         )
         axis.semilogy(*_medians(x[~ended], y[~ended]), "-", color=colour, lw=1.5, label=literal(one.name))
     caption_axes(axis, "mismatch between model and plant [%]", _ERROR)
-    axis.legend(fontsize=8, framealpha=0.8)
+    draw_legend(axis)
     return figure
 
 
@@ -379,7 +379,7 @@ def _sweep_lines(result: Sweep) -> Drawing:
     for one, colour in zip(result.maps, PALETTE * len(result.maps), strict=False):
         shown = np.where(one.outcomes == "finished", one.values, np.nan)
         axis.plot(
-            over.values, [result.aim.told(v) for v in shown], ".-", color=colour, lw=1.5, label=literal(one.controller)
+            over.values, [result.aim.drawn(v) for v in shown], ".-", color=colour, lw=1.5, label=literal(one.controller)
         )
         failed = [v for v, outcome in zip(over.values, one.outcomes, strict=True) if outcome != "finished"]
         axis.plot(
@@ -402,7 +402,9 @@ def _sweep_maps(result: Sweep) -> Drawing:
     rows = -(-count // columns)
     figure = new_figure(4.6 * columns, 3.9 * rows, f"{result.problem}: {_figure_label(result)}")
     panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    figures = [np.vectorize(result.aim.told)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in result.maps]
+    figures = [
+        np.vectorize(result.aim.drawn)(np.where(m.outcomes == "finished", m.values, np.inf)) for m in result.maps
+    ]
     numbers = np.concatenate([values[np.isfinite(values)] for values in figures])
     low, high = (float(numbers.min()), float(numbers.max())) if numbers.size else (0.1, 1.0)
     high = high if high > low else low + 1
@@ -488,7 +490,7 @@ def _path_label(result: Sweep, path: str) -> str:
 
 
 def _figure_label(result: Sweep) -> str:
-    return f"{result.aim.name} [{result.aim.unit}]" if result.aim.unit not in ("", "1") else result.aim.name
+    return f"{result.aim.name} [{result.aim.drawn_unit}]" if result.aim.drawn_unit else result.aim.name
 
 
 def _medians(x: np.ndarray, y: np.ndarray) -> tuple[list[float], list[float]]:

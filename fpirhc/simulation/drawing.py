@@ -97,7 +97,7 @@ def quantity_label(run: _Recorded, signal: str, names: Sequence[str], what: str 
     units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
     shown = ", ".join(names)
     if len(what + shown) > _LABEL:
-        shown = "several" if len(names) > 1 else textwrap.shorten(names[0], _LABEL, placeholder="...")
+        shown = "several" if len(names) > 1 else _cut(names[0], _LABEL)
     return literal(what + shown + (f" [{units[0]}]" if len(units) == 1 else ""))
 
 
@@ -153,8 +153,12 @@ def draw_legend(axis: Axes) -> None:
     """Add a legend where something has a label."""
     handles, labels = axis.get_legend_handles_labels()
     if handles:
-        fitting = [one if len(one) <= _NAME else f"{one[: _NAME // 2]}...{one[-_NAME // 2 :]}" for one in labels]
-        axis.legend(handles, fitting, fontsize=7, loc="best", framealpha=0.8)
+        axis.legend(handles, [_cut(one, _NAME) for one in labels], fontsize=7, loc="best", framealpha=0.8)
+
+
+def _cut(name: str, length: int) -> str:
+    """A name without its middle where it is too long."""
+    return name if len(name) <= length else f"{name[: length // 2]}...{name[-length // 2 :]}"
 
 
 def draw_title(axis: Axes, name: str) -> None:

@@ -71,6 +71,20 @@ class Objective:
             return in_percent(value)
         return self.metric.text(self._sign * value) + self._unit
 
+    @property
+    def is_share(self) -> bool:
+        """Whether its texts are in percent."""
+        return self.metric is None or self.metric.text is in_percent
+
+    @property
+    def drawn_unit(self) -> str:
+        """Unit of what is drawn; '' where there is none."""
+        return "%" if self.is_share else self._unit.strip()
+
+    def drawn(self, value: float) -> float:
+        """Return a value as pictures have it: as `told`, and in percent where its text is."""
+        return (100 if self.is_share else 1) * self.told(value)
+
     def told(self, value: float) -> float:
         """Return a value with the sign that the metric has; what is infinite is not a number."""
         return self._sign * value if math.isfinite(value) else math.nan

@@ -22,6 +22,7 @@ from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
+from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
 from fpirhc.studies.comparison.compare import check_gains, select
@@ -470,8 +471,8 @@ class _Runner:
 def _view(result: Sweep) -> View:
     cells = math.prod(len(axis.values) for axis in result.axes)
     over = " and ".join(
-        f"{axis.path} from {number(axis.values[0])} to {number(axis.values[-1])} in {len(axis.values)} values"
-        + (" by equal factors" if axis.logarithmic else "")
+        f"{axis.path} from {number(axis.values[0])} to {number(axis.values[-1])}{with_space(result.units.get(axis.path, '1'))} "
+        f"in {len(axis.values)} values" + (" by equal factors" if axis.logarithmic else "")
         for axis in result.axes
     )
     conditions = (
@@ -515,7 +516,7 @@ def _extremes(result: Sweep, one: SweepMap) -> list[str]:
         return ["none", "", ""]
     best = np.unravel_index(int(np.argmin(one.values)), one.values.shape)
     at = ", ".join(
-        f"{axis.path} = {behind_equals(axis.values[k])}"
+        f"{axis.path} = {behind_equals(axis.values[k])}{with_space(result.units.get(axis.path, '1'))}"
         for axis, k in zip(result.axes, best, strict=True)
         if axis.path not in one.without
     )

@@ -71,7 +71,7 @@ def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
     assert "has the wrong sign" in capsys.readouterr().err
     Path("light.py").write_text(text.replace("exact=1.6", "exact=0.2"))
     assert main(["compare", "light.py"]) == 2
-    assert "the iteration converges only for effective gains below" in capsys.readouterr().err.replace("\n", " ")
+    assert "is too large, and runs in BeyondLimit(map) alone" in capsys.readouterr().err.replace("\n", " ")
     assert main(["review", "light.py", "--controllers", "RHC+FPI"]) == 1
 
 

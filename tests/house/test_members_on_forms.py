@@ -114,7 +114,7 @@ for family, found in (
 # Pairs that are not served, with the sentence that their user reads
 
 WRONG_SIGN = "has the wrong sign, so every cycle enlarges the error"
-WRONG_PAIR = "so the iteration converges only for effective gains below 0"
+WRONG_PAIR = "so the iteration does not converge with this gain"
 BY_TIME = "a derivative with respect to time, and {}; use ComputedTorque with a deformation"
 AT_ONCE_SAID, STEPS_SAID = BY_TIME.format("y is of order 0"), BY_TIME.format("a map has differences of its steps")
 NO_FILTER = "no stationary gain makes the filter stable; give noise={'a': ...}, or measure more states"

@@ -107,7 +107,7 @@ def test_a_gain_beyond_its_limit_is_refused_with_the_reason(tmp_path: Path) -> N
     """The model-referenced form bears a lambda < 2, and lambda is 1 where b is."""
     found = swept(tmp_path, "deformation.map.gain=-9:-1:3").of("FPI")
     assert list(found.outcomes) == ["refused", "refused", "finished"]
-    assert "converges only for effective gains below" in found.reasons["refused"]
+    assert "(gain=-9)) is too large" in found.reasons["refused"]
 
 
 def test_finished_cells_are_not_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,6 +262,8 @@ def test_a_cell_of_the_picture_is_where_the_page_looks_for_it(tmp_path: Path) ->
     """Cells that failed are grey there, and no other ones."""
     found = swept(tmp_path, "exact.b=10:90:5", "deformation.map.gain=-1.2:-0.4:3")
     figure = sweep_figure(found)
+    assert figure.axes[-1].get_ylabel() == "relative error [%]"  # as in the table
+    assert " m/(s V)" in found.view.tables[0].rows[0].cells[3]
     pixels = plt.imread(io.BytesIO(figure._repr_png_()))
     for panel, one in zip(sweep_panels(figure, found), found.maps, strict=False):
         for place in np.ndindex(one.values.shape):
