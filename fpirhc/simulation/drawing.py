@@ -24,7 +24,8 @@ _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00",
 _POINTS = 2000  # drawn per line
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.95, 0.15, 0.6, 0.35  # margins of a row of axes, inches
 _BESIDE, _BELOW = 0.75, 0.33  # labels of a row's axes, inches from the axes
-_TITLE, _LABEL, _NAME = 60, 32, 48  # characters of a line of a title, a label of an axis, a name in a legend
+_SHORTEST = 12  # characters of a name that was cut
+_TITLE, _LABEL, _NAME = 60, 28, 48  # characters of a line of a title, a label of an axis, a name in a legend
 _TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
 
 
@@ -95,10 +96,10 @@ def quantity_label(run: _Recorded, signal: str, names: Sequence[str], what: str 
     `what` they are of the names, such as 'error of '. Where the names are too long for a label, it says that there are several.
     """
     units = list(dict.fromkeys(run.unit(f"{signal}.{name}") for name in names))
-    shown = ", ".join(names)
+    shown, unit = ", ".join(names), f" [{units[0]}]" if len(units) == 1 else ""
     if len(what + shown) > _LABEL:
-        shown = "several" if len(names) > 1 else _cut(names[0], _LABEL)
-    return literal(what + shown + (f" [{units[0]}]" if len(units) == 1 else ""))
+        shown = "several" if len(names) > 1 else _cut(names[0], max(_LABEL - len(what + unit), _SHORTEST))
+    return literal(what + shown + unit)
 
 
 def by_unit(run: _Recorded, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
@@ -158,7 +159,8 @@ def draw_legend(axis: Axes) -> None:
 
 def _cut(name: str, length: int) -> str:
     """A name without its middle where it is too long."""
-    return name if len(name) <= length else f"{name[: length // 2]}...{name[-length // 2 :]}"
+    side = (length - len("...")) // 2
+    return name if len(name) <= length else f"{name[:side]}...{name[-side:]}"
 
 
 def draw_title(axis: Axes, name: str) -> None:
