@@ -226,7 +226,7 @@ def test_the_latency_that_a_loop_bears_and_the_gain_that_bears_three_cycles(gain
     assert answer is not None
     borne, share = int(answer.numbers["borne"]), answer.numbers["share"]
     assert answer.verdict == "caution"
-    assert f"{share:.2g} times the gain bears them" in answer.change
+    assert f"{share:.2g} times the gain, gain = {share * gain:.3g}, bears them" in answer.change
 
     def most(controller: Controller) -> int:
         late = (

@@ -20,6 +20,7 @@ from fpirhc.review.prediction import CYCLES
 from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict, judged
 from fpirhc.review.questions.margins import margins
 from fpirhc.review.questions.reality import real_loops
+from fpirhc.review.questions.speed import gain_times
 from fpirhc.simulation.linearise.linear_loop import LinearLoop
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.simulate import simulate
@@ -135,7 +136,8 @@ def _latency_of(case: Case, loops: Sequence[LinearLoop], whose: str) -> Answer:
     if share is None:
         lower = "Lower the gain" if _may_help(case, whose) else "No lower gain bears them"
         return Answer(UNSTATED, Verdict.CAUTION, text, f"{lower}; {measure}.", numbers)
-    change = f"{share:.2g} times the gain bears them, in this loop of the model; or {measure}."
+    lower = f"{share:.2g} times the gain, {gain_times(case.controller.deformation, share)},"
+    change = f"{lower} bears them, in this loop of the model; or {measure}."
     return Answer(UNSTATED, Verdict.CAUTION, text, change, {**numbers, "share": share})
 
 
