@@ -75,6 +75,7 @@ class Judgement:
     broken: str = ""  # reason why the problem itself could not be loaded; else empty
     reason: str = ""  # reason of the baseline
     date: str = ""  # date of the baseline
+    faults: tuple[str, ...] = ()  # why metrics have no number: their functions raised
     notes: tuple[str, ...] = ()  # further sentences
     causes: tuple[Cause, ...] = ()  # settings that are not those of the baseline
     headline: str = ""  # name of the number by which the problem compares its controllers; '': the rms errors
@@ -107,14 +108,14 @@ def judge(
         rows += _rows(name, baseline.controllers.get(name), fresh.get(name), metrics)
     # A function of another name makes the baseline stale where numbers changed: else it has been renamed.
     causes = _stale(baseline, settings, list(fresh), names=not all(row.holds for row in rows))
-    notes = [f"{name}: {why}" for name, one in fresh.items() for why in (one.why, *one.broken.values()) if why]
     return Judgement(
         baseline.problem,
         tuple(rows),
         tuple(f"stale: {cause.text}" for cause in causes),
         reason=baseline.reason,
         date=baseline.date,
-        notes=tuple(notes),
+        faults=tuple(f"{name}: {why}" for name, one in fresh.items() for why in one.broken.values()),
+        notes=tuple(f"{name}: {one.why}" for name, one in fresh.items() if one.why),
         causes=causes,
     )
 

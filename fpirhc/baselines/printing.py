@@ -216,7 +216,9 @@ def headline(judgement: Judgement) -> str:
 
 def remarks(judgement: Judgement) -> list[str]:
     """Return everything about a problem that is no row: why it cannot be judged, why runs ended, and what to do."""
-    texts = [clean(text) for text in (judgement.broken, *_unusable(judgement), *judgement.notes) if text]
+    texts = [
+        clean(text) for text in (judgement.broken, *_unusable(judgement), *judgement.faults, *judgement.notes) if text
+    ]
     if judgement.changed or any(text.startswith("stale") for text in judgement.unusable):
         texts.append(
             f"baseline of {clean(judgement.date)}: {clean(judgement.reason)}. If the new numbers are right: "

@@ -8,6 +8,7 @@ With the option the same tests measure anew. One process writes the files when a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,7 +43,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | None]:
     """Function (problem, controller) that compares a controller with its baseline, or all controllers when none is named.
 
-    `problem` is a shipped name, or a path relative to pytest's root folder. The test fails with the metrics that changed.
+    `problem` is a shipped name, or a path relative to pytest's root folder. The test fails with the metrics that changed, and
+    warns of metrics that are broken.
     """
     config = request.config
 
@@ -65,6 +67,8 @@ def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., Judgement | No
             causes = [f"stale: {clean(cause.text)}" for cause in judgement.causes]
             lines = [headline(judgement), *causes, *map(sentence, changed), *remarks(judgement)]
             pytest.fail("\n".join(lines), pytrace=False)
+        for text in judgement.faults:
+            warnings.warn(f"{clean(judgement.problem)}: {clean(text)}", stacklevel=2)
         return judgement
 
     return check

@@ -37,6 +37,7 @@ from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Reference
 
+_WHOLE = 1e-6  # cycles by which a duration may miss a whole number of them
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
 # Cached properties that depend on the exact parameters.
@@ -53,7 +54,7 @@ class Problem(Checked):
         reference: the nominal motion of every coordinate.
         start: first value of every coordinate by name; derivatives (q1', ...) that are not named start at zero.
         period: control cycle, in the plant's unit of time, as are all times.
-        duration: length of a run.
+        duration: length of a run, which has the nearest whole number of cycles.
         limits: of inputs, states, rates and paths.
         disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
             and an output is the coordinate's, and adds to its response. Where an input and a coordinate share a name, they are
@@ -164,6 +165,14 @@ class Problem(Checked):
     def cycles(self) -> int:
         """Number of control cycles in a run."""
         return round(self.duration / self.period)
+
+    @property
+    def rounded_duration(self) -> str:
+        """What a run lasts where its duration is no whole number of cycles, as a clause; else ''."""
+        lasts, unit = self.cycles * self.period, self.time_unit
+        if abs(lasts - self.duration) <= _WHOLE * self.period:
+            return ""
+        return f"a run lasts {lasts:.6g} {unit}, because a duration of {self.duration:g} {unit} is no whole number of cycles"
 
     @property
     def rate_unit(self) -> str:
@@ -559,7 +568,10 @@ def _table(problem: Problem) -> str:
 def _time_rows(problem: Problem) -> list[tuple[str, str]]:
     unit, horizon = problem.time_unit, problem.horizon
     rows = [
-        ("run", f"{problem.cycles} cycles of {problem.period:g} {unit}, {problem.duration:g} {unit} in all"),
+        (
+            "run",
+            f"{problem.cycles} cycles of {problem.period:g} {unit}, {problem.cycles * problem.period:g} {unit} in all",
+        ),
         ("measured from", f"{problem.measure_from:g} {unit}"),
         ("start", _values(dict(zip(problem.plant.state.elements, problem.start_state, strict=True)))),
         ("judged", ", ".join(problem.judged_names)),

@@ -484,6 +484,11 @@ def test_pytest_plugin(pytester, blessed):
     assert second.controllers["CTC"] != first.controllers["CTC"]
     assert second.controllers["RHC+FPI"] == first.controllers["RHC+FPI"]
     run().assert_outcomes(passed=3)
+    path.write_text(f"{path.read_text()}\nmetrics = [fp.Metric('mine', lambda problem, run: 1 / 0)]\n")
+    run("--fpirhc-accept", "a metric of its own").assert_outcomes(passed=3)
+    broken = run("-k", "RHC", "-W", "default")
+    broken.assert_outcomes(passed=1, warnings=1, deselected=2)
+    broken.stdout.fnmatch_lines(["*line: RHC+FPI: metric 'mine'*ZeroDivisionError*"])
     # A function of another name has the same numbers; a renamed controller takes the place of the old one, with the old seed.
     path.write_text(
         LINE.replace(

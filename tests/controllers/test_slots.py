@@ -778,6 +778,11 @@ refusals = cache(lambda: {  # the problem or its name, the controller, and what 
         "order=3 is not the relative order from 'F' to 'angle', which is 2; write order=2 or leave it out",
     ))),
     "none": ("crane_slots", crane_slots(slots=()), ("there are no slots",)),
+    "nothing to look ahead to": (
+        replace(SHIPPED.crane_slots.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t})),
+        crane_slots(schedule=fp.ByLookAhead({"cart": 1.0}, dwell=0.1)),
+        ("Slotted: ByLookAhead: the reference still moves at its end, t = 26.5 s; use ByError",),
+    ),
     "not judged": (replace(SHIPPED.crane_slots.problem, judged=("cart",)), crane_slots(), (
         "slot 'angle' is not among the coordinates that are judged; write Problem(..., judged=('cart', 'angle'))",
     )),

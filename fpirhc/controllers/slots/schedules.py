@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeGuard
+from typing import ClassVar, TypeGuard
 
 import casadi as ca
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.controllers.base import error_signal, like
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.controllers.slots.slot import Channel
-from fpirhc.errors import Mistakes, NotSupported
+from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
 from fpirhc.horizon.nominal import reference_state
@@ -32,6 +32,8 @@ SlotSpans = tuple[tuple[str, float], ...]
 
 class Schedule(Checked, ABC):
     """Contract: which slot is active, cycle by cycle."""
+
+    foresees: ClassVar[bool] = False  # whether it needs the closed loops, linear around the reference's last point
 
     @abstractmethod
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
@@ -379,6 +381,8 @@ class ByLookAhead(Schedule):
         hysteresis: by how much the active slot's V must exceed the best one's, relative.
     """
 
+    foresees: ClassVar[bool] = True
+
     weights: Mapping[str, float]
     dwell: float
     hysteresis: float = 0.1
@@ -396,14 +400,8 @@ class ByLookAhead(Schedule):
         return dict.fromkeys(names, self.dwell)
 
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Return Block (state, reference, ...) -> slot.
-
-        Raises:
-            NotSupported: the closed loops cannot be linearised at the reference's last point.
-        """
-        modes, reason = linear_modes(problem, channels, problem.plant.approximate, 0.0)
-        if reason:
-            raise NotSupported(f"ByLookAhead: {reason}; use ByError")
+        """Return Block (state, reference, ...) -> slot."""
+        modes, _ = linear_modes(problem, channels, problem.plant.approximate, 0.0)
         n = problem.plant.state.size
         column = lambda values: np.ravel(settled(self, values)._forms(problem, modes))  # noqa: E731
         row = following("look_ahead", live_numbers(self), column)

@@ -186,10 +186,14 @@ class Slotted(Controller):
         mistakes.raise_if_any()
 
     def _check_growth(self, problem: Problem, channels: Sequence[Channel]) -> None:
-        """Raise where zero dynamics grow too much by the model at the reference's last point; it needs a set-point there."""
-        modes, _ = linear_modes(problem, channels, problem.plant.approximate, 0.0)
+        """Raise where zero dynamics grow too much by the model at the reference's last point; without a set-point there
+        nothing is known, and a schedule that needs it is refused.
+        """
+        modes, reason = linear_modes(problem, channels, problem.plant.approximate, 0.0)
         dwells = self.schedule.dwells([c.slot.coordinate for c in channels], problem)
         mistakes, unit = Mistakes("Slotted"), problem.time_unit
+        if reason and self.schedule.foresees:
+            mistakes.add(f"{type(self.schedule).__name__}: {reason}; use ByError")
         for one, mode in zip(channels, modes, strict=False):
             name, exponent = one.slot.coordinate, mode.rate * dwells[one.slot.coordinate]
             if exponent > math.log(self.largest_growth):

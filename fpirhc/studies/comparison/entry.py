@@ -54,7 +54,9 @@ def lines_of(problem: Problem, known: Mapping[str, Information]) -> tuple[str, .
     if not known:
         return ()
     uses = {name: ", ".join(one.uses) or "nothing measured" for name, one in known.items()}
-    return _given(problem), *_grouped("use", uses), *_grouped("act", {name: one.rate for name, one in known.items()})
+    acts = _grouped("act", {name: one.rate for name, one in known.items()})
+    rounded = [problem.rounded_duration] if problem.rounded_duration else []
+    return _given(problem), *_grouped("use", uses), *acts, *rounded
 
 
 def _given(problem: Problem) -> str:
