@@ -218,6 +218,7 @@ _REASONS = {
     "17.8": "an argument is advanced where it stands",
     "18.4": "places in the array of numbers are reached by addition",
     "19.2": "the first byte of a number is read on an AVR",
+    "20.1": "what the search includes stands before it, behind generated code",
     "20.7": "a macro of a type",
 }
 

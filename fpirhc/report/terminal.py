@@ -193,20 +193,25 @@ def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
 
 
 class _Status:
-    """Lines of progress for programs: what was done when this process began counts for no rate."""
+    """Lines of progress for programs, the last one with all that was to do.
+
+    A rate counts from the first answer of this process: before it loops are built, and what was done earlier stands in the file.
+    """
 
     def __init__(self) -> None:
-        self._begun: dict[str, tuple[float, int]] = {}
+        self._kept: dict[str, int] = {}  # done when this process began
+        self._begun: dict[str, tuple[float, int]] = {}  # time and number of the first answer
         self._told = time.monotonic()
 
     def report(self, name: str, done: int, total: int) -> None:
-        now = time.monotonic()
-        since, before = self._begun.setdefault(name, (now, done))
-        if now - self._told < _EVERY:
+        now, rate = time.monotonic(), None
+        if done > self._kept.setdefault(name, done):
+            since, before = self._begun.setdefault(name, (now, done))
+            rate = (done - before) / (now - since) if now > since else None
+        if done < total and now - self._told < _EVERY:
             return
         self._told = now
-        rate = (done - before) / (now - since) if now > since else 0.0
-        left = (total - done) / rate if rate else None
+        left = 0.0 if done == total else (total - done) / rate if rate else None
         line = {"controller": name, "done": done, "of": total, "per second": rate, "seconds left": left}
         print(json.dumps(line), file=sys.stderr, flush=True)
 

@@ -41,6 +41,11 @@ class Objective:
         return 2 * self._penalty
 
     @property
+    def ranks(self) -> bool:
+        """Whether one number is better than another."""
+        return self.metric is None or self.metric.better != "neither"
+
+    @property
     def _penalty(self) -> float:
         return PENALTY if self.metric is None else _NO_METRIC
 
@@ -151,14 +156,20 @@ class Objective:
 
 def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> Objective:
     """Return the objective by the name of a number: None for the relative error, else 'at_limit' or 'overshoot.q1'."""
+    found = figure(name, metrics, problem)
+    if not found.ranks:
+        raise InvalidValue(f"metric '{name}' has no better direction, so nothing can be judged by it")
+    return found
+
+
+def figure(name: str | None, metrics: Sequence[Metric], problem: Problem) -> Objective:
+    """Return the same of any number of a run, such as 'effort.F' or 'status.OK', also where none is better than another."""
     if name is None or name == RELATIVE_ERROR:
         return Objective()
     for metric in metrics:
         element = name.removeprefix(metric.name).removeprefix(".")
         if name != metric.key(element):
             continue
-        if metric.better == "neither":
-            raise InvalidValue(f"metric '{metric.name}' has no better direction, so nothing can be judged by it")
         if metric.by is not None and not element:
             raise InvalidValue(
                 f"metric '{metric.name}' has a number for every {metric.by}; give one: '{metric.name}.NAME'"

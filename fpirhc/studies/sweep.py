@@ -26,7 +26,7 @@ from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.objective import Objective, objective
+from fpirhc.studies.objective import Objective, figure
 from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, is_of_judgements
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
@@ -178,10 +178,10 @@ class Sweep(Study):
 
     @cached_property
     def winners(self) -> np.ndarray:
-        """Place of the controller with the best number among `maps`, per cell; -1 where all failed, or the best are equal."""
+        """Place of the controller with the best number among `maps`, per cell; -1 where none is alone the best."""
         values = np.array([one.values for one in self.maps])
         least = values.min(axis=0)
-        alone = np.isfinite(least) & ((values == least).sum(axis=0) == 1)
+        alone = self.aim.ranks & np.isfinite(least) & ((values == least).sum(axis=0) == 1)
         return np.where(alone, values.argmin(axis=0), -1)
 
     def rows(self) -> Iterator[dict[str, Any]]:
@@ -240,7 +240,7 @@ def sweep(
     Raises:
         InvalidName: a path that leads nowhere; an unknown metric.
         InvalidProblem: unknown controllers, gains of the wrong sign.
-        InvalidValue: no setting or more than two, a value that the problem does not accept, a metric without better direction.
+        InvalidValue: no setting or more than two, a value that the problem does not accept.
         OutputError: the folder cannot be written, or holds results under other conditions.
     """
     begin = time.perf_counter()
@@ -248,7 +248,7 @@ def sweep(
     check_gains(task, chosen)
     axes = tuple(replace(axis, path=of_problem(task.problem, axis.path) or axis.path) for axis in over)
     of_cases = _checked_axes(replace(task, controllers=chosen), axes)
-    aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
+    aim = figure(task.headline_metric if metric is None else metric, task.metrics, task.problem)
     grid = _Grid(axes, of_cases, seed)
     measured = [m for m in task.metrics if m.name in ("rms_error", aim.metric.name if aim.metric else "")]
     task = replace(task, controllers=chosen, cases=grid.cases, metrics=measured)
@@ -308,7 +308,10 @@ def _check_controllers(task: Task, axis: Axis, words: Collection[str]) -> None:
     if word in fields_of:
         told = [text for name, text in lacking.items() if task.controllers[name].deformation.adapts]
         raise InvalidName(f"no controller has '{axis.path}'. {(told or list(lacking.values()))[-1]}")
-    parameter = f" The parameter is 'exact.{word}'." if word in task.problem.moved.parameters else ""
+    parameters = task.problem.moved.parameters
+    if axis.path.rpartition(".")[2] in PARAMETERS:
+        raise InvalidName(f"the problem has no parameter '{axis.path.rpartition('.')[0]}'.{nearest(word, parameters)}")
+    parameter = f" The parameter is 'exact.{word}'." if word in parameters else ""
     hint = parameter or nearest(word, sorted({*words, *fields_of}))
     raise InvalidName(f"neither the problem nor a controller has '{axis.path}'.{hint}")
 
@@ -470,17 +473,18 @@ class _Runner:
 
 def _view(result: Sweep) -> View:
     cells = math.prod(len(axis.values) for axis in result.axes)
+    done, first, last = ("judged", "best", "worst") if result.aim.ranks else ("shown", "least", "largest")
     over = " and ".join(
         f"{axis.path} from {number(axis.values[0])} to {number(axis.values[-1])}{with_space(result.units.get(axis.path, '1'))} "
         f"in {len(axis.values)} values" + (" by equal factors" if axis.logarithmic else "")
         for axis in result.axes
     )
     conditions = (
-        f"{cells} runs of a controller over {over}, with the noise of seed {result.seed}; {result.aim.name} is judged. A run "
-        "fails if it ends early, diverges (an rms error above the reference's range) or is refused; best and worst "
+        f"{cells} runs of a controller over {over}, with the noise of seed {result.seed}; {result.aim.name} is {done}. A run "
+        f"fails if it ends early, diverges (an rms error above the reference's range) or is refused; {first} and {last} "
         "are of those that finished."
     )
-    heads = [Column(head) for head in ("controller", "failed", "best", "at", "worst")]
+    heads = [Column(head) for head in ("controller", "failed", first, "at", last)]
     table = Table(f"{result.problem}: over {' and '.join(axis.path for axis in result.axes)}", heads, conditions)
     for one in result.maps:
         table.add([one.controller, in_percent(one.failed), *_extremes(result, one)])
@@ -528,7 +532,7 @@ def _extremes(result: Sweep, one: SweepMap) -> list[str]:
 def _sentences(result: Sweep) -> Iterator[str]:
     """Who is best where, and who fails."""
     cells, places = result.winners.size, result.winners.ravel()
-    if len(result.maps) > 1:
+    if len(result.maps) > 1 and result.aim.ranks:
         shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(result.maps)), reverse=True)
         best = ", ".join(f"{name} in {count}" for count, name in shares if count)
         yield f"{result.aim.subject[0].upper()}{result.aim.subject[1:]} is best with: {best or 'none alone'} of {cells} cells."

@@ -64,9 +64,9 @@ INLINE Truth all_finite(const casadi_real* v, int n) {
     uint64_t wide;
     uint32_t bits;
     if (sizeof *v == sizeof wide) {
-      memcpy(&wide, v + i, sizeof wide), carried |= ((uint32_t)(wide >> 32) & 0x7fffffffu) + (28ul << 20);
+      memcpy(&wide, v + i, sizeof wide), carried |= ((uint32_t)(wide >> 32) & 0x7fffffffu) + (28UL << 20);
     } else {
-      memcpy(&bits, v + i, sizeof bits), carried |= (bits & 0x7fffffffu) + (28ul << 23);
+      memcpy(&bits, v + i, sizeof bits), carried |= (bits & 0x7fffffffu) + (28UL << 23);
     }
   }
   return !(carried >> 31);

@@ -276,12 +276,13 @@ def test_tables_escape_every_part():
 
 
 def test_progress_for_programs_is_a_line_of_json(monkeypatch, capsys):
-    """What was finished before counts for no rate: 30 of 90 in two seconds leave four."""
-    clock = iter([0.0, 10.0, 10.5, 12.0])
+    """What was finished before, and the time until the first answer, count for no rate; the last line has everything."""
+    clock = iter([0.0, 10.0, 10.5, 12.5, 13.0])
     monkeypatch.setattr(terminal, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     with progress_bars(as_json=True) as report:
-        for done in (10, 20, 40):
+        for done in (10, 20, 40, 100):
             report("RHC", done, 100)
-    first, last = map(json.loads, capsys.readouterr().err.splitlines())
-    assert first == {"controller": "RHC", "done": 10, "of": 100, "per second": 0.0, "seconds left": None}
-    assert last == {"controller": "RHC", "done": 40, "of": 100, "per second": 15.0, "seconds left": 4.0}
+    first, second, last = map(json.loads, capsys.readouterr().err.splitlines())
+    assert first == {"controller": "RHC", "done": 10, "of": 100, "per second": None, "seconds left": None}
+    assert second == {"controller": "RHC", "done": 40, "of": 100, "per second": 10.0, "seconds left": 6.0}
+    assert last == {"controller": "RHC", "done": 100, "of": 100, "per second": 32.0, "seconds left": 0.0}

@@ -156,6 +156,7 @@ WRONG = {
     "exact.b=-1:1:3:log": "equal factors need two ends of one sign that are not zero",
     "exact.b=1:2:3:lin": "expected PATH=LOW:HIGH:COUNT",
     "exact.bb=1:2:3": "'exact.NAME' has a parameter of what moves, and there is no 'bb'. Did you mean 'b'?",
+    "mass.exact=1:2:3": "the problem has no parameter 'mass'. Valid: ",
     "exat.b=1:2:3": "neither the problem nor a controller has 'exat.b'. Did you mean 'exact'?",
     "b=1:2:3": "neither the problem nor a controller has 'b'. The parameter is 'exact.b'.",
     "deformation.map.gian=-2:-1:3": "has no 'gian'. Did you mean 'gain'?",

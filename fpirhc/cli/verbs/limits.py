@@ -45,6 +45,7 @@ VERB = Verb(
     codes={
         ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or nothing could be tried",
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; nothing is kept",
     },
     examples=(
         ("fpirhc limits two_mass", "all five, for every controller"),

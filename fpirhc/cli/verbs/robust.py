@@ -47,6 +47,7 @@ VERB = Verb(
     codes={
         ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or no controller could be tried",
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; nothing is kept",
     },
     examples=(
         ("fpirhc robust two_mass --controllers CTC 'CTC+FPI (eq 6)'", "225 plants per box, at most 5 % of which fail"),

@@ -14,7 +14,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     text = "a setting with its values, COUNT of them from LOW to HIGH, by equal factors with :log; once or twice"
     parser.add_argument("--over", action="append", required=True, metavar="PATH=LOW:HIGH:COUNT", help=text)
     add_controllers(parser)
-    text = "figure of merit, such as settling.q1 (default: the problem's headline metric, or the relative error)"
+    text = "any number of a run, such as settling.q1 or status.OK (default: the problem's headline metric, or the relative error)"
     parser.add_argument("--metric", metavar="NAME", help=text)
     add_study(parser, "sweep_PATH...", "noise, the same in every run")
     add_format(parser, "a row per run", "csv")
