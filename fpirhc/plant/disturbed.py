@@ -28,7 +28,7 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
         InvalidProblem: an unknown name, no name, a parameter that already has the name, or a response that has a disturbance
             already.
     """
-    mistakes = Mistakes("disturbances of the model")
+    mistakes = Mistakes("drift: disturbances of the model")
     responses = dict(zip(response_names(plant), plant.controlled_names, strict=True)) if plant.outputs else {}
     what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
     mistakes.unknown(what, names, list(dict.fromkeys([*plant.names, *plant.chains, *responses])))

@@ -150,7 +150,7 @@ class Predicted(ControllerWrapper):
 
     Args:
         controller: any controller.
-        inputs: dead time of the inputs, s; the sum of both dead times is rounded to control cycles.
+        inputs: dead time of all inputs, one number, s; the sum of both dead times is rounded to control cycles.
         measurement: dead time of the measurement, s.
         by: how the state is predicted.
         longest: the longest sum of both dead times that a run may set, s, `live=["inputs"]`; None: twice the sum.
@@ -185,7 +185,7 @@ class Predicted(ControllerWrapper):
         late = f"{cast(float, cycles) * problem.period:g} {problem.time_unit}"
         return (
             *notes,
-            f"Predicted follows set-points {late} late: one that is not known ahead cannot act before the dead time is over",
+            f"Predicted follows set-points {late} late, announced ones too; give one that is known ahead so much earlier",
         )
 
     def check(self, problem: Problem) -> None:

@@ -6,7 +6,7 @@ Theory: docs/theory-estimation.md.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -122,6 +122,8 @@ class DisturbanceKalman(ParameterEstimator):
         mistakes = Mistakes("DisturbanceKalman")
         mistakes.unknown("measured: state, output or response", self.measured, quantities(problem.plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
+        for one in sorted({f for f in self.frequencies if list(self.frequencies).count(f) > 1}):
+            mistakes.add(f"frequencies: {one:g} is given twice; a sine has one frequency, so give it once")
         mistakes.raise_if_any()
         self._check_rank(problem)
         self.gain(problem)
@@ -161,7 +163,9 @@ class DisturbanceKalman(ParameterEstimator):
         ):
             noiseless = [n for n in model.names if n not in self.drift and n not in self.noise]
             hint = (
-                f"give noise={{{noiseless[0]!r}: ...}}, or measure more states" if noiseless else "measure more states"
+                f"give noise={{{noiseless[0]!r}: ...}}, or measure more states"
+                if noiseless
+                else "choose a larger drift beside the deviations of what is measured, or measure more states"
             )
             raise NoAnswer(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
         return np.asarray(gain)
@@ -284,18 +288,24 @@ class DisturbanceKalman(ParameterEstimator):
         measured, disturbances = ", ".join(self.measured), ", ".join(self.learned())
         if len(self.drift) > len(self.measured):
             raise InvalidProblem(
-                f"DisturbanceKalman: {len(self.drift)} disturbances ({disturbances}) cannot be found from "
-                f"{len(self.measured)} measured quantity(ies) ({measured}): measure as many, or estimate fewer"
+                f"DisturbanceKalman: {len(self.drift)} disturbances ({disturbances}) need as many measured quantities, and there "
+                f"{'is' if len(self.measured) == 1 else 'are'} {len(self.measured)} ({measured}): measure more, or estimate fewer"
             )
-        a, _, c = self._matrices(problem)
-        used = self._corrected(problem, a, c)
-        rank = _rank(a[np.ix_(used, used)], c[:, used])
-        if rank < used.sum():
+        rank, needed = self._rank(problem)
+        if rank < needed:
+            others = [n for n in quantities(problem.plant) if n not in self.measured]
+            helping = [n for n in others if np.equal(*replace(self, measured={**self.measured, n: 1.0})._rank(problem))]
             raise NoAnswer(
                 f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, D] has rank "
-                f"{rank} and needs {used.sum()} (Pannocchia and Rawlings 2003); measure another state, or disturb the response "
-                "of a coordinate that acts on a measured state"
+                f"{rank} and needs {needed} (Pannocchia and Rawlings 2003); "
+                + (f"measure {' or '.join(helping)} too" if helping else "estimate fewer disturbances")
             )
+
+    def _rank(self, problem: Problem) -> tuple[int, int]:
+        """The rank of [A - I; C] of what the filter corrects, and the one that it needs."""
+        a, _, c = self._matrices(problem)
+        used = self._corrected(problem, a, c)
+        return _rank(a[np.ix_(used, used)], c[:, used]), int(used.sum())
 
     def _corrected(self, problem: Problem, a: np.ndarray, c: np.ndarray) -> np.ndarray:
         """Which states and disturbances the filter corrects, shape (nx + nw,); no state where it has the measured one."""
