@@ -321,12 +321,16 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
         f.name for f in fields(deformation) if f.metadata.get("of_problem") and getattr(deformation, f.name) is None
     ]
     square = len(inputs) == len(problem.plant.controlled_names)
-    late = [name for name in left_open if max(known[name]) >= least]
     longest = [problem.dead_time.longest[name] / problem.period for name in inputs if name in problem.dead_time.longest]
+    reached = {
+        "cycles": [*known["cycles"], *longest],
+        "lag": known["lag"],
+    }  # a dead time that is live has others in a run
+    late = [name for name in left_open if max(reached[name]) >= least]
     each = {n: square and len(inputs) > 1 and bool(len({*known[n]}) > 1 or (longest and n == "cycles")) for n in late}
     values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in late}
     if "cycles" in values and longest and getattr(deformation, "longest", 0.0) is None:
-        values["longest"] = max(*longest, *known["cycles"])  # a dead time that is live has others in a run
+        values["longest"] = max(reached["cycles"])
     return replace(deformation, **values) if values else deformation
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -75,8 +75,10 @@ class Device:
 
     @cached_property
     def settings(self) -> Layout:
-        """Live settings and what follows from them."""
-        return self._read(lambda name: name.startswith(PREFIX))
+        """Live settings, with their units as far as they are known, and what follows from them."""
+        own = self._read(lambda name: name.startswith(PREFIX)).signals
+        units = {s.name: unit_of_setting(s.name.removeprefix(PREFIX), self.problem) for s in own}
+        return Layout(tuple(replace(s, units=(units[s.name],) * s.size) for s in own))
 
     @cached_property
     def data(self) -> Layout:
@@ -116,6 +118,15 @@ class Device:
 
     def _read(self, wanted: Callable[[str], bool]) -> Layout:
         return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
+
+
+def unit_of_setting(path: str, problem: Problem) -> str:
+    """Return the unit of a live setting, '' where its kind does not say it."""
+    kind, _, name = path.rpartition("inputs.")
+    if kind == "limits.":
+        units = dict(zip(problem.plant.inputs, problem.plant.input.entry_units, strict=True))
+        return units[name.rpartition(".")[0] or name]
+    return problem.plant.time_unit if path.startswith("dead_time.") else ""
 
 
 class BareStep:

@@ -63,15 +63,18 @@ def test_a_dead_time_that_is_set_is_the_one_that_is_built(name, compiled):
         assert rebuilt.cycles == 200
 
 
-@pytest.mark.parametrize("second", [0.003, 0.007], ids=["alike", "different"])
-def test_a_form_that_leaves_its_dead_time_to_the_problem_follows_the_one_in_force(second):
-    """Also where all inputs had one dead time in the build, and have several in the run."""
+@pytest.mark.parametrize(
+    ("built", "second"), [(0.003, 0.003), (0.003, 0.007), (0.0, 0.0)], ids=["alike", "different", "none in the build"]
+)
+def test_a_form_that_leaves_its_dead_time_to_the_problem_follows_the_one_in_force(built, second):
+    """Also where all inputs had one dead time in the build, or none, and have several in the run."""
     controller = fp.ComputedTorque(fp.Exponential(rate=3.0), fp.ModelReferenced(fp.Affine(gain=-0.2)))
-    problem = replace(queued(), dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": second}))
+    longest = {} if built else {"Q1": LONGEST["Q1"]}
+    problem = replace(queued(), dead_time=DeadTime(inputs={"Q1": built, "Q2": second}, longest=longest))
     ready = simulator(problem, controller, live=PLANT[:1], compiled=False)
     for first in (0.003, 0.0045, 0.002, 0.006):
         run = ready.run(seed=0, settings={PLANT[0]: first})
-        own = replace(problem, dead_time=DeadTime(inputs={"Q1": first, "Q2": second}))
+        own = replace(problem, dead_time=DeadTime(inputs={"Q1": first, "Q2": second}, longest={}))
         rebuilt = simulator(own, controller, compiled=False).run(seed=0)
         assert same_signals(run, rebuilt), first
         assert np.abs(run["command"]).max() > 1

@@ -21,6 +21,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, package
+from fpirhc.export.device import unit_of_setting
 from fpirhc.export.lab.loop import LabLoop
 from fpirhc.export.targets.c import template
 from fpirhc.plant.motion import forcing_units
@@ -301,18 +302,8 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
 
         places = _places(loops, started, path, without)
         if places:
-            sliders.append(Slider(path, _unit_of(path, having[0].ready.problem), value, low, high, places))
+            sliders.append(Slider(path, unit_of_setting(path, having[0].ready.problem), value, low, high, places))
     return sliders
-
-
-def _unit_of(path: str, problem: Problem) -> str:
-    """The unit of a live setting, where its kind says it."""
-    kind, _, name = path.rpartition("inputs.")
-    if kind == "limits.":
-        return dict(zip(problem.plant.inputs, problem.plant.input.entry_units, strict=True))[
-            name.rpartition(".")[0] or name
-        ]
-    return problem.time_unit if path.startswith("dead_time.") else ""
 
 
 def _places(

@@ -190,7 +190,7 @@ def _struct(name: str, layout: Layout) -> str:
     names = identifiers([s.name.removeprefix(PREFIX) for s in signals])
     alone = len(signals) == 1 and bool(signals[0].elements)
     for own, signal in zip(names, signals, strict=True):
-        units = ", ".join(dict.fromkeys(signal.entry_units))
+        units = ", ".join(dict.fromkeys(signal.entry_units)) or "as in the problem file"
         entries = identifiers(signal.elements)
         if not entries:
             lines.append(f"  casadi_real {own}; /* {units} */")
