@@ -181,9 +181,7 @@ def probe(
     if try_them and not results:
         why = "the loop refuses every candidate"
     elif try_them and name is None:
-        bearing = "" if all(one.bears for one in results.values()) else f", and bore {MARGIN:g} times its gain"
-        since = "" if problem.measure_from else "; errors count from the start on, where measure_from is not stated"
-        why = f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}{since}"
+        why = _none_of(results, problem)
     elif candidates and name is None:
         why = "no candidate bears twice the gain, which one that is not tried has to"
     elif name is not None:
@@ -252,6 +250,23 @@ def _answer(
     )
 
 
+def _none_of(results: Mapping[str, Trial], problem: Problem) -> str:
+    """Why none of the trials is kept; the budget of chatter where nothing else is against one."""
+    loud = {name: one for name, one in results.items() if not one.calm and replace(one, calm=True).passes}
+    if loud:
+        name = min(loud, key=lambda n: loud[n].error)
+        budget = {n: float(f"{_SPARE * step:.2g}") for n, step in loud[name].steps.items()}
+        one = f"{max(budget.values()):g}"
+        given = f"{budget}, or --chatter {one} for every input" if len(budget) > 1 else one
+        return (
+            f"in trials on the plant {name} had {loud[name].error:.3g} of the error of the controller alone, but the steps of its "
+            f"commands are beyond the budget of chatter; where the plant bears them, give chatter={given}"
+        )
+    bearing = "" if all(one.bears for one in results.values()) else f", and bore {MARGIN:g} times its gain"
+    since = "" if problem.measure_from else "; errors count from the start on, where measure_from is not stated"
+    return f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}{since}"
+
+
 def _notes(record: Record) -> list[str]:
     notes = [f"the run ended early: {record.stop}"] if record.stop else []
     if record.clipped > _CLIPPED:
@@ -286,6 +301,7 @@ _WORSE = 1.03  # largest ratio of any coordinate's error to that of the controll
 _WORTH = 0.95
 _LARGER = 1.5  # ratio of its errors with that gain and with its own
 _SHARE = ", share "
+_SPARE = 1.2  # times the steps of a trial that a budget of chatter has to be; those of other runs differ
 _SEEDS = 3  # of the trials of the best candidate
 _DARED = 0.9  # ratio of errors, from which a candidate that is stable at the estimate alone is kept
 
@@ -298,6 +314,7 @@ class Trial:
     worst: float  # of any coordinate
     bears: bool = True  # False where a run with a larger gain, which a daring candidate has to bear, does not pass
     calm: bool = True  # whether the steps of its commands are within what is allowed
+    steps: Mapping[str, float] = field(default_factory=dict)  # their rms by input
 
     @property
     def passes(self) -> bool:
@@ -337,9 +354,11 @@ class OnPlant:
         except FpirhcError as error:
             return str(error)
         pair = errors_of(self._problem, (alone, run), self._names)
-        calm = loud or self._allowed is None or bool((steps_of(run) <= self._allowed(alone)).all())
+        steps = steps_of(run)
+        calm = loud or self._allowed is None or bool((steps <= self._allowed(alone)).all())
         ratio = mean_ratio(self._problem, alone, run, self._names)
-        return Trial(ratio, max(pair.ratio(n) for n in pair.without), calm=calm)
+        by_input = dict(zip(self._problem.plant.inputs, steps.tolist(), strict=True))
+        return Trial(ratio, max(pair.ratio(n) for n in pair.without), calm=calm, steps=by_input)
 
     def walk(self, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int) -> dict[str, Trial]:
         """Return trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none.
@@ -381,7 +400,8 @@ class OnPlant:
         others = [self.trial(chosen, other) for other in self._seeds(seed)[1:]]
         trials = [first, *(one for one in others if isinstance(one, Trial))]
         error, worst = max(one.error for one in trials), max(one.worst for one in trials)
-        return replace(first, error=error, worst=worst, calm=all(one.calm for one in trials))
+        steps = {name: max(one.steps.get(name, 0.0) for one in trials) for name in first.steps}
+        return replace(first, error=error, worst=worst, calm=all(one.calm for one in trials), steps=steps)
 
     def _bears_more(self, chosen: Deformation, own: Trial, seed: int) -> bool:
         """Whether trials with a larger gain pass, and have no error that is much larger: else the limit is near."""

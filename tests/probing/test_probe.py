@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -290,6 +291,16 @@ def test_the_budget_of_chatter_is_kept():
     found = fp.probe(problem, RHC, chatter=1e-6, trials=False)
     assert found.deformation is None
     assert "no setting" in found.why
+
+
+def test_a_budget_of_chatter_that_every_trial_exceeds_is_named(monkeypatch):
+    """With what is to give, something is kept."""
+    monkeypatch.setattr(Rule, "shortlist", lambda rule: forms(rule, "bold"))
+    problem = body_problem(1.6, 0, 0.0, 0.05)
+    found = fp.probe(problem, RHC, cycles=100, chatter=1e-6)
+    assert found.deformation is None
+    (given,) = re.findall(r"budget of chatter; .* give chatter=(.*)", found.why)
+    assert fp.probe(problem, RHC, cycles=100, chatter=float(given)).deformation is not None
 
 
 # --- Recordings -------------------------------------------------------------------------------------------------------
