@@ -37,6 +37,7 @@ from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.scenarios.paired import Quantiles, median_interval, middle, share_interval, summarise, verdict
+from fpirhc.studies.scenarios.scenario_comparison import _beside
 
 LINE = line_text(
     "period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)", more=EXACT
@@ -267,6 +268,9 @@ def test_a_run_that_failed_has_nothing_of_what_is_to_be_large():
     assert summarise("A", failed, fine, seed=0, figure=figure).ratio == 0.0
     assert summarise("A", fine, failed, seed=0, figure=figure).ratio == math.inf
     assert summarise("A", records(0.4), fine, seed=0, figure=figure).ratio == pytest.approx(0.5)
+    negative = summarise("A", records(-0.4), records(-0.8), seed=0, figure=figure)  # its ratio would say the opposite
+    assert math.isnan(negative.ratio)
+    assert _beside(negative, figure)[1] == "none"
 
 
 def test_failures_of_named_cases_are_no_sample():

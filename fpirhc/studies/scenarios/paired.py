@@ -123,7 +123,7 @@ class Summary(FoundByName):
     statuses: Mapping[str, int]  # number of cycles by status, over all scenarios
     # this value minus the baseline's in the same scenario; None for the baseline itself
     difference: ConfidenceInterval | None
-    ratio: float  # median of this value over the baseline's
+    ratio: float  # median of this value over the baseline's; NaN where a value is negative
     better: int  # number of scenarios in which this value is the smaller one
     equal: int  # number of scenarios in which both are equal, or failed; 0 for the baseline itself
 
@@ -203,9 +203,9 @@ def _sentence(baseline: Summary, one: Summary, what: str, figure: Objective) -> 
     )
     if one.is_small:
         return f"{one.name} and {baseline.name} have too few {what} for an interval ({numbers})."
-    # Of numbers that may be negative, such as a lowest level, a ratio can say the opposite.
     more = figure.better == ("larger" if one.outcome is Outcome.BETTER else "smaller")
-    times = f"; {one.ratio:.3g} times its {figure.noun}" if one.ratio >= 0 and (one.ratio > 1) == more else ""
+    told = not math.isnan(one.ratio) and (one.ratio > 1) == more
+    times = f"; {one.ratio:.3g} times its {figure.noun}" if told else ""
     worse = "larger" if figure.better == "smaller" else "smaller"
     if one.outcome is Outcome.BETTER:
         return f"{one.name} has a {figure.better} {figure.noun} than {baseline.name} ({numbers}{times})."
@@ -357,6 +357,7 @@ class _Running:
         self._shown = _Shown()
         self._outcomes, self._statuses = Counter[str](), Counter[str]()
         self._better = self._equal = 0
+        self._negative = False  # of numbers such as a lowest level, of which a ratio can say the opposite
         self._worst, self._worst_of = -math.inf, ("", 0)
         self._first_ended: int | None = None
 
@@ -365,7 +366,9 @@ class _Running:
         other = value if before is None else self._figure.value(before)
         self._values.add(value)
         self._differences.add(0.0 if value == other else value - other)
-        self._ratios.add(_ratio(self._figure.amount(value), self._figure.amount(other)))
+        of_this, of_other = self._figure.amount(value), self._figure.amount(other)
+        self._negative |= min(of_this, of_other) < 0
+        self._ratios.add(0.0 if self._negative else _ratio(of_this, of_other))
         self._better += value < other
         self._equal += before is not None and value == other
         number = int(record["scenario"])
@@ -408,7 +411,7 @@ class _Running:
             outcomes=dict(self._outcomes),
             statuses=dict(+self._statuses),
             difference=None if seed is None else median_interval(self._differences, seed),
-            ratio=self._ratios.median,
+            ratio=math.nan if self._negative else self._ratios.median,
             better=self._better,
             equal=self._equal,
         )
@@ -470,6 +473,6 @@ def _ratio(after: float, before: float) -> float:
     if after == before:
         return 1.0
     if before == 0:
-        return math.copysign(math.inf, after) * math.copysign(1.0, before)
+        return math.inf
     ratio = after / before
     return 1.0 if math.isnan(ratio) else ratio

@@ -226,7 +226,8 @@ def _beside(one: Summary, figure: Objective) -> list[str]:
     if one.equal == one.count and math.isinf(one.median):
         return ["none", "none", f"0 of {one.count}"]
     interval = "too few" if one.is_small else figure.interval(d.low, d.high)
-    return [f"{figure.difference(d.median)} ({interval})", written_out(one.ratio), f"{one.better} of {one.count}"]
+    ratio = "none" if math.isnan(one.ratio) else written_out(one.ratio)
+    return [f"{figure.difference(d.median)} ({interval})", ratio, f"{one.better} of {one.count}"]
 
 
 def _number(column: Number, of: Mapping[str, Mapping[str, float]]) -> str:
