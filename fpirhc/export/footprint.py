@@ -24,7 +24,7 @@ _STILL = frozenset((ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_PARAMETER))
 def worst_case(device: Device) -> str:
     """Return the worst case as a line: operations always, bytes where there is a compiler that counts them."""
     most = operations(device.stepper.function)
-    text = f"{most} operations of a step"
+    text = f"{most} operations of a step{_iterations(device)}"
     missed = 0 if device.bare else device.most_missed
     text += f", {missed + 1} times as many after {missed} missed cycles" if missed else ""
     sizes = _bytes(device)
@@ -32,6 +32,13 @@ def worst_case(device: Device) -> str:
         return text
     flash, ram, stack = sizes
     return f"{text}; {flash} bytes of code without exp and the like, {ram} of RAM, {stack} of stack (double, -Os, this machine)"
+
+
+def _iterations(device: Device) -> str:
+    """What bounds the iterations of a plan, where the controller plans."""
+    planner = device.controller.planner
+    bounds = [] if planner is None else [f"{name} = {count}" for name, count in planner.optimiser.most_work.items()]
+    return f" with {' and '.join(bounds)} at most" if bounds else ""
 
 
 def operations(function: ca.Function) -> int:

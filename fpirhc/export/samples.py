@@ -25,6 +25,7 @@ def recorded(device: Device) -> bytes:
     stepper, rows = device.stepper, _samples(device)
     if not device.bare:  # there nothing catches them
         rows = with_faults(rows, device.problem)
+    rows = rows[: device.cycles]
     exact = device.libm == "system" and (stepper.compiled or stepper.function.is_a("SXFunction"))
     head = struct.pack("<4i", len(rows), rows.shape[1], device.problem.plant.input.size, exact)
     memory, parts = stepper.start(), [head]
@@ -44,12 +45,20 @@ def recorded(device: Device) -> bytes:
     return b"".join(parts)
 
 
+_GAPS = ((150, 3), (220, 30), (300, 700))  # first cycle behind a gap, and the number of missing ones
 _DAMAGED = 95  # cycle before which an entry of the memory becomes NaN
 
 
 def with_faults(rows: np.ndarray, problem: Problem) -> np.ndarray:
-    """Return samples with what a device meets: no numbers, outliers, a plant that jumped, and cycles that are missing."""
-    rows = rows.copy()
+    """Return samples with what a device meets: no numbers, outliers, a plant that jumped, and cycles that are missing.
+
+    Behind a gap the samples are those of its end, as the reference is: others would keep the commands at their limits.
+    """
+    place = np.arange(len(rows))
+    for first, missing in _GAPS:
+        place[first:] += missing
+    rows = rows[place % len(rows)]
+    rows[:, 0] = problem.period * place
     faults: dict[int, tuple[int, float]] = {
         20: (1, np.nan), 25: (-1, np.inf), 30: (-1, -np.inf), 35: (0, np.nan), 40: (1, 1e9), 41: (1, 1e9), 42: (1, 1e9),
         50: (-1, 1e200), 52: (0, 1e18), 53: (1, -np.inf),
@@ -57,8 +66,6 @@ def with_faults(rows: np.ndarray, problem: Problem) -> np.ndarray:
     for k, (entry, value) in faults.items():
         rows[k : k + 1, entry] = value
     rows[60:85, 1] += 1e4
-    for first, missing in ((150, 3), (220, 30), (300, 700)):
-        rows[first:, 0] += missing * problem.period
     rows[350:351, 0] = rows[349:350, 0]  # a cycle twice
     return rows
 
@@ -73,11 +80,12 @@ def digest(values: np.ndarray) -> int:
 
 
 def _samples(device: Device) -> np.ndarray:
-    """What the step is given in a run, with times that go on where it is repeated."""
+    """What the step is given in a run, with times that go on where it is repeated, and as many cycles more as gaps are long."""
     problem = device.problem
     run = simulate(problem.of_equations, device.controller, seed=0)
     parts = (run.time if name == "time" else run[name] for name in device.inputs.names)
     rows = np.hstack([np.asarray(part, dtype=float).reshape(len(run.time), -1) for part in parts])
-    rows = np.vstack([rows] * -(-device.cycles // len(rows)))[: device.cycles]
+    wanted = device.cycles + sum(missing for _, missing in _GAPS)
+    rows = np.vstack([rows] * -(-wanted // len(rows)))[:wanted]
     rows[:, 0] = device.problem.period * np.arange(len(rows))
     return rows

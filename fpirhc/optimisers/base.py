@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import ClassVar, Literal, cast
+from typing import ClassVar, Literal
 
 import casadi as ca
 import numpy as np
@@ -64,12 +64,17 @@ class Optimiser(Checked, ABC):
         """
         return self
 
+    @property
+    def most_work(self) -> dict[str, int]:
+        """Settings that bound the iterations of a call, by name."""
+        return (
+            {f.name: getattr(self, f.name) for f in fields(self) if f.name in _ITERATIONS} if is_dataclass(self) else {}
+        )
+
     def longer(self, times: int) -> Optimiser | None:
         """The same optimiser with so many times the iterations per call; None where it has no such setting."""
-        if not is_dataclass(self):
-            return None
-        more = {f.name: times * getattr(self, f.name) for f in fields(self) if f.name in _ITERATIONS}
-        return cast(Optimiser, replace(self, **more)) if more else None
+        more = {name: times * count for name, count in self.most_work.items()}
+        return replace(self, **more) if more else None  # type: ignore[type-var]
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if the optimiser cannot serve the problem.

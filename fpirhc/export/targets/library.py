@@ -10,6 +10,7 @@ from fpirhc.export.binaries import ENDINGS, shared_libraries
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
+from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import why_no_compiler
 
 
@@ -20,6 +21,13 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     own = {
         **sources(device),
         f"{name}_library.c": filled(device, "library.c", change=change if device.bounds else nothing),
+        "README.md": filled(
+            device,
+            "library.md",
+            sample=_listed(device.inputs),
+            command=_listed(_command(device)),
+            settings=", ".join(device.bounds) or "none",
+        ),
     }
     made = {f"{name}_{at}{ENDINGS[at.split('-')[1]]}": data for at, data in shared_libraries(own).items()}
     if not made:
@@ -27,6 +35,15 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
             f"a shared library needs a C compiler: {why_no_compiler()}; install gcc or clang, or pip install 'fpirhc[compiler]'"
         )
     return {**own, **made, "layout.json": json.dumps(layout_of(device), indent=1)}
+
+
+def _command(device: Device) -> Layout:
+    return Layout((device.stepper.signals["command"],))
+
+
+def _listed(layout: Layout) -> str:
+    """Names and units in their order."""
+    return ", ".join(f"`{name}` [{unit}]" for name, unit in zip(layout.columns, layout.units, strict=True))
 
 
 TARGET = Target(
