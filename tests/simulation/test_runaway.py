@@ -10,6 +10,8 @@ import pytest
 from plants import heavy
 
 import fpirhc as fp
+from fpirhc.studies.comparison.compare import _remarks
+from fpirhc.studies.comparison.optimality import Optimality
 
 
 def late_mass(late: float, amplitude: float = 0.2) -> fp.Problem:
@@ -71,6 +73,8 @@ def test_a_run_of_plans_that_did_not_converge_names_its_rounding_in_one_sentence
     )
     assert "compiled C, the virtual machine and another computer may give other runs" in run.depends_on_rounding
     assert run.depends_on_rounding in repr(run)
+    told = {gap: _remarks(run, Optimality(gap, gap, 25)) for gap in (1e-13, 1e-3)}
+    assert told == {1e-13: [], 1e-3: [run.depends_on_rounding]}
 
 
 def test_a_run_of_converged_plans_says_nothing():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 import fpirhc as fp
 from fpirhc.simulation.machine import SKIPPED
-from fpirhc.studies.comparison.timing import _planned, stepper_to_time
+from fpirhc.studies.comparison.timing import REPLAYED, _planned, measure_cycles, stepper_to_time
 from fpirhc.task.problem import cycles_per_plan
 
 
@@ -30,3 +32,22 @@ def test_a_skipped_sample_moves_the_next_plans_by_one_cycle():
     assert set(new) <= set(found)
     assert found.size == (600 - skipped[-1] - 1) // stride
     assert not (found % stride == 0).all()
+
+
+def test_controllers_are_timed_in_turn(monkeypatch):
+    """Each has all of its cycles, in blocks between those of the other."""
+    task, turns = fp.load_problem("two_mass"), list[int]()
+    ran = [
+        (stepper_to_time(task.problem, law, compiled=False), fp.simulate(task.problem, law, seed=0, compiled=False))
+        for law in (task.controllers["CTC"], task.controllers["CTC+FPI (eq 6)"])
+    ]
+    for k, (stepper, _) in enumerate(ran):
+
+        def stepped(*now: object, k: int = k, step: Any = stepper.step) -> object:
+            turns.append(k)
+            return step(*now)
+
+        monkeypatch.setattr(stepper, "step", stepped)
+    assert all(one is not None and one.median > 0 for one in measure_cycles(task.problem, ran))
+    assert turns.count(0) == turns.count(1) == min(REPLAYED, ran[0][1].cycles)
+    assert np.count_nonzero(np.diff(turns)) > 2

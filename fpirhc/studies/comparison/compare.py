@@ -31,13 +31,12 @@ from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import judged_run, simulator
-from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.causes import yardstick_of
 from fpirhc.studies.comparison.changes import Finding, Outcome, scales
 from fpirhc.studies.comparison.comparison import Comparison
 from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, information, lines_of, plan_every
-from fpirhc.studies.comparison.optimality import measure_optimality
+from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
 from fpirhc.studies.comparison.pairwise import (
     Built,
     NullTest,
@@ -46,7 +45,7 @@ from fpirhc.studies.comparison.pairwise import (
     partners,
     with_reviewed_causes,
 )
-from fpirhc.studies.comparison.timing import CycleTime, measure_cycle, stepper_to_time
+from fpirhc.studies.comparison.timing import measure_cycles, stepper_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.view import Progress, circumstances
@@ -110,9 +109,10 @@ def compare(
     found, unjudged = partners(task.problem, ran, selected, seed=seed, compiled=compiled, metrics=task.metrics)
     alone = [entry for entry, _ in found.values()]
     ran = [replace(e, pair=found[e.name][0].name) if e.name in found else e for e in ran]
+    broken: list[str] = []
+    ran = _timed(task.problem, ran, built, broken)
     entries = beside_each_other(task.problem, ran, built, sizes)
     built |= {entry.name: Built(loop, None) for entry, loop in found.values()}
-    broken: list[str] = []
     judge = partial(
         findings,
         skipped=skipped,
@@ -234,7 +234,7 @@ def _entry(
     part = partial(attempted, broken=broken)
     metrics = measure(problem, run, task.metrics)
     view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
-    stepper, cycle = part("the time of a cycle", _timed, problem, ready, run, compiled=compiled) or (None, None)
+    stepper = part("the time of a cycle", stepper_to_time, problem, ready, compiled=compiled)
     built[name], told = Built(loop, stepper), [view.text] if view else []
     contraction = part("the contraction", _contraction, problem, ready, run, metrics)
     optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
@@ -245,7 +245,7 @@ def _entry(
         name=name,
         run=run,
         metrics=metrics,
-        cycle=cycle,
+        cycle=None,  # measured when all have run, in turn
         adaptive=adaptive,
         pair=pair_of(controllers, name) if adaptive else None,
         contraction=contraction,
@@ -255,7 +255,7 @@ def _entry(
             *_notes(controller, ready),
             *ready.notes(problem),
             *told,
-            *run.remarks,
+            *_remarks(run, optimality),
             *broken,
             *metrics.broken.values(),
         ),
@@ -271,10 +271,18 @@ def _entry(
     )
 
 
-def _timed(problem: Problem, ready: Controller, run: Run, *, compiled: bool) -> tuple[Stepper, CycleTime | None]:
-    """The controller stepped by hand, and the time of its cycle."""
-    stepper = stepper_to_time(problem, ready, compiled=compiled)
-    return stepper, measure_cycle(problem, stepper, run)
+def _timed(problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], broken: list[str]) -> list[Entry]:
+    """The entries with the times of their cycles, which are measured in turn."""
+    ran = {e.name: (stepper, e.run) for e in entries if (stepper := built[e.name].stepper) is not None}
+    times = attempted("the time of a cycle", measure_cycles, problem, [*ran.values()], broken=broken)
+    of = dict(zip(ran, times or (), strict=False))
+    return [replace(e, cycle=of.get(e.name)) for e in entries]
+
+
+def _remarks(run: Run, optimality: Optimality | None) -> list[str]:
+    """What a reader should know of a run; plans at their optimum, to the accuracy of costs, depend on rounding no more than it."""
+    reached = optimality is not None and optimality.reached
+    return [text for text in run.remarks if not (reached and text == run.depends_on_rounding)]
 
 
 def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:

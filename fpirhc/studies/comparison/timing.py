@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from fpirhc.task.problem import Problem, cycles_per_plan
 
 REPLAYED = 2000  # cycles of the run that are stepped again, one by one
 ROUNDS = 40  # in which two controllers are timed in turn
+_TURN = 250  # cycles of a turn: the first one, whose code another controller has displaced, is no 99th percentile
 _FEWEST = 10  # rounds from which a median has an interval
 _PLACEMENT = 0.03  # of a time: where code and data happen to lie changes it by this much
 
@@ -131,37 +132,60 @@ def stepper_to_time(problem: Problem, controller: Controller, *, compiled: bool)
 
 
 def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | None:
-    """Replay the run's measurements through its controller, one call per cycle, and return the times.
+    """Return the times of one controller, see `measure_cycles`."""
+    return measure_cycles(problem, [(stepper, run)])[0]
 
-    The replay repeats the computations of the run: the controller starts afresh and has the same measurements.
-    The result is None for a run of fewer than two cycles.
+
+def measure_cycles(problem: Problem, ran: Sequence[tuple[Stepper, Run]]) -> list[CycleTime | None]:
+    """Replay the measurements of runs through their controllers, one call per cycle, and return the times.
+
+    A replay repeats the computations of its run: the controller starts afresh and has the same measurements. The controllers take
+    turns, so that other work on the machine slows all of them alike. The result is None for a run of fewer than two cycles.
     """
-    cycles = min(run.cycles, REPLAYED)
-    if cycles < 2:
-        return None
-    memory = stepper.start()
-    taken, skipped = np.empty(cycles), np.empty(cycles)
-    times, step = run.time[:cycles], _step_of(stepper)
-    states, realised = (part[:cycles] for part in _samples(stepper, run))
-    for k in range(cycles):
-        begin = time.perf_counter_ns()
-        _, memory = step(times[k], states[k], realised[k], memory)
-        taken[k] = time.perf_counter_ns() - begin
-        skipped[k] = stepper.skipped
-    micro = taken / 1e3
-    later = micro[1:]
-    stride = cycles_per_plan(problem.horizon, problem.period) if problem.horizon and "solve" in run.layout else 1
-    plans = micro[_planned(skipped, stride)] if cycles > stride else micro
-    # Whole plan periods: where every other cycle plans, the median of single cycles would be the one or the other by chance.
-    whole = later[: later.size - later.size % stride] if later.size >= stride else later
-    periods = whole.reshape(-1, stride) if later.size >= stride else whole[:, None]
-    return CycleTime(
-        median=float(np.median(periods.mean(axis=1))),
-        p99=float(np.quantile(later, 0.99)),
-        maximum=float(later.max()),
-        first=float(micro[0]),
-        planning=float(np.median(plans)),
-    )
+    timed = [_Timed(*one) for one in ran]
+    for number in range(-(-REPLAYED // _TURN)):
+        for one in timed[:: -1 if number % 2 else 1]:
+            one.advance(_TURN)
+    return [one.times(problem) for one in timed]
+
+
+class _Timed:
+    """A controller on the measurements of its run, every cycle timed."""
+
+    def __init__(self, stepper: Stepper, run: Run) -> None:
+        self._stepper, self._step, self._memory, self._at = stepper, _step_of(stepper), stepper.start(), 0
+        self._cycles, self._plans = min(run.cycles, REPLAYED), "solve" in run.layout
+        self._signals = run.time, *_samples(stepper, run)
+        self._taken, self._skipped = np.empty(self._cycles), np.empty(self._cycles)
+
+    def advance(self, cycles: int) -> None:
+        """Replay the next cycles, as far as there are some."""
+        times, states, realised = self._signals
+        for k in range(self._at, min(self._at + cycles, self._cycles)):
+            begin = time.perf_counter_ns()
+            _, self._memory = self._step(times[k], states[k], realised[k], self._memory)
+            self._taken[k] = time.perf_counter_ns() - begin
+            self._skipped[k] = self._stepper.skipped
+        self._at += cycles
+
+    def times(self, problem: Problem) -> CycleTime | None:
+        """The times of all cycles."""
+        if self._cycles < 2:
+            return None
+        micro, cycles = self._taken / 1e3, self._cycles
+        later = micro[1:]
+        stride = cycles_per_plan(problem.horizon, problem.period) if problem.horizon and self._plans else 1
+        plans = micro[_planned(self._skipped, stride)] if cycles > stride else micro
+        # Whole plan periods: where every other cycle plans, the median of single cycles would be the one or the other by chance.
+        whole = later[: later.size - later.size % stride] if later.size >= stride else later
+        periods = whole.reshape(-1, stride) if later.size >= stride else whole[:, None]
+        return CycleTime(
+            median=float(np.median(periods.mean(axis=1))),
+            p99=float(np.quantile(later, 0.99)),
+            maximum=float(later.max()),
+            first=float(micro[0]),
+            planning=float(np.median(plans)),
+        )
 
 
 def _planned(skipped: np.ndarray, stride: int) -> np.ndarray:
