@@ -222,9 +222,9 @@ _CHECKED: Latest[None] = Latest(8)  # cases with the problem that they fit
 
 
 def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
-    """The problem with all changes but those of exact parameters; whole fields come first."""
+    """The problem with all changes but those of exact parameters."""
     of_fields = {path: value for path, value in changes.items() if _word(path) not in (*_WORDS, _GROUP, _SEED)}
-    for path, value in sorted(_joined(problem, of_fields).items(), key=lambda one: one[0].count(".")):
+    for path, value in _joined(problem, of_fields).items():
         problem = changed_at(problem, path, _number_of(problem, path, value))
     model = {name: value for word in (_APPROXIMATE, _KNOWN) for name, value in _named(changes, word).items()}
     start = _named(changes, START)
@@ -286,19 +286,26 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
         yield f"'{_GROUP}' is a text, got {described(group)}"
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
         yield f"'{_SEED}' is a whole number of at least 0, got {described(seed)}"
+    for path in changes:
+        word, _, rest = path.partition(".")
+        both = [f"{_KNOWN}.{rest}"] if word in (_EXACT, _APPROXIMATE) else []
+        above = [path[:at] for at, mark in enumerate(path) if mark == "."]
+        for other in (one for one in (*both, *above) if one in changes):
+            yield f"'{other}' and '{path}' set the same number; leave one of them out"
 
 
 def _check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
     """Raise where one change does not fit."""
     word, _, name = path.partition(".")
+    if word in _WORDS and not name:
+        what = "state" if word == START else "parameter"
+        raise InvalidName(f"'{word}' alone names no {what}; write one entry for each, '{word}.NAME'")
     if word == START:
         _check_name(f"'{START}.NAME' has a state", name, problem.plant.state.elements)
         _check_number(changes[path], problem.plant.ranges.get(name))
         return
     if word in PARAMETERS:
         settable = {n: one for n, one in _parametric(problem, changes, word).parameters.items() if not one.outside}
-        if not name:
-            raise InvalidName(f"'{word}' alone names no parameter; write one entry for each, '{word}.NAME'")
         if not settable and problem.foreign is not None and word == _EXACT:
             raise InvalidName(
                 f"what moves is outside and has no parameter '{name}'; state it: "
@@ -311,6 +318,12 @@ def _check_change(problem: Problem, changes: Mapping[str, object], path: str) ->
     if word not in paths:
         meant = _meant(problem, path.rpartition(".")[2]) or nearest(word, [*_WORDS, *paths])
         raise InvalidName(f"the problem has no '{path}'.{meant}")
+    parent, _, last = path.rpartition(".")
+    if parent == "dead_time.inputs" and last in problem.plant.inputs and last not in problem.dead_time.inputs:
+        stated = {**problem.dead_time.inputs, last: 0.0}
+        raise InvalidName(
+            f"the problem states no dead time of '{last}'; write dead_time=fp.DeadTime(inputs={stated}) there"
+        )
     if isinstance(content_at(problem, path, "the problem"), int | float):
         _check_number(changes[path])
 

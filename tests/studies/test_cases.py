@@ -391,6 +391,16 @@ WRONG_PATHS: dict[str, tuple[Any, str]] = {
     "a parameter outside its bounds": ({"exact.b": -70.0}, r"'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70"),
     "no number": ({"exact.b": "1.2"}, r"'exact\.b': expected a finite number, got the text '1\.2'"),
     "an infinite start": ({"start.y": float("inf")}, r"'start\.y': expected a finite number, got inf"),
+    "a state without its name": ({"start": {"y": 1.0}}, r"'start' alone names no state; .*, 'start\.NAME'"),
+    "a dead time that is not stated": (
+        {"dead_time.inputs.u": 0.1},
+        r"write dead_time=fp.DeadTime\(inputs={'u': 0.0}\)",
+    ),
+    "a parameter twice": ({"exact.b": 1.0, "known.b": 2.0}, r"'known.b' and 'exact.b' set the same number"),
+    "an interval and its end": (
+        {"limits.inputs.u.1": 9.0, "limits.inputs.u": (-3.0, 3.0)},
+        r"'limits.inputs.u' and 'limits.inputs.u.1' set the same number",
+    ),
     "a limit that is none": ({"limits.inputs.u.1": -50.0}, r"case 'weak': .*u"),
 }
 WRONG_TABLES = {
