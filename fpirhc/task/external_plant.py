@@ -277,9 +277,9 @@ class ExternalPlant(Checked):
         except BaseException as error:  # noqa: BLE001  # whatever else a stranger's object raises is a bad answer
             words = f"{who} raised {type(error).__name__}{_words(error)}"
             words = (
-                f"{who}{_words(error)}" if isinstance(error, FpirhcError) else words
+                f"{who}{_words(error)}" if issubclass(type(error), FpirhcError) else words
             )  # those of an adapter say it all
-            return Reading(None, str(error) if isinstance(error, _NoBody) else words)
+            return Reading(None, str(error) if issubclass(type(error), _NoBody) else words)
         elapsed = self._now() - begin
         answer = _real_numbers(returned)
         expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
@@ -300,7 +300,10 @@ class ExternalPlant(Checked):
         """The wall time; without a deadline nobody asks for it."""
         if self.deadline is None:
             return 0.0
-        time = self.clock()
+        try:
+            time = self.clock()
+        except Exception as error:  # noqa: BLE001  # a stranger's function may raise anything
+            raise InvalidValue(f"ExternalPlant(clock=...): it raised {type(error).__name__}{_words(error)}") from None
         if not finite_number(time):
             raise InvalidValue(
                 f"ExternalPlant(clock=...): it returned {_short(time)}, expected the wall time as a number, in s"
@@ -338,9 +341,10 @@ def _real_numbers(answer: object) -> np.ndarray | None:
 
 def _words(error: BaseException) -> str:
     try:
-        return f": {' '.join(str(error).split())}"
+        text = " ".join(str(error).split())
     except Exception:  # noqa: BLE001  # an exception of a stranger's that has no words
-        return ""
+        text = ""
+    return f": {text}" if text else ""
 
 
 def _short(answer: object) -> str:

@@ -195,10 +195,12 @@ def test_one_input_is_late_in_the_body_and_another_before_it():
     assert late.simulated.queued == ("w",)
 
 
-@pytest.mark.parametrize("clock", [lambda: None, lambda: "noon", lambda: float("nan")])
+@pytest.mark.parametrize("clock", [lambda: None, lambda: "noon", lambda: float("nan"), lambda: 1 / 0])
 def test_a_clock_that_shows_no_time_is_named(clock):
     """It is the user's own mistake, and no bad answer of the body."""
-    with pytest.raises(InvalidValue, match=r"ExternalPlant\(clock=\.\.\.\): it returned .*, expected the wall time"):
+    with pytest.raises(
+        InvalidValue, match=r"ExternalPlant\(clock=\.\.\.\): it (returned .*, expected the wall|raised Zero)"
+    ):
         run(outside(task(), deadline=1.0, clock=clock), CONTROLLERS["computed torque"])
 
 
@@ -362,6 +364,18 @@ def speechless(_answer):
     raise Speechless
 
 
+class Nameless(Exception):
+    """An exception whose attributes raise."""
+
+    def __getattribute__(self, name):
+        raise TypeError(name)
+
+
+def nameless(_answer):
+    """Raise it."""
+    raise Nameless
+
+
 class WithoutLength:
     """A sequence that has no length."""
 
@@ -381,6 +395,7 @@ class WithoutLength:
         (lambda _: [Hostile("array", "len", "repr")] * 3, "returned a value of the class list, expected 3 numbers"),
         (lambda _: WithoutLength(), "expected 3 numbers"),
         (speechless, "step of Faulty raised Speechless at t"),
+        (nameless, "step of Faulty raised Nameless at t"),
     ],
 )
 def test_whatever_raises_in_an_answer_is_a_bad_answer(bad, words, deadline):
