@@ -24,6 +24,7 @@ from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.scenario_study import LEDGER, compare_scenarios
 
+dask = pytest.importorskip("dask", reason="the extra 'cluster' is not installed")
 distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 NAMES = ["CTC", "CTC+FPI (eq 6)"]
 
@@ -60,19 +61,25 @@ def test_a_cluster_gives_the_records_of_one_process(tmp_path: Path, two_workers:
     assert studied(tmp_path / "together", cluster=two_workers.scheduler_address) == alone
 
 
-def test_workers_that_are_killed_lose_and_double_nothing(tmp_path: Path, two_workers: Any) -> None:
-    """One of two, after every third record."""
+@pytest.mark.parametrize(("kills", "borne"), [(3, 3), (2, 0), pytest.param(30, 3, marks=pytest.mark.slow)])
+def test_workers_that_are_killed_lose_and_double_nothing(tmp_path: Path, kills: int, borne: int) -> None:
+    """One of two, after every third record; also a task that Dask gives up when so many of its workers have died is given again."""
     killed: list[int] = []
-    alone = studied(tmp_path / "alone")
+    alone = studied(tmp_path / "alone", 4 * kills)
 
     def kill(name: str, done: int, total: int) -> None:
         del name, total
-        if done % 3 == 0 and len(killed) < 3:
-            killed.append(next(iter(two_workers.workers.values())).process.pid)
+        workers = [one.process.pid for one in local.workers.values() if one.process is not None]
+        if done % 3 == 0 and len(killed) < kills and workers:
+            killed.append(workers[0])
             os.kill(killed[-1], signal.SIGKILL)
 
-    together = studied(tmp_path / "together", cluster=two_workers.scheduler_address, progress=kill)
-    assert killed
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": borne}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
+    ):
+        together = studied(tmp_path / "together", 4 * kills, cluster=local.scheduler_address, progress=kill)
+    assert len(killed) > kills // 2
     assert together == alone
 
 

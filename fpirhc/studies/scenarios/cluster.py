@@ -221,6 +221,7 @@ def _end(process: subprocess.Popen[str]) -> None:
 
 LOCAL = "local"  # in place of an address: a cluster of this machine's cores
 _CHUNK = 0.2  # s of work in a task, beside which the milliseconds of its transport do not count
+_LOSSES = 2  # times that a task is given again after Dask gave it up, because its workers died one after the other
 _MOST = 200  # groups of jobs in a task
 _WAIT = 10  # s for an answer of the scheduler
 _LOCAL = {
@@ -295,25 +296,37 @@ class Cluster:
 
     def _chunks(self, jobs: Iterator[Sequence[Job]]) -> Iterator[list[Any]]:
         """Answers of one task after the other; tasks get longer until their transport does not count."""
-        size, running = 1, 0
+        size, given = (
+            1,
+            dict[str, tuple[list[Sequence[Job]], int]](),
+        )  # jobs of a task, and how often it was lost, by key
         pool = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         while True:
             threads = sum(self._client.nthreads().values())  # asked once for every answer: workers may come and go
-            while running < 2 * max(1, threads) and (chunk := list(itertools.islice(jobs, size))):
-                pool.add(self._client.submit(run_jobs, self._opening, self._content, self._greeting, chunk, pure=False))
-                running += 1
-            if not running:
+            while len(given) < 2 * max(1, threads) and (chunk := list(itertools.islice(jobs, size))):
+                future = self._submitted(chunk)
+                pool.add(future)
+                given[future.key] = chunk, 0
+            if not given:
                 return
             if not threads:
                 self._wait_for_workers()
             future, result = next(pool)
-            running -= 1
+            chunk, losses = given.pop(future.key)
             if future.status != "finished":
-                raise _lost("the cluster lost a task", result)
+                if losses == _LOSSES or not isinstance(_error_in(result), self._dask.KilledWorker):
+                    raise _lost("the cluster lost a task", result)
+                again = self._submitted(chunk)
+                pool.add(again)
+                given[again.key] = chunk, losses + 1
+                continue
             answers, seconds = result
             future.release()  # a worker that is killed would compute every result that it holds anew
             size = min(max(size, math.ceil(_CHUNK * len(answers) / max(seconds, 1e-6))), 2 * size, _MOST)
             yield answers
+
+    def _submitted(self, chunk: list[Sequence[Job]]) -> Any:
+        return self._client.submit(run_jobs, self._opening, self._content, self._greeting, chunk, pure=False)
 
     def _wait_for_workers(self) -> None:
         """Warn where nobody takes the tasks; a cluster may begin workers when it has tasks, or bring back those it lost."""
@@ -325,8 +338,13 @@ class Cluster:
             warnings.warn(text, RuntimeWarning, stacklevel=users_level())
 
 
+def _error_in(result: Any) -> Any:
+    """The error of a task that failed, of which Dask has class, error and traceback."""
+    return result[1] if isinstance(result, tuple) and len(result) > 1 else result
+
+
 def _lost(what: str, why: Any) -> WorkerDied:
-    error = why[1] if isinstance(why, tuple) and len(why) > 1 else why  # Dask has (class, error, traceback)
+    error = _error_in(why)
     text = " ".join(str(error).split())[:160]
     return WorkerDied(
         f"{what} ({type(error).__name__}: {text}); finished results are kept, and the same command continues from them"
