@@ -28,7 +28,7 @@ from typing import Any, ClassVar
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
-from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError
+from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError, nearest
 from fpirhc.fields.checked import Checked, FoundByName, checked_call, mistakes_of
 from fpirhc.fields.kinds import call_of, described
 from fpirhc.fields.user_code import explained
@@ -44,7 +44,7 @@ from fpirhc.problem_files.settings import (
     with_settings,
 )
 from fpirhc.problem_files.shipped import find_problem
-from fpirhc.simulation.metrics import Metric, known_metrics, with_own_metrics
+from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.summary import line, table
 from fpirhc.task.cases import Cases
@@ -146,6 +146,13 @@ def load_problem(name_or_path: str | Path) -> Task:
         mistakes.raise_if_any()
         check_tuning(tuning, controllers)
         metrics = with_own_metrics(own)
+        if (
+            main is not None
+            and main != RELATIVE_ERROR
+            and not any(f"{main}.".startswith(f"{m.name}.") for m in metrics)
+        ):
+            known = nearest(main, [RELATIVE_ERROR, *(m.name for m in metrics)])
+            raise InvalidName(f"{_line_of(module, 'headline_metric')}metric '{main}' is unknown.{known}")
         assert problem is not None
         if cases is not None:
             cases.check(problem)

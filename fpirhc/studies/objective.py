@@ -9,12 +9,11 @@ from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.metrics import Metric, Metrics
+from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, Metrics
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 
 PENALTY = 10.0  # relative error that no run can exceed; one that ended early costs up to twice as much, less if it lasted long
-RELATIVE_ERROR = "relative error"
 _NO_METRIC = 1e12  # instead of `PENALTY` for a metric, whose size is not known
 
 

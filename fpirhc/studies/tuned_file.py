@@ -11,8 +11,8 @@ from typing import Any
 from fpirhc.errors import InvalidValue, Mistakes, ProblemFileError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import Values, with_settings
+from fpirhc.simulation.metrics import RELATIVE_ERROR
 from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.objective import RELATIVE_ERROR
 from fpirhc.whole_file import write_whole
 
 FORMAT = 1

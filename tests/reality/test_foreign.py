@@ -525,7 +525,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "an option": (lambda: loose(dead_times={}), "no field 'dead_times'. Did you mean 'dead_time'?"),
     "a dead time": (
         lambda: loose(dead_time=0.002),
-        "dead_time: expected {name: a finite number of at least 0}, got 0.002; give",
+        "dead_time: expected {name: a finite number of at least 0}, got 0.002; write",
     ),
     "a negative one": (
         lambda: task(reality=loose(dead_time={"u": -0.1})),

@@ -363,8 +363,10 @@ def test_figures_that_mean_nothing_are_refused(wrong, message):
 
 
 def test_a_signal_that_is_not_there_breaks_its_figure_alone():
-    metrics = fp.measure(problem(), run(0.0), [figures.Largest("comand.u"), figures.Nadir("command.u")])
+    several = figures.Nadir("state", name="several")  # its entries have units of their own
+    metrics = fp.measure(problem(), run(0.0), [figures.Largest("comand.u"), figures.Nadir("command.u"), several])
     assert metrics["nadir"][""] == 0.0
+    assert "name one of them, such as 'state.y'" in metrics.broken["several"]
     assert "metric 'largest'" in metrics.broken["largest"]
     assert "Did you mean 'command.u'?" in metrics.broken["largest"]
 

@@ -108,9 +108,16 @@ def test_baselines_have_it(task, folder):
     path.unlink()
 
 
-def test_a_problem_file_with_something_else_is_refused(tmp_path):
-    (tmp_path / "line.py").write_text(LINE + "\nmetrics = ('overshoot',)\n")
-    with pytest.raises(fp.FpirhcError, match=r"metrics must be a sequence of fpirhc\.Metric"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("metrics = ('overshoot',)", r"metrics must be a sequence of fpirhc\.Metric"),
+        ("headline_metric = 'rms_eror.y'", r"line \d+: metric 'rms_eror.y' is unknown\. Did you mean 'rms_error'"),
+    ],
+)
+def test_a_problem_file_with_something_else_is_refused(text, message, tmp_path):
+    (tmp_path / "line.py").write_text(f"{LINE}\n{text}\n")
+    with pytest.raises(fp.FpirhcError, match=message):
         fp.load_problem(str(tmp_path / "line.py"))
 
 

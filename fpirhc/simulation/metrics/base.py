@@ -32,6 +32,8 @@ Better = Literal["smaller", "larger", "neither"]
 Compared = Literal["banded", "tight", "exact", "not"]
 Function = Callable[[Problem, Run], float | Mapping[str, float] | None]
 
+RELATIVE_ERROR = "relative error"  # by which controllers are compared where no metric is named
+
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
 
 

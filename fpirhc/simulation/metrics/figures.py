@@ -143,7 +143,13 @@ def _figure(
     """The metric of one signal: `figure` of its values and the period, `unit` of its unit and that of time."""
 
     def function(problem: Problem, run: Run) -> float:
-        return float(figure(numbers(run, what)[measured_cycles(problem, run)], problem.period))
+        values = numbers(run, what)
+        if values.ndim > 1 and values.shape[1] > 1:
+            named = f", such as '{what}.{run.layout[what].elements[0]}'" if isinstance(what, str) else ""
+            raise InvalidValue(
+                f"expected one number in every cycle, got {values.shape[1]} of {what!r}; name one of them{named}"
+            )
+        return float(figure(values[measured_cycles(problem, run)], problem.period))
 
     whole = partial(_of_whole_runs, function)
     return Metric(
