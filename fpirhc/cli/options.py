@@ -89,6 +89,11 @@ def positive(text: str) -> float:
     return _number(text, text, lambda one: 0 < one < math.inf, "a number above 0")
 
 
+def share(text: str) -> float:
+    """A number above 0 and below 1."""
+    return _number(text, text, lambda one: 0 < one < 1, "a number above 0 and below 1")
+
+
 def add_mismatch(parser: Parser, default: float | None = 0.0, dead_times: str = "dead times likewise") -> None:
     """--mismatch PERCENT, with the same meaning for parameters wherever it stands; see `fpirhc.plant.plant`."""
     text = (
@@ -156,7 +161,7 @@ def add_json(parser: Parser, instead: str) -> None:
 def add_fails(parser: Parser) -> None:
     """--fails SHARE."""
     text = "rms error from which a run has failed, as a share of the reference's range (default: 0.5)"
-    parser.add_argument("--fails", type=float, default=argparse.SUPPRESS, metavar="SHARE", help=text)
+    parser.add_argument("--fails", type=positive, default=argparse.SUPPRESS, metavar="SHARE", help=text)
 
 
 def add_study(parser: Parser, folder: str, seeds: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study
+from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study, share
 from fpirhc.cli.output import publish, results_folder, study_settings
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -18,7 +18,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     add_controllers(parser)
     for name, text in _SHARES.items():
-        parser.add_argument(f"--{name}", type=float, default=argparse.SUPPRESS, metavar="SHARE", help=text)
+        parser.add_argument(f"--{name}", type=share, default=argparse.SUPPRESS, metavar="SHARE", help=text)
     add_fails(parser)
     add_study(parser, "robust", "the draws and the noise")
 
