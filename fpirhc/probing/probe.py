@@ -26,7 +26,7 @@ from fpirhc.simulation.trials import errors_of, weighed
 from fpirhc.summary import line, number, table
 from fpirhc.task.problem import Problem
 
-_FEWEST = 40
+_FEWEST, _USUAL = 40, 300
 _MORE, _AGAIN = 2.5, 2  # factor of the amplitude where a sign is not certain, and how often it is applied
 _CLIPPED = 0.2  # share of the cycles at a limit, from which it is said
 
@@ -122,7 +122,7 @@ def probe(
     problem: Problem,
     controller: Controller,
     *,
-    cycles: Count = 300,
+    cycles: Count | None = None,
     amplitude: float | Mapping[str, float] | None = None,
     recording: str | Path | None = None,
     chatter: float | Mapping[str, float] | None = None,
@@ -140,25 +140,25 @@ def probe(
     Args:
         problem: with the plant that is to be probed, mostly an `ExternalPlant`.
         controller: that keeps it safe.
-        cycles: of the excitation, 50 to 500.
+        cycles: of the excitation, 50 to 500; None: 300.
         amplitude: of the sequence, in the unit of the response, by controlled quantity or one for all; 0 only listens. None: twice
             the noise and a tenth of the deviation of the desired response, both in a first run without it; where the sign of a
             gain is not certain with that, 2.5 times as much, and once more.
-        recording: CSV file in place of runs, with the columns "time", every input, and what is measured.
+        recording: CSV file in place of runs, without `cycles` and `amplitude`; its columns are "time", every input, and what is
+            measured.
         chatter: largest rms step of the command per cycle, in the input's unit, by input or one for all; None: 1.5 times that of
             the controller alone, or 2 % of the input's range.
         trials: whether candidates are tried on the plant; False on a machine that must not be risked.
         seed: of sequence and runs.
 
     Raises:
-        InvalidValue: too few cycles, a record in which nothing moves, an amplitude that is negative.
+        InvalidValue: too few cycles, a record in which nothing moves, an amplitude that is negative, settings of an excitation
+            beside a recording.
         FpirhcError: every error that the controller raises about the problem.
     """
     _check(problem, amplitude, chatter)
-    if recording is None and cycles < _FEWEST:
-        raise InvalidValue(
-            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {_FEWEST}, 300 are usual"
-        )
+    _check_excitation(cycles, amplitude, recording)
+    cycles = _USUAL if cycles is None else cycles
     bare = without_deformation(resolved(problem, controller))
     estimates, notes = _recorded(problem, bare, cycles, amplitude, recording, seed)
     trying = trials and recording is None
@@ -289,6 +289,18 @@ def _check(
             wrong = value is not None and not least_value <= value < np.inf
             if wrong:
                 raise InvalidValue(f"probe({what}={value!r}): expected a number {least}, in the unit of the signal")
+
+
+def _check_excitation(
+    cycles: int | None, amplitude: float | Mapping[str, float] | None, recording: str | Path | None
+) -> None:
+    for name, given in (("cycles", cycles), ("amplitude", amplitude)):
+        if recording is not None and given is not None:
+            raise InvalidValue(f"{name} is of an excitation, and a recording has been excited: leave one of them out")
+    if cycles is not None and cycles < _FEWEST:
+        raise InvalidValue(
+            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {_FEWEST}, {_USUAL} are usual"
+        )
 
 
 def _interval(one: Interval) -> str:

@@ -398,7 +398,7 @@ review mine.py --mismatch nan => --mismatch: expected percent of at least 0, suc
 compare mine.py --headline rms_error => has a number for every coordinate; give one: 'rms_error.NAME'
 compare mine.py --headline rms_error.angel => is unknown. Did you mean 'rms_error.angle'?
 compare mine.py --headline max_error.phi => is unknown. Did you mean 'max_error.angle'? Valid: max_error.angle.
-compare mine.py --headline effort.torque => metric 'effort' has no better direction
+compare mine.py --headline effort.torque => metric 'effort.torque' has no better direction
 compare mine.py --headline '' => metric '' is unknown. Valid: relative error, cycles, rms_error
 compare mine.py --tuned gone.json => 'gone.json': No such file ... 'fpirhc tune mine' writes such a file
 compare mine.py --scenarios 0 => --scenarios: expected a whole number of at least 1, got '0'.
@@ -470,7 +470,7 @@ export two_mass CTC --out o --live gain =>
 compare two_mass --tuned notes.txt => 'notes.txt' is not a file that 'fpirhc tune' wrote
 replay two_mass CTC short.csv => recording short.csv: line 2 has 1 entries, the line of names 2
 probe mine.py --recording words.csv --cycles 7 =>
-    --cycles is of an excitation, and a --recording has been excited: leave one of them out
+    cycles is of an excitation, and a recording has been excited: leave one of them out
 replay mine.py RHC words.csv --out words.csv => --out words.csv is the recording itself, which would be lost
 probe mine.py --recording words.csv => recording words.csv: line 4 is not made of numbers: 0, abc
 """

@@ -369,6 +369,8 @@ def test_a_wrong_recording_says_what_is_wrong(tmp_path, text, words):
         ({"chatter": 0.0}, "expected a number above 0"),
         ({"chatter": {"q": 1.0}}, "'q' is unknown"),
         ({"recording": "nowhere.csv"}, "cannot be read"),
+        ({"recording": "run.csv", "cycles": 300}, "^cycles is of an excitation, and a recording has been excited"),
+        ({"recording": "run.csv", "amplitude": 0.0}, "^amplitude is of an excitation"),
     ],
 )
 def test_wrong_arguments_are_refused(arguments, words):

@@ -14,14 +14,12 @@ if TYPE_CHECKING:
     from fpirhc.controllers.base import Controller
     from fpirhc.probing.probe import Probe
 
-_CYCLES = 300
-
 
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
     text = "controller that keeps the plant safe, without its deformation (default: the first one)"
     parser.add_argument("--controller", metavar="NAME", help=text)
-    parser.add_argument("--cycles", type=int, metavar="N", help=f"of the excitation (default: {_CYCLES})")
+    parser.add_argument("--cycles", type=int, metavar="N", help="of the excitation (default: 300)")
     text = "of the excitation, in the unit of the response (default: by noise and desired response); 0 only listens"
     parser.add_argument("--amplitude", type=float, metavar="A", help=text)
     text = "CSV file of a run, in place of runs: time, inputs, and what is measured"
@@ -37,20 +35,14 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.problem_files.problem_file import load_problem
 
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
-    from fpirhc.errors import InvalidValue
     from fpirhc.probing.probe import probe
     from fpirhc.studies.comparison.compare import select
 
-    for name in ("cycles", "amplitude"):
-        if options.recording is not None and getattr(options, name) is not None:
-            raise InvalidValue(
-                f"--{name} is of an excitation, and a --recording has been excited: leave one of them out"
-            )
     name, controller = _probed(select(task, None if options.controller is None else [options.controller]))
     answer = probe(
         task.problem,
         controller,
-        cycles=_CYCLES if options.cycles is None else options.cycles,
+        cycles=options.cycles,
         amplitude=options.amplitude,
         recording=options.recording,
         chatter=options.chatter,
