@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.adapters.names import adapter, counterparts, derivatives, steps_per_cycle
 from fpirhc.errors import Mistakes, package
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
@@ -23,7 +24,13 @@ _STEP, _PULL, _COORDINATES = 1e-3, 2.0, ("x", "y", "heading")  # s; 1/s of the s
 
 @adapter
 def commonroad_body(
-    kind: str, model: Plant, *, period: float, speed: float, vehicle: int = 2, names: Mapping[str, str] | None = None
+    kind: str,
+    model: Plant,
+    *,
+    period: float,
+    speed: NotNegative,
+    vehicle: int = 2,
+    names: Mapping[str, str] | None = None,
 ) -> ExternalPlant:
     """Return a car as a reality; it starts at the origin, along x.
 
@@ -32,16 +39,19 @@ def commonroad_body(
         model: the controller's model, of order 2 at most, with time in s.
         period: of the problem, s; a whole number of ms.
         speed: at the start, m/s, which the car holds where the model has no input `acceleration`.
-        vehicle: number of the package's set of parameters; 2 is a BMW 320i.
+        vehicle: number of the package's set of parameters, 1 to 4; 2 is a BMW 320i.
         names: coordinate -> "x", "y" or "heading", input -> "steer" or "acceleration", where the names differ.
 
     Raises:
         NotSupported: commonroad-vehicle-models is not installed.
-        InvalidProblem: a name that the car or the model does not have, or a period that is no whole number of ms.
+        InvalidField: a speed below zero.
+        InvalidProblem: a name that the car or the model does not have, a number of no vehicle, or a period that is no
+            whole number of ms.
     """
     units, mistakes, counterpart = quantities(model), Mistakes("commonroad_body"), names or {}
     parts = derivatives(mistakes, units)
     mistakes.unknown("kind", [kind], ("st", "std"))
+    mistakes.unknown("vehicle", [str(vehicle)], "1234")
     own = dict.fromkeys(name for name, _ in parts.values())
     mistakes.unknown("names: name of the model", counterpart, [*own, *model.inputs])
     shown = counterparts(mistakes, "coordinate", own, {n: v for n, v in counterpart.items() if n in own}, _COORDINATES)

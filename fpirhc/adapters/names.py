@@ -116,7 +116,7 @@ def counterparts(
     mistakes: Mistakes, what: str, own: Iterable[str], given: Mapping[str, str], valid: Iterable[str]
 ) -> dict[str, str]:
     """Return the name outside of each own name: the given one, or the same; names that either side does not have are mistakes."""
-    own, valid = tuple(own), tuple(valid)
+    own, valid = tuple(dict.fromkeys(own)), tuple(valid)
     mistakes.unknown(f"{what}s: name of the model", given, own)
     found = {name: given.get(name, name) for name in own}
     mistakes.unknown(what, found.values(), valid)

@@ -14,14 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, require_seconds
+from fpirhc.adapters.names import adapter, finite_numbers, require_seconds
 from fpirhc.errors import Mistakes, package
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
 
 _SEEN = [name + dash for dash in ("", "'", "''") for name in ("x", "y", "z")]
 _State = dict[str, np.ndarray]
 _SENT = ("thrust_x", "thrust_y", "thrust_z")
+_NEEDED = (  # parameters of a vehicle for which the package has no value of its own
+    *("mass", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz", "num_rotors", "rotor_pos", "rotor_directions"),
+    *("rotor_speed_min", "rotor_speed_max", "k_eta", "k_m", "tau_m"),
+)
 
 
 @adapter
@@ -31,7 +36,7 @@ def rotorpy_body(
     period: float,
     start: Mapping[str, float] | None = None,
     wind: Sequence[float] = (0.0, 0.0, 0.0),
-    payload: float = 0.0,
+    payload: NotNegative = 0.0,
     vehicle: Mapping[str, Any] | None = None,
 ) -> ExternalPlant:
     """Return a quadrotor as a reality.
@@ -46,7 +51,9 @@ def rotorpy_body(
 
     Raises:
         NotSupported: RotorPy is not installed.
-        InvalidProblem: the model has other names.
+        InvalidField: a payload below zero.
+        InvalidValue: a wind that is not of three finite numbers.
+        InvalidProblem: the model has other names, or the vehicle lacks parameters.
     """
     require_seconds("rotorpy_body", model)
     mistakes = Mistakes("rotorpy_body")
@@ -55,10 +62,16 @@ def rotorpy_body(
     mistakes.unknown("start: quantity", start or {}, _SEEN[:6])
     for name in (name for name in (*_SEEN[:3], *_SENT) if name not in (*model.coordinates, *model.inputs)):
         mistakes.add(f"the model has no {name}; it needs x, y, z and thrust_x, thrust_y, thrust_z")
+    lacking = [name for name in _NEEDED if name not in (_NEEDED if vehicle is None else vehicle)]
+    if lacking:
+        mistakes.add(
+            f"the vehicle lacks {', '.join(lacking)}; change a set of the package: {{**quad_params, 'mass': 1.0}}"
+        )
     mistakes.raise_if_any()
+    air = finite_numbers("rotorpy_body: wind", wind, _SEEN[:3])
     parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
     at = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
-    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": np.array(wind), **_hovering(parameters)}
+    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": air, **_hovering(parameters)}
     loaded = {**deepcopy(parameters), "mass": parameters["mass"] + payload}
     multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
     flown = multirotor(loaded, initial_state=first, control_abstraction="cmd_acc", aero=True)
