@@ -89,14 +89,25 @@ def explained(error: BaseException) -> str:
     symbols = re.search(r"\b(SX|MX|to_double|to_int|new_SX|new_MX)\b", text) is not None
     if re.search(r"\bMX\b", text) and re.search(r"\bSX\b", text):
         return "the symbols here are of the kind SX, which cannot be mixed with MX; use them, numbers and functions of ca alone"
-    if isinstance(error, AttributeError) and is_dataclass(error.obj):
-        valid = [one.name for one in fields(error.obj)]
-        return f"a {type(error.obj).__name__} has no '{error.name}'.{nearest(error.name, valid)}"
+    if missing := _missing_name(error):
+        return missing
     if symbols and call is not None:
         return f"{call.group(0)} cannot act on a symbol; {_instead(call.group(3))}"
     if symbols and re.search(r"\b(float|int|range|round)\(", line):
         return "a symbol has no value yet, so it cannot become a Python number; keep it as an expression"
     return f"{type(error).__name__}: {_first_line(text)}"
+
+
+def _missing_name(error: BaseException) -> str:
+    """What is said of a field that a value does not have, or of a name that a module does not have; '' for another error."""
+    if isinstance(error, AttributeError) and is_dataclass(error.obj):
+        valid = [one.name for one in fields(error.obj)]
+        return f"a {type(error.obj).__name__} has no '{error.name}'.{nearest(error.name, valid)}"
+    found = re.match(r"cannot import name '(\w+)' from '([\w.]+)'", f"{error}")
+    if not isinstance(error, ImportError) or found is None or found[2] not in sys.modules:
+        return ""
+    names = [one for one in dir(sys.modules[found[2]]) if not one.startswith("_")]
+    return f"{found[2]} has no name '{found[1]}'.{nearest(found[1], names)}"
 
 
 def place_in_users_code(error: BaseException) -> str:

@@ -345,7 +345,7 @@ OTHERS = {
     "name that a neighbour lacks": Wrong(
         PENDULUM,
         (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
-        ("mine.py, line 5", "cannot import name 'LENGTH' from 'helper'"),
+        ("mine.py, line 5", "helper has no name 'LENGTH'. Did you mean 'LENGHT'?"),
         beside={"helper.py": "LENGHT = 1.0\n"},
     ),
     "equations of MATLAB": Wrong("function dx = f(t, x)\n", (), ("mine.py, line 1: invalid syntax",)),
