@@ -87,6 +87,7 @@ class Cases(Checked):
         *,
         needed: Sequence[str] = (),
         words: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+        bounds: Mapping[str, tuple[float, float]] = MappingProxyType({}),
     ) -> Cases:
         """Return the cases of a table: a row each, named in the column 'case', with a path as the head of every other column.
 
@@ -97,12 +98,14 @@ class Cases(Checked):
             path: of the file; a relative one begins at the folder of the file that calls this.
             needed: heads of columns that must be there, filled in every row.
             words: by head of a column, the words of its cells and the number that each means: {"exact.sex": {"m": 0, "f": 1}}.
+            bounds: by head of a column, the least and the largest number of its cells, for a file that computes with them before
+                a problem checks them.
 
         Raises:
             InvalidProblem: the file cannot be read, or all mistakes in its form together, each with row and column.
         """
         place = Path(path)
-        return _read(cls, place if place.is_absolute() else users_folder() / place, needed, words)
+        return _read(cls, place if place.is_absolute() else users_folder() / place, needed, words, bounds)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -372,7 +375,11 @@ def _check_number(value: object, bounds: tuple[float, float] | None = None, unit
 
 
 def _read(
-    make: Callable[..., Cases], path: Path, needed: Sequence[str], words: Mapping[str, Mapping[str, float]]
+    make: Callable[..., Cases],
+    path: Path,
+    needed: Sequence[str],
+    words: Mapping[str, Mapping[str, float]],
+    bounds: Mapping[str, tuple[float, float]],
 ) -> Cases:
     """The cases of a file; places of mistakes are its rows and columns, counted from 1."""
     lines = _lines(path)
@@ -399,6 +406,8 @@ def _read(
                 try:
                     filled = cell or column in needed
                     changes[name] |= {column: _cell(column, cell, words.get(column))} if filled else {}
+                    if filled and column in bounds:
+                        _check_number(changes[name][column], bounds[column])
                 except ValueError as error:
                     mistakes.add(f"row {number} ({name}), column '{column}': {error}")
     mistakes.raise_if_any()

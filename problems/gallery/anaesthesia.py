@@ -122,4 +122,5 @@ tuning = {
     "CTC": {"tracking.rate": fp.LogSpan(0.5, 5.0)},  # 1/min
     "CTC+FPI": {"tracking.rate": fp.LogSpan(0.5, 5.0), "deformation.gain": fp.LogSpan(-6.0, -0.5)},
 }
-cases = fp.Cases.from_csv("anaesthesia_patients.csv")  # the curves of 44 patients, with this man's kinetics
+# The curves of 44 patients, with this man's kinetics.
+cases = fp.Cases.from_csv("anaesthesia_patients.csv", needed=[f"exact.{name}" for name in plant.parameters])

@@ -35,9 +35,6 @@ A pump adds insulin and takes none away, and a dose acts for hours: what is too 
 controller is a plan with a filter, and an iteration may only move its target, slowly. `diabetes_announced` shows what fails.
 """
 
-import csv
-from pathlib import Path
-
 import casadi as ca
 
 import fpirhc as fp
@@ -76,6 +73,20 @@ RATES = (
     "ksc",
 )
 UNITS |= dict.fromkeys(RATES, "1/min")
+POSSIBLE = {  # numbers of a person, by unit
+    "kg": (2.0, 300.0),
+    "mg/kg": (20.0, 2000.0),
+    "l/kg": (0.005, 0.5),
+    "dl/kg": (0.5, 5.0),
+    "pmol/l": (1.0, 2000.0),
+    "1": (0.001, 0.999),
+    "mg/kg/min": (0.01, 100.0),
+    "mg l/kg/min/pmol": (1e-4, 1.0),
+    "1/min": (1e-5, 10.0),
+    "mg/dl": (40.0, 400.0),
+    "U/h": (0.01, 20.0),
+}
+TABLE = UNITS | {"Gb": "mg/dl", "basal": "U/h"}
 BODY = {
     "solid": "mg",
     "liquid": "mg",
@@ -172,9 +183,10 @@ def at_rest(k, glucose, basal):
     return body, k["kp2"] * Gp + k["kp3"] * insulin + lost + k["k1"] * Gp - k["k2"] * Gt
 
 
-with Path(__file__).with_name("diabetes_people.csv").open() as file:
-    rows = csv.DictReader(line for line in file if not line.startswith("#"))
-    PEOPLE = {row.pop("person"): {name: float(value) for name, value in row.items()} for row in rows}
+table = fp.Cases.from_csv(
+    "diabetes_people.csv", needed=list(TABLE), bounds={name: POSSIBLE[unit] for name, unit in TABLE.items()}
+)
+PEOPLE = table.changes
 
 
 def group_of(name):
@@ -266,7 +278,7 @@ controllers = {
     ),
 }
 headline = ("RHC", "RHC+FPI on the target")
-cases = fp.Cases({name: changes(name) for name in PEOPLE})
+cases = fp.Cases({name: changes(name) for name in PEOPLE}, places=table.places)
 GLUCOSE = "plant_output.glucose"
 metrics = (
     fp.figures.InBand(GLUCOSE, 70.0, 180.0, name="in_range"),

@@ -179,6 +179,8 @@ def test_a_table_may_have_words_and_columns_that_every_case_needs(task):
         InvalidProblem, match=r"row 3 \(two\), column 'group': it is empty; expected the name of a group"
     ):
         fp.Cases.from_csv(written("case,group\none,old\ntwo,\n").resolve(), needed=["group"])
+    with pytest.raises(InvalidProblem, match=r"row 2 \(one\), column 'exact\.b': expected 1 to 3, got 0\.9"):
+        fp.Cases.from_csv(written("case,exact.b\none,0.9\n").resolve(), bounds={"exact.b": (1.0, 3.0)})
     with pytest.raises(InvalidField, match=r"from_csv\.needed: expected .*, got the text 'exact\.b'"):
         fp.Cases.from_csv(written("case,exact.b\none,0.9\n").resolve(), needed="exact.b")
 
@@ -508,33 +510,35 @@ def test_wrong_commands(options, message, task, capsys):
     assert message in capsys.readouterr().err
 
 
-# --- The shipped table of patients ------------------------------------------------------------------------------------
+# --- The shipped tables of people -------------------------------------------------------------------------------------
 
-FIRST_CURVE = "patient 01,elderly,2.367,91.1,6.722,1.793"
-WRONG_PATIENTS = {
-    "a misspelt column": (
-        "exact.C50",
-        "exact.EC50",
-        r"column 'exact\.EC50': .* Did you mean 'C50'\? Valid: ke0, E0, C50",
-    ),
-    "no column of names": ("case,group", "group", r"row 3: there is no column 'case'"),
-    "a cell too few": (FIRST_CURVE, FIRST_CURVE.replace("91.1,", ""), "row 4: it has 5 cells, expected 6"),
-    "a negative concentration": (
-        "6.722",
-        "-6.722",
-        r"row 4 \(patient 01\), column 'exact\.C50': expected 0\.5 to 20 mg/l, got -6\.722",
-    ),
-    "a word": ("6.722", "unknown", r"row 4 \(patient 01\), column 'exact\.C50': expected a number, .* got 'unknown'"),
+CURVE, TEENAGER = "patient 01,elderly,2.367,91.1,6.722,1.793", "adolescent#003,44.791,0.046752"
+WRONG_PEOPLE = {
+    "anaesthesia_patients": {
+        "exact.C50 -> exact.EC50": r"row 3: there is no column 'exact\.C50', .* Did you mean 'exact\.EC50'\?",
+        "case,group -> group": r"row 3: there is no column 'case'",
+        f"{CURVE} -> {CURVE.replace('91.1,', '')}": "row 4: it has 5 cells, expected 6",
+        "6.722 -> -6.722": r"row 4 \(patient 01\), column 'exact\.C50': expected 0\.5 to 20 mg/l, got -6\.722",
+        "6.722 -> unknown": r"row 4 \(patient 01\), column 'exact\.C50': expected a number, .* got 'unknown'",
+    },
+    "diabetes_people": {
+        "case,BW -> case,mass": r"row 3: there is no column 'BW', which every case needs",
+        f"{TEENAGER} -> adolescent#003,-65,0.046752": r"row 6 \(adolescent#003\), column 'BW': expected 2 to 300, got -65",
+        f"{TEENAGER} -> adolescent#003,44.791,": r"row 6 \(adolescent#003\), column 'kabs': it is empty",
+        "145.9,0.6477 -> -9,0.6477": r"row 6 \(adolescent#003\), column 'Gb': expected 40 to 400, got -9",
+    },
 }
 
 
-@pytest.mark.parametrize("wrong", WRONG_PATIENTS)
-def test_wrong_patients(wrong, tmp_path):
-    """A curve that no patient can have is refused before a run: its row, its column, and what was expected."""
-    patients = Path(fp.__file__).parents[1] / "problems" / "gallery" / "anaesthesia_patients.csv"
-    right, other, message = WRONG_PATIENTS[wrong]
-    text = patients.read_text()
+@pytest.mark.parametrize(
+    ("table", "change", "message"), [(table, *one) for table, all_ in WRONG_PEOPLE.items() for one in all_.items()]
+)
+def test_wrong_people(table, change, message, tmp_path):
+    """A person who cannot be is refused before a run: row, column, and what was expected."""
+    gallery, problem = Path(fp.__file__).parents[1] / "problems" / "gallery", f"{table.partition('_')[0]}.py"
+    (tmp_path / problem).write_text((gallery / problem).read_text())
+    text, (right, other) = (gallery / f"{table}.csv").read_text(), change.split(" -> ")
     assert right in text
-    (tmp_path / "cases.csv").write_text(text.replace(right, other, 1))
-    with pytest.raises(InvalidProblem, match=message):
-        fp.Cases.from_csv(tmp_path / "cases.csv").check(fp.load_problem("anaesthesia").problem)
+    (tmp_path / f"{table}.csv").write_text(text.replace(right, other, 1))
+    with pytest.raises((InvalidProblem, ProblemFileError), match=message):
+        in_case(fp.load_problem(str(tmp_path / problem)), "patient 01")
