@@ -58,7 +58,8 @@ class Cases(Checked):
         places: where cases stand in a file, by name, for messages.
 
     Raises:
-        InvalidProblem: all mistakes together: no case, a name that is no text, changes that are no mapping, a wrong group or seed.
+        InvalidProblem: all mistakes together: no case, a name that is no text, changes that are no mapping, a wrong group or seed,
+            a number that a case sets twice.
     """
 
     _where: ClassVar[str] = "cases"  # first words of a message
@@ -322,7 +323,8 @@ def _check_change(problem: Problem, changes: Mapping[str, object], path: str) ->
         meant = _meant(problem, path.rpartition(".")[2]) or nearest(word, [*_WORDS, *paths])
         raise InvalidName(f"the problem has no '{path}'.{meant}")
     parent, _, last = path.rpartition(".")
-    if parent == "dead_time.inputs" and last in problem.plant.inputs and last not in problem.dead_time.inputs:
+    if parent == "dead_time.inputs" and last not in problem.dead_time.inputs:
+        _check_name(f"'{parent}.NAME' has an input", last, problem.plant.inputs)
         stated = {**problem.dead_time.inputs, last: 0.0}
         raise InvalidName(
             f"the problem states no dead time of '{last}'; write dead_time=fp.DeadTime(inputs={stated}) there"

@@ -398,6 +398,7 @@ WRONG_PATHS: dict[str, tuple[Any, str]] = {
         {"dead_time.inputs.u": 0.1},
         r"write dead_time=fp.DeadTime\(inputs={'u': 0.0}\)",
     ),
+    "a dead time of no input": ({"dead_time.inputs.x": 0.1}, r"has an input, and there is no 'x'\. Valid: u"),
     "a parameter twice": ({"exact.b": 1.0, "known.b": 2.0}, r"'known.b' and 'exact.b' set the same number"),
     "an interval and its end": (
         {"limits.inputs.u.1": 9.0, "limits.inputs.u": (-3.0, 3.0)},
