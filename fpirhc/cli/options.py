@@ -15,6 +15,12 @@ def add_problem(parser: Parser) -> None:
     parser.add_argument("problem", metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")
 
 
+def add_controller(parser: Parser) -> None:
+    """CONTROLLER."""
+    text = "name of a controller of the problem; 'fpirhc review PROBLEM' lists them"
+    parser.add_argument("controller", metavar="CONTROLLER", help=text)
+
+
 def add_out(parser: Parser, default: str = "results/PROBLEM") -> None:
     """--out FOLDER."""
     parser.add_argument("--out", metavar="FOLDER", help=f"folder for the results (default: {default})")

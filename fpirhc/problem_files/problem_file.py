@@ -244,7 +244,8 @@ def _headline(module: ModuleType, controllers: Mapping[str, Controller], mistake
         )
         return None
     pair, line = (headline[0], headline[1]), _line_of(module, "headline")
-    mistakes.unknown(f"{line}headline: controller", pair, controllers)
+    if controllers:  # else that there are none is the mistake
+        mistakes.unknown(f"{line}headline: controller", pair, controllers)
     if mistakes.none and (wrong := not_a_pair(controllers, pair)):
         mistakes.add(f"{line}{wrong}")
     return pair

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from fpirhc.cli.options import add_problem, whole
+from fpirhc.cli.options import add_controller, add_problem, whole
 from fpirhc.cli.verb import ExitCode, Verb
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
-    parser.add_argument("controller", metavar="CONTROLLER", help="name of a controller in the problem file")
+    add_controller(parser)
     parser.add_argument(
         "--to",
         metavar="TARGET",

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from fpirhc.cli.options import add_json, add_problem
+from fpirhc.cli.options import add_controller, add_json, add_problem
 from fpirhc.cli.verb import ExitCode, Verb
 
 
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
-    parser.add_argument("controller", metavar="CONTROLLER", help="name of a controller of the problem")
+    add_controller(parser)
     text = "CSV file: time, what the controller is given, and the inputs that were sent where they are known"
     parser.add_argument("recording", type=Path, metavar="FILE", help=text)
     parser.add_argument("--out", type=Path, metavar="FILE", help="CSV file for the commands")

@@ -7,7 +7,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.cli.options import add_mismatch, add_no_compile, add_out, add_problem, add_seed, add_set, numbers, whole
+from fpirhc.cli.options import (
+    add_controller,
+    add_mismatch,
+    add_no_compile,
+    add_out,
+    add_problem,
+    add_seed,
+    add_set,
+    numbers,
+    whole,
+)
 from fpirhc.cli.output import results_folder
 from fpirhc.cli.verb import ExitCode, Verb
 
@@ -23,7 +33,7 @@ _SETPOINT = "setpoints."  # before a coordinate, in place of the path of a setti
 
 def _add(parser: argparse.ArgumentParser) -> None:
     add_problem(parser)
-    parser.add_argument("controller", metavar="CONTROLLER", help="name of a controller in the problem file")
+    add_controller(parser)
     add_out(parser)
     add_seed(parser, "the noise")
     add_no_compile(parser)
