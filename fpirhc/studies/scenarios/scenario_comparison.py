@@ -169,12 +169,14 @@ def _flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float 
 def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
     """The controllers, what is worst of them first."""
     figure, directed = comparison.figure, [c for c in comparison.columns if c.metric.better != "neither"]
+    # a terminal has room for few: those of a file that judges by a figure, such as the lowest value beside the time in a range
+    beside = [c for c in directed if figure.metric and c.metric.headline and c.metric is not figure.metric]
     heads = (
         Column("controller"),
         Column(f"worst {figure.noun}", "worst"),
         Column(f"in {noun(comparison.named).removesuffix('s')}", "in" if comparison.named else None),
         Column("failures", "failed"),
-        *(Column(f"worst {c.short}", None) for c in directed),
+        *(Column(f"worst {c.short}", "" if c in beside else None) for c in directed),
         Column(f"median {figure.noun}", "median"),
         Column("difference (95 %)"),
         Column("ratio"),
@@ -187,8 +189,8 @@ def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
     for one in comparison.summaries:
         worst = [_number(c, one.worst_metrics) for c in directed]
         medians = [_number(c, one.metrics) for c in comparison.columns]
-        beside = [figure.text(one.median), *_beside(one, figure)]
-        table.add([one.name, *_worst(one, figure), *worst, *beside, *medians, status_shares(one.statuses)])
+        compared = [figure.text(one.median), *_beside(one, figure)]
+        table.add([one.name, *_worst(one, figure), *worst, *compared, *medians, status_shares(one.statuses)])
     return table
 
 
