@@ -230,6 +230,7 @@ def _page(device: Device, interface: Interface, variables: list[Variable], conte
     return f"""# {device.title}
 
 `{device.name}.fmu` is a unit of FMI {interface.version} for co-simulation, with sources. Libraries in it: {libraries}.
+Whoever builds the sources leaves fused multiplications out (gcc and clang: -ffp-contract=off), or the last bits are others.
 
 - A communication step is one period, {float(device.problem.period)!r} {unit}; every other step is refused.
 - A command follows from the inputs of its own cycle: set the inputs, get the commands, then take the step. A master that exchanges

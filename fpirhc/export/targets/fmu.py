@@ -28,7 +28,9 @@ def _structure(root: ET.Element, computed: list[int]) -> None:
 def _build(_: ET.Element, name: str, files: list[str]) -> Mapping[str, ET.Element]:
     root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     configuration = ET.SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    listed = ET.SubElement(configuration, "SourceFileSet", language="C99")
+    listed = ET.SubElement(
+        configuration, "SourceFileSet", language="C99", compiler="gcc", compilerOptions="-ffp-contract=off"
+    )
     for file in files:
         ET.SubElement(listed, "SourceFile", name=file)
     return {"sources/buildDescription.xml": root}

@@ -1,6 +1,8 @@
 /* @title@ as a level-2 S-function. Made by fpirhc.
 
-       mex -I. @name@_sfun.c @sources@
+       mex CFLAGS='$CFLAGS -ffp-contract=off' -I. @name@_sfun.c @sources@
+
+   Without fused multiplications the bits are those of fpirhc; Microsoft's compiler has /fp:precise for it, its default.
 
    Input ports, in this order: @ports@. Output ports: the command, its status (0: OK).
    Parameters of the block, in this order: @settings@.
