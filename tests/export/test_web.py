@@ -90,9 +90,9 @@ def tools() -> None:
 @pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 @pytest.mark.parametrize("name", CASES)
 def test_webassembly_has_the_commands_of_this_machine_bit_by_bit(name, tmp_path):
-    """2000 cycles with faults, and the commands are those of Python to 1e-9 of their size."""
-    exported(name, tmp_path / "wasm", "wasm")
-    exported(name, tmp_path / "c", "c")
+    """Ten thousand cycles with faults, and the commands are those of Python to 1e-9 of their size."""
+    exported(name, tmp_path / "wasm", "wasm", cycles=10_000)
+    exported(name, tmp_path / "c", "c", cycles=10_000)
     done = subprocess.run(
         [str(shutil.which("node")), str(tmp_path / "wasm" / "replay.mjs")], capture_output=True, text=True, check=False
     )
