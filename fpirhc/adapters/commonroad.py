@@ -21,16 +21,13 @@ from fpirhc.task.external_plant import ExternalPlant, quantities
 
 _STEP, _PULL, _COORDINATES = 1e-3, 2.0, ("x", "y", "heading")  # s; 1/s of the speed's error; in the order of `_moved`
 
+_Names = Mapping[str, str] | None
+_Read = list[tuple[int, int]]  # order and coordinate of every number that is measured
+
 
 @adapter
 def commonroad_body(
-    kind: str,
-    model: Plant,
-    *,
-    period: float,
-    speed: NotNegative,
-    vehicle: int = 2,
-    names: Mapping[str, str] | None = None,
+    kind: str, model: Plant, *, period: float, speed: NotNegative, vehicle: int = 2, names: _Names = None
 ) -> ExternalPlant:
     """Return a car as a reality; it starts at the origin, along x.
 
@@ -58,21 +55,19 @@ def commonroad_body(
     sent = {n: v for n, v in counterpart.items() if n in model.inputs}
     inputs = counterparts(mistakes, "input", model.inputs, sent, ("steer", "acceleration"))
     mistakes.raise_if_any()
+    read = [(order, _COORDINATES.index(shown[name])) for name, order in parts.values()]
     count = steps_per_cycle("commonroad_body", model, period, _STEP)
-    body = _Car(kind, speed, vehicle, count, tuple(inputs.values()))
-    body.read = [(order, _COORDINATES.index(shown[name])) for name, order in parts.values()]
-    return ExternalPlant(body, measures=units, period=period)
+    return ExternalPlant(_Car(kind, speed, vehicle, count, [*inputs.values()], read), measures=units, period=period)
 
 
 class _Car:
     """The package's derivative, integrated by Runge-Kutta steps of 1 ms. `kind`: "st" or "std"."""
 
-    def __init__(self, kind: str, speed: float, vehicle: int, steps: int, inputs: tuple[str, ...]) -> None:
+    def __init__(self, kind: str, speed: float, vehicle: int, steps: int, inputs: list[str], read: _Read) -> None:
         names = f"vehicle_dynamics_{kind}", f"init_{kind}", f"parameters_vehicle{vehicle}"
         of: list[Any] = [getattr(package(f"vehiclemodels.{name}", "outside"), name) for name in names]
         self._rate, self._start, self._car = of[0], of[1], of[2]()
-        self._kind, self._speed, self._steps, self._inputs = kind, speed, steps, inputs
-        self.read: list[tuple[int, int]] = []
+        self._kind, self._speed, self._steps, self._inputs, self._read = kind, speed, steps, inputs, read
 
     def reset(self, _seed: int) -> np.ndarray:
         """Straight on at the speed; there is nothing random."""
@@ -88,13 +83,10 @@ class _Car:
         for _ in range(self._steps):
             pull = sent.get("acceleration", np.clip(_PULL * (self._speed - self._x[3]), -5.0, 5.0))
             self._x = self._x + _STEP * self._mean_rate([turn, pull])
-        now = self._moved()
-        return self._measured(now, (now - before) / span)
+        return self._measured(self._moved(), (self._moved() - before) / span)
 
     def _mean_rate(self, u: list[float]) -> np.ndarray:
-        def rate(x: np.ndarray) -> np.ndarray:
-            return np.array(self._rate(list(x), u, self._car))
-
+        rate = lambda x: np.array(self._rate(list(x), u, self._car))  # noqa: E731
         k1 = rate(self._x)
         k2 = rate(self._x + _STEP / 2 * k1)
         k3 = rate(self._x + _STEP / 2 * k2)
@@ -106,5 +98,4 @@ class _Car:
         return np.array([v * np.cos(heading + slip), v * np.sin(heading + slip), turn])
 
     def _measured(self, rates: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
-        values = self._x[[0, 1, 4]], rates, accelerations
-        return np.array([values[order][place] for order, place in self.read])
+        return np.array([(self._x[[0, 1, 4]], rates, accelerations)[order][place] for order, place in self._read])

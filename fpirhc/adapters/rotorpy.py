@@ -23,10 +23,6 @@ from fpirhc.task.external_plant import ExternalPlant, quantities
 _SEEN = [name + dash for dash in ("", "'", "''") for name in ("x", "y", "z")]
 _State = dict[str, np.ndarray]
 _SENT = ("thrust_x", "thrust_y", "thrust_z")
-_NEEDED = (  # parameters of a vehicle for which the package has no value of its own
-    *("mass", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz", "num_rotors", "rotor_pos", "rotor_directions"),
-    *("rotor_speed_min", "rotor_speed_max", "k_eta", "k_m", "tau_m"),
-)
 
 
 @adapter
@@ -62,11 +58,8 @@ def rotorpy_body(
     mistakes.unknown("start: quantity", start or {}, _SEEN[:6])
     for name in (name for name in (*_SEEN[:3], *_SENT) if name not in (*model.coordinates, *model.inputs)):
         mistakes.add(f"the model has no {name}; it needs x, y, z and thrust_x, thrust_y, thrust_z")
-    lacking = [name for name in _NEEDED if name not in (_NEEDED if vehicle is None else vehicle)]
-    if lacking:
-        mistakes.add(
-            f"the vehicle lacks {', '.join(lacking)}; change a set of the package: {{**quad_params, 'mass': 1.0}}"
-        )
+    if lacking := {"mass", "k_eta"} - {*(vehicle or {"mass": 0, "k_eta": 0})}:
+        mistakes.add(f"vehicle lacks {min(lacking)}; change a set of the package: {{**quad_params, 'mass': 1.0}}")
     mistakes.raise_if_any()
     air = finite_numbers("rotorpy_body: wind", wind, _SEEN[:3])
     parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
