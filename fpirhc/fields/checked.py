@@ -285,7 +285,7 @@ def _mended(expected: Expected, value: object) -> str:
 
 def _made_of(expected: Expected, value: object, contract: type | None) -> str:
     """How what is expected is made of a value that holds it, or that it should hold."""
-    if isinstance(value, Mapping) and value and all(accepts(expected, one) for one in value.values()):
+    if contract is None and isinstance(value, Mapping) and value and all(accepts(expected, v) for v in value.values()):
         return f"it is one for all, without a name: write {shortened(next(iter(value.values())))}"
     if isinstance(value, int | float | Mapping) and expected.fits(lambda t: t):
         return f"write lambda t: {shortened(value)}"

@@ -221,7 +221,7 @@ WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
     "too little": (
         lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, fp.DisturbanceKalman({"C": 1.0, "E": 1.0, "depth": 1.0}, STATES))),
         InvalidProblem,
-        "measure as many",
+        "need as many measured quantities",
     ),
     "twice": (lambda: disturbed(disturbed(hill(5.5), ("depth''",)), ("depth''",)), InvalidProblem, "rename it"),
     "no parameter": (
