@@ -74,7 +74,7 @@ def test_sector_bound():
 
 def test_wrong_sign_is_refused():
     """A positive gain on a plant whose eigenvalues are 1.5 and 1.3 is refused with the admissible gains."""
-    with pytest.raises(NotContractive, match=r"wrong sign.*negative gain, 0 < \|gain\| < 3.36 .*< 2.82"):
+    with pytest.raises(NotContractive, match=r"wrong sign.*negative gain, 0 < \|gain\| < 3.36, and below 2.82"):
         fp.simulate(tasks.two_mass.problem, sigmoid(0.1), seed=0)
 
 
