@@ -90,6 +90,7 @@ from .studies.open_loop import certify
 from .studies.operating_limits import operating_limits
 from .studies.scenarios.scenario_study import compare_scenarios
 from .studies.tune import tune
+from .symbolic.layout import Layout
 from .symbolic.live import signed_power
 from .task.cases import Cases
 from .task.dead_time import DeadTime

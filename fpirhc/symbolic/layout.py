@@ -130,7 +130,17 @@ class Named:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """An ordered set of named signals in one flat vector: their names in order, and the length of the vector."""
+    """An ordered set of named signals in one flat vector, such as what a `Stepper` reads, remembers and writes.
+
+    `names` are those of the signals, `columns`, `units` and `kinds` those of the entries, `slice(name)` is a signal's place, `size`
+    the length of the vector, and `start()` its first value. `pack` makes a vector of numbers by name, and `unpack` undoes it.
+
+        Stepper(problem, controller).reads.columns        ('time', 'state.q1', ...)
+
+    Raises:
+        InvalidName: two signals of one name; a name that is not there.
+        InvalidShape, InvalidValue: start values of another number, or not finite.
+    """
 
     signals: tuple[Signal, ...] = ()
     names: tuple[str, ...] = field(init=False, repr=False)
