@@ -215,10 +215,11 @@ def test_facts_go_through_wrappers():
 @pytest.mark.parametrize("wrap", [lambda c: c, twice], ids=["alone", "wrapped twice"])
 def test_a_users_controller_takes_the_recommended_map(wrap):
     """The scale of Sigmoid(gain=-0.5) is chosen for it as for a shipped controller on the same reference."""
-    problem = mass(reference=fp.Trajectory(lambda t: {"q": ca.sin(5 * t)}), start={"q": 0.0}, period=2e-2)
+    problem = mass(reference=fp.Trajectory(lambda t: {"q": 40.0 * t**3}), start={"q": 0.0}, period=2e-2)
     resolved_controller: Any = resolved(problem, wrap(Follower(fp.Sigmoid(gain=-0.5)))).deformation
-    # twice what q'' = -25 sin 5 t changes in one cycle
-    assert resolved_controller.scale == pytest.approx(2 * 2e-2 * 125.0, rel=1e-2)
+    assert resolved_controller.scale == pytest.approx(
+        2 * 2e-2 * 240.0, rel=1e-2
+    )  # twice what q'' = 240 t changes in one cycle
     run = fp.simulate(mass(duration=0.1), wrap(Follower(fp.Sigmoid(gain=-0.5))), seed=0, compiled=False)
     assert run.stop is None
     limit: Any = run.settings["step_limit"]
