@@ -25,7 +25,7 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem, nominal_start
-from fpirhc.tracking.base import Tracking, error_chains
+from fpirhc.tracking.base import Tracking
 
 
 def stages_of(problem: Problem) -> int:
@@ -171,10 +171,7 @@ def request_along_reference(problem: Problem, law: Tracking | None = None) -> Re
     response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant)
     smooth = problem.period * _slew(response_of, problem.duration)
     change = max(jump, _largest_change(response_of, problem)) if jump else smooth
-    error = _largest_error(problem)
-    return RequestChange(
-        change, sudden=False, recovery=_recovery(problem, law, error), size=max(error, _first_demand(problem, law))
-    )
+    return RequestChange(change, sudden=False, recovery=_recovery(problem, law))
 
 
 def request_of_plans(problem: Problem) -> RequestChange:
@@ -200,22 +197,10 @@ def request_of_commands(problem: Problem, parameters: np.ndarray) -> RequestChan
     values = plant.equations.inverse.map(_INSTANTS)(
         reference_states(problem, _INSTANTS), wanted, np.repeat(parameters[:, None], _INSTANTS, axis=1)
     )
-    commands = np.asarray(values.full())
-    size = float(np.linalg.norm(commands, axis=0).max())
-    return RequestChange(problem.period * _steepest(commands, times), sudden=False, size=size)
+    return RequestChange(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
 
 
-def _first_demand(problem: Problem, law: Tracking | None) -> float:
-    """Size of the response that the law asks for at the start beside the nominal one; 0 without constant gains."""
-    plant = problem.plant
-    target = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
-    chains = error_chains(plant, target - problem.start_output)
-    laws = [law.feedback(len(chain)) if law and chain else None for chain in chains]
-    asked = [np.dot(one.gains[one.integral :], chain) for one, chain in zip(laws, chains, strict=True) if one]
-    return float(np.linalg.norm(asked))
-
-
-def _recovery(problem: Problem, law: Tracking | None, error: float) -> float:
+def _recovery(problem: Problem, law: Tracking | None) -> float:
     """Step per cycle with which the plain form comes back from the largest expected error; 0 without a law of one rate."""
     laws = [law.feedback(order) for order in problem.plant.response_orders.values()] if law else []
     rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None and one.gains]
@@ -223,6 +208,7 @@ def _recovery(problem: Problem, law: Tracking | None, error: float) -> float:
         return 0.0
     from fpirhc.contraction.delayed import step_for_basin  # of laws with one rate alone
 
+    error = _largest_error(problem)
     return max(step_for_basin(error, poles, rate, problem.period) for poles, rate in rates)
 
 

@@ -132,7 +132,6 @@ class RequestChange:
     # step per cycle with which the plain form comes back from the largest response error that is expected, in units of the
     # response (`fpirhc.contraction.delayed`)
     recovery: float = 0.0
-    size: float = 0.0  # how large responses are that the command has to bring about, in units of the response
 
 
 @dataclass(frozen=True)

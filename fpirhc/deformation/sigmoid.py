@@ -26,7 +26,6 @@ from fpirhc.symbolic.live import atanh, signed, sqrt, tanh
 _SHIFTS = Range("a number from -5 to 5, such as 0.3", low=-5.0, high=5.0)
 _FLOOR = 1e-9  # |h| / S below which the norm is rounded off, so that its derivatives exist at zero
 _BISECTIONS = 60
-_LEAST = 0.1  # share of the size of responses that an automatic scale has at least
 
 
 @dataclass(frozen=True)
@@ -58,17 +57,16 @@ class Sigmoid(Deformation):
         return replace(self, scale=scale)
 
     def with_scale_for(self, request: RequestChange) -> Self:
-        """Return the map with a scale S for the change of the request; a scale that the user has set stays.
+        """Return the map with a scale S of at least 1 for the change of the request; a scale that the user has set stays.
 
         The largest step covers a sudden change. For a change that goes on from cycle to cycle S is twice the change. In both cases
-        the largest step covers the recovery, and S is at least a tenth of the size of responses; 1 where all of these are zero.
+        the largest step covers the recovery.
         """
         if self.scale is not None:
             return self
         step = self.with_scale(1.0).largest_step()
         scale = request.change / step if request.sudden else 2 * request.change
-        least = max(scale, request.recovery / step, _LEAST * request.size)
-        return self.with_scale(float(f"{least or 1.0:.3g}"))
+        return self.with_scale(float(f"{max(1.0, scale, request.recovery / step):.3g}"))
 
     @cached_property
     def _tanh_fixed_point(self) -> float:

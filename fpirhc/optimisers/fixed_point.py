@@ -40,7 +40,7 @@ class FixedPoint(Optimiser):
     Args:
         iterations: per call without limits of states; 1 is the intended number, one step per control cycle.
         tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
-        feasible: violation of a state bound, in its unit, below which a plan counts as converged; about 1e-8 of the smallest range.
+        feasible: violation of a state bound (in its unit) below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
             Gauss-Newton first where a remembered plan is improved.
