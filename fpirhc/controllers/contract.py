@@ -191,11 +191,6 @@ class Controller(Checked, ABC):
         return False if self.inner is None else self.inner.learns
 
     @property
-    def uses_model(self) -> bool:
-        """Whether its command depends on parameters of the model; True by default."""
-        return True if self.inner is None else self.inner.uses_model
-
-    @property
     def deforms(self) -> Deforms:
         """What its deformation acts on: the desired response, a command, or the target of an inner controller.
 

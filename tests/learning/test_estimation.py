@@ -429,10 +429,3 @@ def test_where_offset_free_control_is_the_better_choice():
     assert result["RHC offset-free"] <= 1.3 * result["RHC exact model"]
     assert result["RHC offset-free"] < 0.05 * result["RHC"]
     assert result["RHC+FPI"] > 0.5 * result["RHC"]
-
-
-def test_an_estimate_that_changes_no_command_is_noted():
-    learner = fp.RecursiveLeastSquares(SPRING, NOISE, 1.0)
-    idle, used = fp.PID({"y": 1.0}), fp.ComputedTorque(fp.Exponential(rate=1.0))
-    assert "learns changes no command: PID uses no model" in fp.Estimating(idle, learner).notes(task(spring()))[0]
-    assert fp.Estimating(used, learner).notes(task(spring())) == ()

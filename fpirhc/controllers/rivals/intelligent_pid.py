@@ -43,8 +43,6 @@ class IntelligentPID(Undeformed):
     alpha: Mapping[str, float]
     window: Few = field(metadata={"structure": True})
 
-    uses_model = False
-
     def check(self, problem: Problem) -> None:
         """Raise if the numbers do not fit the plant.
 

@@ -50,8 +50,6 @@ class PID(Undeformed):
     derivative: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     bumpless: bool = True
 
-    uses_model = False
-
     def gains(self, name: str, order: int) -> tuple[float, ...]:
         """Return the gains of (e_int, e, e', ...) of a coordinate of that relative order, shape (order + 1,)."""
         derivative = self.derivative.get(name, ())

@@ -73,10 +73,6 @@ class Estimating(ControllerWrapper):
         planner, at_once = self.controller.planner, self.at_once or self.estimator.acts_at_once
         return replace(planner, follows_model=True) if planner is not None and at_once else planner
 
-    def notes(self, problem: Problem) -> tuple[str, ...]:
-        idle = f"what {type(self.estimator).__name__} learns changes no command: {type(self.controller).__name__} uses no model"
-        return (*super().notes(problem), *(() if self.uses_model else (idle,)))
-
     def check(self, problem: Problem) -> None:
         """Raise if the estimator or the wrapped controller does not fit the problem.
 
