@@ -15,21 +15,26 @@ A clinic knows the weight, the fasting glucose and the basal dose, and takes the
 no meals: a filter of the sensor's signal takes them for disturbances of the gut. The sensor's noise has the deviation and the
 correlation time of that simulator's.
 
-Task: a dose beside the basal one, every 5 min, holds 115 mg/dl. 220 g of carbohydrate come a day, in five meals. For the adult of
+Task: a dose beside the basal one, every 5 min, holds 120 mg/dl. 220 g of carbohydrate come a day, in five meals. For the adult of
 this file, over two days:
 
     rms error, seed 0      glucose [mg/dl]
-    PID                                115
+    PID                                112
     RHC                                 47
-    RHC+FPI on the target               45
+    RHC+FPI on the target               46
 
 Nobody may be below 70 mg/dl for more than 4 % of the time; the time from 70 to 180 mg/dl is what is won. Over all thirty people
 (`fpirhc compare diabetes --cases all`), seed 0:
 
     shares of the time [%]    from 70 to 180    worst person    below 70    worst person
     PID                                   31              16           0               0
-    RHC                                   62              32           0               0
-    RHC+FPI on the target                 63              33           0               0
+    RHC                                   59              32           0               0
+    RHC+FPI on the target                 60              32           0               0
+
+The sensor's noise decides about those who are sensitive. With seeds 0 to 9 nobody of child#001, #003, #004, #006, #008 and
+adult#007 is below 70 for more than 2.8 % of the time, which child#004 is with RHC and seed 7
+(`fpirhc run diabetes RHC --case 'child#004' --seed 7`). A target of 115 mg/dl, with 62 and 63 % in the range, broke the rule: with
+seed 6 child#001 was below for 5.7 and 6.9 %.
 
 A pump adds insulin and takes none away, and a dose acts for hours: what is too much cannot be called back. So the safe
 controller is a plan with a filter, and an iteration may only move its target, slowly. `diabetes_announced` shows what fails.
@@ -254,7 +259,7 @@ problem = fp.Problem(
     reality=fp.Reality(
         plant({**BODY, "meal": "mg", "eating": "1"}, person, step=1.0), start={"meal": 0.0, "eating": 0.0}
     ),
-    reference=held(115.0),
+    reference=held(120.0),
     start=at_rest(PEOPLE[FIRST], PEOPLE[FIRST]["Gb"], PEOPLE[FIRST]["basal"])[0],
     period=CYCLE,
     duration=2880.0,  # min

@@ -1,6 +1,7 @@
 """What fails on the people of `diabetes`: a naive announcement of meals, and adaptation of the sensor's derivative.
 
-Everything but the rows and the announcement is that of `diabetes`. Here the plan knows every meal ahead. For the same adult:
+Everything but the rows, the announcement and the target, 115 mg/dl, is that of `diabetes`. Here the plan knows every meal ahead.
+For the same adult:
 
     rms error, seed 0            glucose [mg/dl]
     RHC                                       22
@@ -29,7 +30,11 @@ import fpirhc as fp
 
 silent = fp.load_problem(str(Path(__file__).with_name("diabetes.py")))
 
-problem = replace(silent.problem, signals={name: fp.Known(one.values) for name, one in silent.problem.signals.items()})
+problem = replace(
+    silent.problem,
+    reference=fp.Trajectory(lambda t: {"glucose": 115.0 + 0 * t, "sensor": 115.0 + 0 * t}),
+    signals={name: fp.Known(one.values) for name, one in silent.problem.signals.items()},
+)
 plan = silent.controllers["RHC"]
 controllers = {
     "RHC": plan,

@@ -88,7 +88,7 @@ def test_wrong_sign_of_the_gain_is_explained(folder, capsys):
     printed = capsys.readouterr().err
     assert "controller 'CTC+FPI'" in printed
     assert "wrong sign" in printed
-    assert "negative gain" in printed
+    assert "recommended -" in printed
     assert not (folder / "results").exists()  # a folder that would be empty
 
 

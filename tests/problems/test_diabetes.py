@@ -21,6 +21,7 @@ TWO_DAYS = Path(__file__).parents[1] / "data" / "diabetes" / "two_days.csv"
 # Minutes of a row of 3 min in which a meal begins: the recording has the mean of the row.
 BEGINS = {172: 1, 214: 2, 291: 0, 369: 2, 638: 1, 669: 0, 709: 2, 784: 1, 828: 0}
 EATING = 5.0  # g/min
+LOWEST = 6  # the seed, of ten, with which the lowest of all is below 70 mg/dl for longest
 # Of adolescent#001, in the order of the source: Gp, Gt, Ip, X, I1, Id, Il, two depots, Gs.
 PUBLISHED: tuple[float, ...] = (250.621836, 176.506559902, 4.697517762, 0.0, 97.554, 97.554, 3.19814917262)
 PUBLISHED += (57.951224472, 93.2258828462, 250.621836)
@@ -104,9 +105,13 @@ def of_people(of: Task, names: list[str], controllers: list[str], folder: Path) 
 
 @pytest.mark.slow
 def test_the_lowest_of_all_keeps_the_rule(tmp_path):
-    """A child whom unfinished plans take lowest is never below 70 mg/dl, and longer in the range than with PID."""
-    shares = of_people(task(), ["child#001"], ["PID", "RHC"], tmp_path)
-    assert max(shares["RHC"]["below"]) < 0.04
+    """The child whom noise takes lowest, with the noise that does: a target of 115 mg/dl gave 6 and 7 % below 70 mg/dl."""
+    cases = task().cases
+    assert cases is not None
+    changes = {**cases.changes["child#001"], "seed": LOWEST}
+    of = replace(task(), cases=fp.Cases({"child#001": changes}))
+    shares = of_people(of, ["all"], list(of.controllers), tmp_path)
+    assert all(max(one["below"]) < 0.04 for one in shares.values())
     assert shares["RHC"]["within"][0] > 1.3 * shares["PID"]["within"][0]
 
 
