@@ -75,7 +75,23 @@ class NotInvertible(FpirhcError, ValueError):
 
 
 class NotContractive(FpirhcError, ValueError):
-    """The fixed-point iteration does not converge with this gain, or with any gain."""
+    """The fixed-point iteration does not converge with this gain, or with any gain.
+
+    Args:
+        fault: what is wrong.
+        remedy: what the iteration by itself would bear, such as "use 0 < |gain| < 0.4"; empty where nothing is known.
+    """
+
+    def __init__(self, fault: str, remedy: str = "") -> None:
+        super().__init__(fault, remedy)
+        self.fault, self.remedy = fault, remedy
+
+    def __str__(self) -> str:
+        return f"{self.fault}; {self.remedy}" if self.remedy else self.fault
+
+    def advised(self, advice: str) -> str:
+        """Return what is wrong with an advice about the whole loop in place of what the iteration by itself would bear."""
+        return f"{self.fault}; {advice}"
 
 
 class NotSupported(FpirhcError, ValueError):

@@ -83,7 +83,8 @@ class _Car:
         for _ in range(self._steps):
             pull = sent.get("acceleration", np.clip(_PULL * (self._speed - self._x[3]), -5.0, 5.0))
             self._x = self._x + _STEP * self._mean_rate([turn, pull])
-        return self._measured(self._moved(), (self._moved() - before) / span)
+        now = self._moved()
+        return self._measured(now, (now - before) / span)
 
     def _mean_rate(self, u: list[float]) -> np.ndarray:
         rate = lambda x: np.array(self._rate(list(x), u, self._car))  # noqa: E731

@@ -302,6 +302,8 @@ class ContractionReport:
     contractive: bool  # whether the effective gain is within the linear limit
     within_sector: bool  # whether the effective gain is within the sector limit
     text: str  # the verdict and the admissible gains, for a reader
+    fault: str = ""  # what is wrong; empty where the deformation converges
+    remedy: str = ""  # what would do instead
 
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self._facts()))
@@ -333,7 +335,7 @@ def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepor
     """
     report = assess_gain(deformation, spectrum)
     if not report.contractive:
-        raise NotContractive(report.text)
+        raise NotContractive(report.fault, report.remedy)
     return report
 
 
@@ -345,16 +347,16 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
     try:
         linear = linear_limit(spectrum.eigenvalues)
     except NotContractive as error:
-        return _hopeless(predicted, gain, name, str(error))
+        return _hopeless(predicted, gain, name, error)
     if gain == 0:
-        text = f"{deformation} does not iterate, so nothing contracts; use Sigmoid(gain=...)"
-        return _hopeless(predicted, gain, name, text)
+        fault = f"{deformation} does not iterate, so nothing contracts"
+        return _hopeless(predicted, gain, name, NotContractive(fault, "use Sigmoid(gain=...)"))
     sector = sector_limit(deformation, spectrum.eigenvalues)
     own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
     contractive, within = linear[0] < gain < linear[1], sector[0] < gain < sector[1]
     admissible = _admissible(name, own_linear, own_sector)
     what = with_its_gain(deformation)
-    verdict = _verdict(what, predicted, within, admissible) if contractive else ""
+    fault, remedy = ("", "") if contractive else (f"{what} {_fault(gain, linear, predicted)}", f"use {admissible}")
     return ContractionReport(
         predicted=predicted,
         effective_gain=gain,
@@ -365,13 +367,16 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
         own_sector_limit=own_sector,
         contractive=contractive,
         within_sector=within,
-        text=verdict or f"{what} {_fault(gain, linear, predicted)}; use {admissible}",
+        text=f"{fault}; {remedy}" if fault else _verdict(what, predicted, within, admissible),
+        fault=fault,
+        remedy=remedy,
     )
 
 
-def _hopeless(predicted: float, gain: float, name: str, text: str) -> ContractionReport:
+def _hopeless(predicted: float, gain: float, name: str, refusal: NotContractive) -> ContractionReport:
     none = (0.0, 0.0)
-    return ContractionReport(predicted, gain, name, none, none, none, none, False, False, text)
+    limits, why = (none, none, none, none), (str(refusal), refusal.fault, refusal.remedy)
+    return ContractionReport(predicted, gain, name, *limits, False, False, *why)
 
 
 def _fault(gain: float, linear: tuple[float, float], predicted: float) -> str:

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 import numpy as np
 
 from fpirhc.contraction.delayed import limit_behind_weights
-from fpirhc.contraction.spectrum import Spectrum, assess_gain, jacobians_along, linear_limit
+from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation, Iteration, against_wrappers, own_gain, with_its_gain
 from fpirhc.errors import NotContractive
@@ -48,7 +48,7 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
         return
     spectrum = _at_start(problem, deformation)
     if spectrum is not None and sum(linear_limit(spectrum.eigenvalues)) * gain <= 0:
-        raise NotContractive(assess_gain(deformation, spectrum).text)
+        check_gain(deformation, spectrum)  # which raises, with the sign that would do
 
 
 def check_gain_size(problem: Problem, deformation: Deformation) -> None:
@@ -80,12 +80,12 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     if abs(gain) < largest:
         return
     if not late:
-        raise NotContractive(_too_large(deformation, spectrum, largest))
+        raise _too_large(deformation, spectrum, largest)
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
     limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
     best = None if mirror.share else next((d for d, most in limits.items() if abs(gain) < most), None)
-    raise NotContractive(_too_late(problem, deformation, largest, best))
+    raise _too_late(problem, deformation, largest, best)
 
 
 def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eigenvalue: float) -> float:
@@ -129,20 +129,20 @@ def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
     return np.convolve(weights, np.append(np.zeros(whole), [1 - share, share]))
 
 
-def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> str:
+def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> NotContractive:
     """What is wrong with a gain that is beyond the limit of the plant itself."""
     name = own_gain(deformation)[0]
     values = spectrum.eigenvalues.ravel()
     largest = values[np.argmax(np.abs(values))]
     value_text = f"{largest.real if largest.imag == 0 else largest:.3g}"
-    return (
-        f"{with_its_gain(deformation)} is too large, and runs in BeyondLimit(map) alone; use 0 < |{name}| < "
-        f"{_in_own(deformation, limit):.3g}, where the iteration converges: the largest eigenvalue of the response Jacobian at "
-        f"the start is {value_text}"
+    return NotContractive(
+        f"{with_its_gain(deformation)} is too large, and runs in BeyondLimit(map) alone",
+        f"use 0 < |{name}| < {_in_own(deformation, limit):.3g}, where the iteration converges: the largest eigenvalue of the "
+        f"response Jacobian at the start is {value_text}",
     )
 
 
-def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing: float | None) -> str:
+def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing: float | None) -> NotContractive:
     name, estimator = own_gain(deformation)[0], problem.sensing.estimator
     delay = problem.response_delay
     reasons = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
@@ -151,7 +151,8 @@ def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing:
     remedies = [f"0 < |{name}| < {_in_own(deformation, limit):.3g}"] if limit else []
     remedies += [f"Paired(map, cycles={pairing:.4g})"] if pairing is not None else []
     remedies += ["a shorter window or time constant"]
-    return (
+    # These remedies stay beside an advice on the gain, because all but the first change something else.
+    return NotContractive(
         f"{with_its_gain(deformation)}: {' and '.join(reasons)}, so the iteration does not converge with this {name}; what "
         f"helps: {', or '.join(remedies)}"
     )

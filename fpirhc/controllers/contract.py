@@ -317,10 +317,8 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
     ]
     square = len(inputs) == len(problem.plant.controlled_names)
     longest = [problem.dead_time.longest[name] / problem.period for name in inputs if name in problem.dead_time.longest]
-    reached = {
-        "cycles": [*known["cycles"], *longest],
-        "lag": known["lag"],
-    }  # a dead time that is live has others in a run
+    # a dead time that is live has others in a run
+    reached = {"cycles": [*known["cycles"], *longest], "lag": known["lag"]}
     late = [name for name in left_open if max(reached[name]) >= least]
     each = {n: square and len(inputs) > 1 and bool(len({*known[n]}) > 1 or (longest and n == "cycles")) for n in late}
     values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in late}

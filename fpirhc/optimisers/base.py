@@ -205,11 +205,11 @@ def _state_violation(ocp: OptimalControl, states: ca.MX, factors: np.ndarray | N
 
 def counted(ocp: OptimalControl, violation: ca.MX, states: ca.MX) -> ca.MX:
     """Return the violation that the status counts, as a multiple of what is kept of limits of size one."""
-    times = FEASIBLE / kept(ocp)
+    times = FEASIBLE / feasible_to(ocp)
     return violation if (times == 1).all() else _state_violation(ocp, states, times)
 
 
-def kept(ocp: OptimalControl) -> np.ndarray:
+def feasible_to(ocp: OptimalControl) -> np.ndarray:
     """Return the violation of every state's limits that counts as kept (ns,), by half its range; `FEASIBLE` where that is 1."""
     half = ocp.half_ranges
     about = np.minimum(FEASIBLE * np.maximum(half, 1), _SHARE * half)
@@ -250,7 +250,7 @@ def judge(ocp: OptimalControl) -> ca.Function:
 def _valid_multipliers(ocp: OptimalControl, states: ca.MX, multipliers: ca.MX) -> ca.MX:
     """The part that can be a multiplier: positive at the upper bound, negative at the lower one, zero elsewhere."""
     rows, none = [], ca.MX.zeros(1, ocp.stages)
-    for k, near in enumerate(kept(ocp).tolist()):
+    for k, near in enumerate(feasible_to(ocp).tolist()):
         row, values = states[k, 1:], multipliers[k, :]
         at_upper = row >= ocp.state_upper[k] - near if ocp.state_upper[k] < FINITE else none
         at_lower = row <= ocp.state_lower[k] + near if ocp.state_lower[k] > -FINITE else none

@@ -13,7 +13,7 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.fields.checked import ByName, checked_call
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
-from fpirhc.optimisers.base import Optimiser, first_plan, improved, judge, kept
+from fpirhc.optimisers.base import Optimiser, feasible_to, first_plan, improved, judge
 from fpirhc.optimisers.bounds import tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
@@ -338,8 +338,8 @@ def _fit_multipliers(
         return none
     slope, states, sensitivity = (np.asarray(v.full()) for v in sensitivity_of(ocp)(state, inputs, data))
     flat = states[:, 1:].ravel(order="F")
-    upper = flat >= np.tile(ocp.state_upper - kept(ocp), ocp.stages)
-    lower = flat <= np.tile(ocp.state_lower + kept(ocp), ocp.stages)
+    upper = flat >= np.tile(ocp.state_upper - feasible_to(ocp), ocp.stages)
+    lower = flat <= np.tile(ocp.state_lower + feasible_to(ocp), ocp.stages)
     free = ~_at_bound(inputs, bounds).ravel(order="F")
     if not (upper.any() or lower.any()) or not free.any() or not np.isfinite(sensitivity).all():
         return none

@@ -264,12 +264,7 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
         advice = review.recommended_for(problem, controller)
         if advice is None:
             raise
-        raise NotContractive(advised(error, advice.text)) from None
-
-
-def advised(error: NotContractive, advice: str) -> str:
-    """Return a refusal of a gain with the advice of a review in place of the limit of the iteration by itself."""
-    return f"{str(error).partition('; use ')[0]}; {advice}"
+        raise NotContractive(error.fault, advice.text) from None
 
 
 @contextmanager

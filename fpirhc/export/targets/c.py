@@ -190,16 +190,17 @@ def _struct(name: str, layout: Layout) -> str:
     names = identifiers([s.name.removeprefix(PREFIX) for s in signals])
     alone = len(signals) == 1 and bool(signals[0].elements)
     for own, signal in zip(names, signals, strict=True):
-        units = ", ".join(dict.fromkeys(signal.entry_units)) or "as in the problem file"
+        each = [unit or "as in the problem file" for unit in signal.entry_units]
+        units = ", ".join(dict.fromkeys(each))
         entries = identifiers(signal.elements)
         if not entries:
             lines.append(f"  casadi_real {own}; /* {units} */")
         elif alone:
-            lines += [f"  casadi_real {e}; /* {u} */" for e, u in zip(entries, signal.entry_units, strict=True)]
+            lines += [f"  casadi_real {e}; /* {u} */" for e, u in zip(entries, each, strict=True)]
         elif len(entries) <= _FEW:
             lines += [
                 "  struct {",
-                *[f"    casadi_real {e}; /* {u} */" for e, u in zip(entries, signal.entry_units, strict=True)],
+                *[f"    casadi_real {e}; /* {u} */" for e, u in zip(entries, each, strict=True)],
                 f"  }} {own};",
             ]
         else:

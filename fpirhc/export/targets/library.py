@@ -25,7 +25,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
             device,
             "library.md",
             sample=_listed(device.inputs),
-            command=_listed(_command(device)),
+            command=_listed(Layout((device.stepper.signals["command"],))),
             settings=", ".join(device.bounds) or "none",
         ),
     }
@@ -35,10 +35,6 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
             f"a shared library needs a C compiler: {why_no_compiler()}; install gcc or clang, or pip install 'fpirhc[compiler]'"
         )
     return {**own, **made, "layout.json": json.dumps(layout_of(device), indent=1)}
-
-
-def _command(device: Device) -> Layout:
-    return Layout((device.stepper.signals["command"],))
 
 
 def _listed(layout: Layout) -> str:

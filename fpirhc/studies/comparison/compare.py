@@ -31,7 +31,7 @@ from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import judged_run, simulator
-from fpirhc.simulation.trials import advised, weighed
+from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.causes import yardstick_of
 from fpirhc.studies.comparison.changes import Finding, Outcome, scales
 from fpirhc.studies.comparison.comparison import Comparison
@@ -174,7 +174,7 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             advice = recommended_for(task.problem, controller)
-            mistakes.add(f"controller '{name}': {error if advice is None else advised(error, advice.text)}")
+            mistakes.add(f"controller '{name}': {error if advice is None else error.advised(advice.text)}")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()

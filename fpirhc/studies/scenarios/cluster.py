@@ -296,29 +296,27 @@ class Cluster:
 
     def _chunks(self, jobs: Iterator[Sequence[Job]]) -> Iterator[list[Any]]:
         """Answers of one task after the other; tasks get longer until their transport does not count."""
-        size, given = (
-            1,
-            dict[str, tuple[list[Sequence[Job]], int]](),
-        )  # jobs of a task, and how often it was lost, by key
+        size = 1
+        running: dict[str, tuple[list[Sequence[Job]], int]] = {}  # jobs of a task, and how often it was lost, by key
         pool = self._dask.as_completed(loop=self._client.loop, with_results=True, raise_errors=False)
         while True:
             threads = sum(self._client.nthreads().values())  # asked once for every answer: workers may come and go
-            while len(given) < 2 * max(1, threads) and (chunk := list(itertools.islice(jobs, size))):
+            while len(running) < 2 * max(1, threads) and (chunk := list(itertools.islice(jobs, size))):
                 future = self._submitted(chunk)
                 pool.add(future)
-                given[future.key] = chunk, 0
-            if not given:
+                running[future.key] = chunk, 0
+            if not running:
                 return
             if not threads:
                 self._wait_for_workers()
             future, result = next(pool)
-            chunk, losses = given.pop(future.key)
+            chunk, losses = running.pop(future.key)
             if future.status != "finished":
                 if losses == _LOSSES or not isinstance(_error_in(result), self._dask.KilledWorker):
                     raise _lost("the cluster lost a task", result)
                 again = self._submitted(chunk)
                 pool.add(again)
-                given[again.key] = chunk, losses + 1
+                running[again.key] = chunk, losses + 1
                 continue
             answers, seconds = result
             future.release()  # a worker that is killed would compute every result that it holds anew

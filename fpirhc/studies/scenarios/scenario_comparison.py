@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import chain, islice, zip_longest
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from fpirhc.fields.checked import FoundByName
 from fpirhc.simulation.metrics.base import Column as Number
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.studies.objective import Objective
+from fpirhc.studies.scenarios.bench import RecordFields
 from fpirhc.studies.scenarios.paired import Record, Summary, counted, noun
 from fpirhc.studies.view import Study, View, status_shares
 from fpirhc.summary import Column, Table, in_percent, line, written_out
@@ -30,7 +31,7 @@ _MEANING = (
     "and where the reference is held that of the plant left alone, has diverged; a run that ended early counts as worse than every "
     "other run."
 )
-_FIELDS = ("scenario", "name", "group", "controller", "mismatch", "outcome", "error", "lasted", "stop")
+_FIELDS = tuple(one.name for one in fields(RecordFields) if one.name != "metrics")
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
 
@@ -101,10 +102,10 @@ class ScenarioComparison(Study, FoundByName):
         names = dict.fromkeys(name for record in self._every() for name in _flat(record["metrics"]))
         left, first = self._every(), True
         while (part := list(islice(left, rows))) or first:
-            fields = {name: [one[name] for one in part] for name in _FIELDS}
+            facts = {name: [one[name] for one in part] for name in _FIELDS}
             numbers = [_flat(one["metrics"]) for one in part]
             metrics = {name: np.array([some.get(name) for some in numbers], dtype=float) for name in names}
-            frame = pd.DataFrame({**fields, **metrics}).astype({"error": float})
+            frame = pd.DataFrame({**facts, **metrics}).astype({"error": float})
             frame.attrs["units"] = {name: unit for name, unit in self.units.items() if unit not in ("", "1")}
             yield frame
             first = False
