@@ -151,7 +151,7 @@ def _states(task: Problem) -> np.ndarray:
 
 def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:
     count = states.shape[1]
-    repeated = (np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate))
+    repeated = [np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate)]
     return np.asarray(task.plant.equations.controlled_response.map(count)(states, *repeated).full())
 
 

@@ -82,9 +82,7 @@ class Checked(metaclass=_CheckedWhenCalled):
 
 def missing(owner: type, name: str) -> AttributeError:
     """The error of an attribute that is not there, with the name that took the place of an earlier one."""
-    now = next(
-        (FORMER_MEMBERS[k] for k in (f"{base.__name__}.{name}" for base in owner.__mro__) if k in FORMER_MEMBERS), None
-    )
+    now = next(filter(None, [FORMER_MEMBERS.get(f"{base.__name__}.{name}") for base in owner.__mro__]), None)
     return AttributeError(
         f"{owner.__name__} has no attribute '{name}'" + (f"; it is called '{now}' now" if now else ""), name=name
     )

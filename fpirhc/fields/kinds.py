@@ -211,7 +211,12 @@ class Expected(ABC):
 
 def accepts(expected: Expected, value: object) -> bool:
     """Whether the value and all its parts are as expected."""
-    return expected.fits(value) and all(accepts(inner, part) for _, inner, part in expected.parts(value))
+    if not expected.fits(value):
+        return False
+    for _, inner, part in expected.parts(value):  # noqa: SIM110 -- most values have no parts, and a generator costs a call
+        if not accepts(inner, part):
+            return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -244,7 +249,7 @@ class Number(Expected):
                 return False
         if self.whole and not isinstance(value, numbers.Integral):
             return False
-        number = real_number(value)
+        number = value if type(value) is float else real_number(value)
         if number is None:  # a whole number beyond the largest float is a whole number
             return self.whole and type(value) is int and (self.within is None or self.within.holds(value))
         return not math.isnan(number) if self.within is None else self.within.holds(number)
@@ -432,7 +437,7 @@ def expected_by(annotation: object) -> Expected:  # noqa: PLR0911 -- one line pe
 
 
 def _annotated(arguments: tuple[typing.Any, ...]) -> Expected:
-    within = next((a for a in arguments[1:] if isinstance(a, Range)), None)
+    within = next(iter([a for a in arguments[1:] if isinstance(a, Range)]), None)
     if within is not None and arguments[0] in (int, float):
         return Number(arguments[0] is int, within)
     return expected_by(arguments[0])

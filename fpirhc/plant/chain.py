@@ -33,7 +33,9 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
 def _derivatives(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
-    most = {name: max(k for n, k in wanted if n == name) for name, _ in wanted}
+    most = dict[str, int]()
+    for name, k in wanted:
+        most[name] = max(k, most.get(name, k))
     responses = _responses(plant, (x, u, p, w))
     chains = {name: _chain(plant, name, count, (x, u, p, w), responses) for name, count in most.items()}
     column = ca.vertcat(*(chains[name][k] for name, k in wanted))

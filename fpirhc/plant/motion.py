@@ -171,7 +171,7 @@ def disturbed(motion: Motion) -> str:
 
 def followed_units(motion: Motion) -> dict[str, str]:
     """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
-    return {name: one.unit for name, one in motion.outputs.items()} or dict(motion.coordinates)
+    return {name: one.unit for name, one in motion.outputs.items()} if motion.outputs else dict(motion.coordinates)
 
 
 def input_columns(motion: Motion) -> tuple[str, ...]:

@@ -263,7 +263,7 @@ def _has_live(value: object) -> bool:
     else:
         return False
     for part in parts:
-        if type(part) not in _LEAVES and _has_live(part):
+        if type(part) not in _LEAVES and _PLAIN.get(id(part)) is not part and _has_live(part):
             return True
     if is_dataclass(value):
         _PLAIN[id(value)] = value
