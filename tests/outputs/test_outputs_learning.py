@@ -18,7 +18,7 @@ from test_outputs import arm, circle, hill, planned, sedated
 from test_outputs import depth_error as rms
 
 import fpirhc as fp
-from fpirhc.errors import FpirhcError, InvalidProblem
+from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.horizon.nominal import consistent_state
 from fpirhc.plant.disturbed import disturbed
 from fpirhc.studies.comparison.entry import information
@@ -222,6 +222,11 @@ WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         lambda: simulated(sedated(hill(5.5)), fp.Estimating(LAW, fp.DisturbanceKalman({"C": 1.0, "E": 1.0, "depth": 1.0}, STATES))),
         InvalidProblem,
         "need as many measured quantities",
+    ),
+    "no use of the model": (
+        lambda: simulated(sedated(hill(5.5)), fp.Estimating(fp.PID({"depth": -1.0}), fp.DisturbanceKalman({"C": 1.0}, STATES))),
+        NotSupported,
+        "PID uses none of them",
     ),
     "twice": (lambda: disturbed(disturbed(hill(5.5), ("depth''",)), ("depth''",)), InvalidProblem, "rename it"),
     "no parameter": (

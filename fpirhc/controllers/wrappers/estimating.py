@@ -22,7 +22,7 @@ from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import GAP, Block, Delay
+from fpirhc.symbolic.block import GAP, Block, Composite, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
@@ -78,7 +78,8 @@ class Estimating(ControllerWrapper):
 
         Raises:
             FpirhcError: a check of the estimator or of the wrapped controller fails.
-            NotSupported: a controller that reads a response of its own; a response that nobody measures.
+            NotSupported: a controller that reads a response of its own; a response that nobody measures. `blocks` raises it for a
+                controller whose command does not depend on the model.
         """
         modelled = self.inner_problem(problem)
         self.estimator.check(modelled)
@@ -102,6 +103,11 @@ class Estimating(ControllerWrapper):
         following = with_setting(self.controller, "follows_model", True) if self.at_once else None
         controller = following or self.controller
         inner = compose_controller(modelled, controller)
+        if not _uses_parameters(inner):
+            raise NotSupported(
+                f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
+                "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon"
+            )
         outputs = self.estimator.reads_outputs(modelled.plant)
         age = response_age(problem.plant) if self.estimator.reads_response(modelled.plant) else 0
         pairs = ResponsePairs(problem, self.dead_time or problem.dead_time, outputs, age)
@@ -112,6 +118,14 @@ class Estimating(ControllerWrapper):
             embedded("controller", inner, {"parameters": believed}),
         ]
         return blocks, [Delay(acted, problem.plant.input.name)]
+
+
+def _uses_parameters(step: Composite) -> bool:
+    """Whether a command, of this cycle or of a later one, depends on the parameters of the model."""
+    names = step.function.name_in()
+    place = names.index("parameters") if "parameters" in names else None
+    used = ("command", "memory_next")
+    return place is not None and any(step.function.jac_sparsity(o, place).nnz() for o in map(step.function.index_out, used))
 
 
 def _estimate_block(
