@@ -144,8 +144,13 @@ def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> No
 
 def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing: float | None) -> NotContractive:
     name, estimator = own_gain(deformation)[0], problem.sensing.estimator
-    delay = problem.response_delay
-    reasons = [f"the response comes {delay:.4g} cycles late ({estimator})"] if delay else []
+    delay, of_estimator = problem.response_delay, problem.sensing.delay(problem.plant, problem.period)
+    causes = (
+        str(estimator)
+        if delay == of_estimator
+        else f"dead time {delay - of_estimator:.4g}, {estimator} {of_estimator:.4g}"
+    )
+    reasons = [f"the response comes {delay:.4g} cycles late ({causes})"] if delay else []
     pole = deformation.iteration.error_pole
     reasons += [f"the error is filtered with the pole {pole:g}"] if pole else []
     remedies = [f"0 < |{name}| < {_in_own(deformation, limit):.3g}"] if limit else []

@@ -1,4 +1,4 @@
-"""A foreign reality: hardware, another simulator, a physics engine. The loop is the same, its plant is an object outside.
+"""A reality outside: hardware, another simulator, a physics engine. The loop is the same, its plant is an object outside.
 
 Theory: docs/theory-plants.md.
 """
@@ -28,7 +28,7 @@ _LONGEST = 60  # characters of an answer that are shown
 
 
 class Body(Protocol):
-    """What a foreign reality must be able to do."""
+    """What a body outside must be able to do."""
 
     def reset(self, seed: int) -> npt.ArrayLike:
         """Go to the start of the problem and return the first measurements."""
@@ -146,7 +146,7 @@ class ExternalPlant(Checked):
         Raises:
             NotSupported: always.
         """
-        self.require_equations("a foreign reality has no equations that could be the exact model; leave ExactModel out")
+        self.require_equations("an ExternalPlant has no equations that could be the exact model; leave ExactModel out")
 
     def require_equations(self, refusal: str) -> NoReturn:
         """Raise: it is an object outside.

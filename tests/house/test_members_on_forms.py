@@ -138,7 +138,7 @@ REFUSED: dict[tuple[str, str], str] = {
     **{("ResolvedAccelerationRate", form): f"prescribes {STEPS_SAID}" for form in IN_STEPS},
     **{("ModelReferenced 3", form): "a map has no lag, and no dead time of parts of a cycle" for form in IN_STEPS},
     ("ExactModel", "reality"): "no coordinate y, which the model has: it cannot be the exact model of this controller",
-    ("ExactModel", "outside"): "a foreign reality has no equations that could be the exact model; leave ExactModel out",
+    ("ExactModel", "outside"): "an ExternalPlant has no equations that could be the exact model; leave ExactModel out",
 }
 YOUNG = "order 1", "curve", "at once", "late", "late curve"
 FARTHER = {  # pairs that are served and leave their reference

@@ -112,6 +112,13 @@ def test_no_limit_is_left_where_nobody_is_drawn_to_the_reference():
         assert sum(KEEPS in one.question for one in asked) == count
 
 
+def test_small_lengths_leave_a_limit_like_large_ones():
+    """A thousandth of a micrometre along, with a limit to one side at four fifths of the way."""
+    one = answer(mass(1e-9, states={"q": (-np.inf, 0.8e-9)}), None, KEEPS)
+    assert one.verdict == "no"
+    assert one.numbers["room_q"] == pytest.approx(-0.2, abs=0.01)
+
+
 def test_limits_that_are_touched_are_not_covered():
     """At rest on the limit: the linear loop leaves it out, which is no yes."""
     one = answer(mass(0.0, states={"q": (0.0, 1.0)}), None, KEEPS)

@@ -125,7 +125,9 @@ def _uses_parameters(step: Composite) -> bool:
     names = step.function.name_in()
     place = names.index("parameters") if "parameters" in names else None
     used = ("command", "memory_next")
-    return place is not None and any(step.function.jac_sparsity(o, place).nnz() for o in map(step.function.index_out, used))
+    return place is not None and any(
+        step.function.jac_sparsity(o, place).nnz() for o in map(step.function.index_out, used)
+    )
 
 
 def _estimate_block(

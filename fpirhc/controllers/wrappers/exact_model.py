@@ -22,7 +22,7 @@ class ExactModel(ControllerWrapper):
         controller: any controller that uses its model.
 
     Raises:
-        NotSupported: a foreign reality, or one whose coordinates or orders are not the model's.
+        NotSupported: an ExternalPlant, or a reality whose coordinates or orders are not the model's.
     """
 
     def inner_problem(self, problem: Problem) -> Problem:

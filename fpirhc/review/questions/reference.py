@@ -202,7 +202,13 @@ def _rooms(ocp: OptimalControl, low: np.ndarray, high: np.ndarray) -> np.ndarray
     """Distance to the nearest limit as a share of the interval, negative outside; infinite where nothing is limited."""
     with np.errstate(invalid="ignore"):
         interval = ocp.state_upper - ocp.state_lower
-    scale = np.where(np.isfinite(interval) & (interval > 0), interval, np.maximum(np.maximum(abs(low), abs(high)), 1.0))
+    ends = [
+        abs(low),
+        abs(high),
+        *(np.where(np.isfinite(end), abs(end), 0.0) for end in (ocp.state_lower, ocp.state_upper)),
+    ]
+    size = np.max(ends, axis=0)
+    scale = np.where(np.isfinite(interval) & (interval > 0), interval, np.where(size > 0, size, 1.0))
     return np.asarray(np.minimum(ocp.state_upper - high, low - ocp.state_lower) / scale)
 
 
@@ -351,13 +357,10 @@ def _used(commands: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndar
 
     Where one side has no limit, the share is 0 inside and 2 outside.
     """
-    both = np.isfinite(lower) & np.isfinite(upper)
-    middle = np.where(both, 0.5 * (np.where(both, lower, 0) + np.where(both, upper, 0)), 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        above = np.where(np.isfinite(upper), (commands - middle) / np.abs(upper - middle), 0.0)
-        below = np.where(np.isfinite(lower), (middle - commands) / np.abs(middle - lower), 0.0)
-    one_sided = np.where(commands > upper, 2.0, np.where(commands < lower, 2.0, 0.0))
-    shares = np.where(both, np.maximum(above, below), one_sided)
+        two_sided = np.abs(commands - (lower + upper) / 2) / ((upper - lower) / 2)
+    one_sided = np.where((commands > upper) | (commands < lower), 2.0, 0.0)
+    shares = np.where(np.isfinite(lower) & np.isfinite(upper), two_sided, one_sided)
     return np.asarray(np.where(np.isfinite(commands), shares, np.nan))
 
 

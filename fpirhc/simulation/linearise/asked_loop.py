@@ -50,7 +50,7 @@ class AskedLoop:
 
     def __init__(self, problem: Problem, controller: Controller) -> None:
         """Compose the loop."""
-        problem.require_equations("the step of a loop with a foreign reality cannot be evaluated twice at one point")
+        problem.require_equations("the step of a loop with an ExternalPlant cannot be evaluated twice at one point")
         self.problem = _CALM.of((problem,), (), lambda: _calm(problem))
         self.controller = resolved(problem, controller)
         with any_gain(), compiled_plans():  # one that a run refuses has poles too

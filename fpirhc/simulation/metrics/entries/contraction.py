@@ -20,7 +20,7 @@ _SAMPLES = 200  # cycles of a run whose eigenvalues are computed
 
 
 def predicted(problem: Problem, run: Run) -> float | None:
-    """Return the largest max|1 - a lambda| in sampled cycles of the run; None for a foreign reality. See `fpirhc.contraction`."""
+    """Return the largest max|1 - a lambda| in sampled cycles of the run; None for an ExternalPlant. See `fpirhc.contraction`."""
     if not _differentiable(problem, run):
         return None
     return predicted_factor(sampled_spectrum(problem, run).eigenvalues, _gain(run))
