@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, Mistakes, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, Mistakes, listed, nearest
 from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.plant.motion import with_space
@@ -498,10 +498,13 @@ def _view(result: Sweep) -> View:
         for one in result.maps
         if one.rebuilt
     ]
+    lacking: dict[tuple[str, ...], list[str]] = {}
+    for one in result.maps:
+        lacking.setdefault(one.without, []).append(one.controller)
     same = [
-        f"{one.controller} has no {', '.join(one.without)}: it is the same along it"
-        for one in result.maps
-        if one.without
+        f"without {' and '.join(paths)}, and the same along {'it' if len(paths) == 1 else 'them'}: {listed(names)}"
+        for paths, names in lacking.items()
+        if paths
     ]
     apart = [f"{one.controller}: one run after the other, because {one.apart}" for one in result.maps if one.apart]
     lists = {"Why runs failed": reasons, "How it was run": [*built, *same, *apart]}
@@ -536,9 +539,15 @@ def _sentences(result: Sweep) -> Iterator[str]:
         shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(result.maps)), reverse=True)
         best = ", ".join(f"{name} in {count}" for count, name in shares if count)
         yield f"{result.aim.subject[0].upper()}{result.aim.subject[1:]} is best with: {best or 'none alone'} of {cells} cells."
-    for one in result.maps:
-        failed = int((one.outcomes != "finished").sum())
-        yield f"{one.controller} fails in {failed} of {cells} cells." if failed else f"{one.controller} fails nowhere."
+    failures = {one.controller: int((one.outcomes != "finished").sum()) for one in result.maps}
+    for name, failed in failures.items():
+        if failed:
+            yield f"{name} fails in {failed} of {cells} cells."
+    never = [name for name, failed in failures.items() if not failed]
+    if len(never) == len(failures) > 1:
+        yield "No controller fails anywhere."
+    elif never:
+        yield f"{listed(never)} {'fails' if len(never) == 1 else 'fail'} nowhere."
 
 
 def _facts(result: Sweep) -> dict[str, Any]:

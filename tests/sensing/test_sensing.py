@@ -358,7 +358,9 @@ def test_dead_time_counts_but_is_not_judged_alone():
     close_loop(late, wild)
     window = replace(late, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=5, degree=2)))
     assert window.response_delay == pytest.approx(11.5)
-    with pytest.raises(NotContractive, match=r"11.5 cycles late \(dead time 10, Sav.* 1.5\).*Paired\(map, cycles=11.5\)"):
+    with pytest.raises(
+        NotContractive, match=r"11.5 cycles late \(dead time 10, Sav.* 1.5\).*Paired\(map, cycles=11.5\)"
+    ):
         close_loop(window, wild)
     close_loop(window, fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Paired(fp.Affine(gain=-1.0), cycles=11.5)))
 
