@@ -154,13 +154,12 @@ INLINE void exchange(Plan** best, Plan** plan, Truth accepted) {
   }
 }
 
-/* L D L' on the free rows; what is not free is a unit row. Pivots that are not positive are replaced. */
+/* L D L' on the free rows; what is not free is no part of the others. Pivots that are not positive are replaced. */
 INLINE void factorise(In matrix, const Truth* free, Out lower, Out pivots) {
   int i, j, k;
   for (j = 0; j < NU; ++j) {
     casadi_real size = fabs(matrix[j * NU + j]) + TINY, pivot = matrix[j * NU + j];
     for (k = 0; k < j; ++k) pivot -= lower[k * NU + j] * lower[k * NU + j] * pivots[k];
-    pivot = EITHER(free[j], pivot, ALL(1));
     pivots[j] = EITHER(pivot > PIVOT * size, pivot, size);
     for (i = j + 1; i < NU; ++i) {
       casadi_real sum = matrix[j * NU + i];

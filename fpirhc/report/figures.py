@@ -396,7 +396,7 @@ def _sweep_lines(result: Sweep) -> Drawing:
 def _sweep_maps(result: Sweep) -> Drawing:
     from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
-    several = len(result.maps) > 1 and result.aim.ranks
+    several = result.ranks
     count = len(result.maps) + several
     columns = min(count, _PANELS)
     rows = -(-count // columns)

@@ -78,10 +78,8 @@ _LIMITS = (
     "the line they left a limit of a state. The first point of a line is the problem as it stands."
 )
 
-_SWEEP = (
-    "One cell per run, all maps in one scale of colours. Grey cells failed; rings are the settings as they stand. The last map "
-    "shows which controller is best."
-)
+_SWEEP = "One cell per run, all maps in one scale of colours. Grey cells failed; rings are the settings as they stand."
+_WINNERS = " The last map shows which controller is best."
 _CELL = "Click on one, or choose it below: its number, and the command of its run."
 _LINES = "One point per run; crosses at the upper edge are runs that failed, dotted lines the settings as they stand."
 
@@ -256,7 +254,7 @@ def render_limits(result: OperatingLimits) -> str:
 def render_sweep(result: Sweep) -> str:
     """Return the page's text."""
     figure, name = sweep_figure(result), " and ".join(axis.path for axis in result.axes)
-    caption = f"{_SWEEP if len(result.axes) > 1 else _LINES} {_CELL}"
+    caption = f"{_SWEEP + _WINNERS * result.ranks if len(result.axes) > 1 else _LINES} {_CELL}"
     chart = Image(figure.address, f"Over {name}", caption)  # drawn first: only then it is known where its panels lie
     data = json.dumps({**sweep_cells(result), "panels": sweep_panels(figure, result)}, separators=(",", ":"))
     script = f"const SWEEP={_in_script(data)};\n{asset('sweep.js')}"

@@ -93,10 +93,12 @@ def show_table(table: Table, console: Console | None = None) -> None:
     """Print a table in as many parts as the width of the console needs."""
     console = console or Console()
     parts = _parts(table, console.width)
-    for k, part in enumerate(parts):
-        title = printable(table.title) + (" (continued)" if k else "")
-        caption = printable(table.caption) if k == len(parts) - 1 else ""
-        console.print(_grid(table, part, title, caption, console.width))
+    for k, part in enumerate(parts):  # what stands above and below may be wider than a part
+        if table.title:
+            console.print(Text(printable(table.title) + (" (continued)" if k else ""), "italic"))
+        console.print(_grid(table, part, console.width))
+    if table.caption:
+        console.print(Text(printable(table.caption), "dim italic"))
 
 
 def _parts(table: Table, width: int) -> list[list[int]]:
@@ -127,9 +129,9 @@ def _whole_units(head: str) -> str:
     return re.sub(r"\[[^]]*\]", lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), printable(head))
 
 
-def _grid(table: Table, part: Sequence[int], title: str, caption: str, width: int) -> Grid:
+def _grid(table: Table, part: Sequence[int], width: int) -> Grid:
     heads = [_whole_units(table.columns[k].head) for k in range(len(table.columns))]
-    grid = Grid(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=Text(title), caption=Text(caption) or None)
+    grid = Grid(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     places = [*range(table.names), *part]
     for k, own in zip(places, _widths(table, places, width), strict=True):
         justify: JustifyMethod = "left" if k < table.names or table.columns[k].left else "right"

@@ -176,6 +176,11 @@ class Sweep(Study):
         """Return what stands behind --set in the command of a run, for every value of a setting."""
         return [shlex.quote(f"{axis.path}={value:.10g}") for value in axis.values]
 
+    @property
+    def ranks(self) -> bool:
+        """Whether one controller may be better than another: there are several, and the figure has a better side."""
+        return len(self.maps) > 1 and self.aim.ranks
+
     @cached_property
     def winners(self) -> np.ndarray:
         """Place of the controller with the best number among `maps`, per cell; -1 where none is alone the best."""
@@ -535,7 +540,7 @@ def _extremes(result: Sweep, one: SweepMap) -> list[str]:
 def _sentences(result: Sweep) -> Iterator[str]:
     """Who is best where, and who fails."""
     cells, places = result.winners.size, result.winners.ravel()
-    if len(result.maps) > 1 and result.aim.ranks:
+    if result.ranks:
         shares = sorted(((int((places == k).sum()), one.controller) for k, one in enumerate(result.maps)), reverse=True)
         best = ", ".join(f"{name} in {count}" for count, name in shares if count)
         yield f"{result.aim.subject[0].upper()}{result.aim.subject[1:]} is best with: {best or 'none alone'} of {cells} cells."

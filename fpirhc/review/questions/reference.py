@@ -5,6 +5,7 @@ A step by `if_else` has the derivative zero, so that no symbolic question sees i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -80,15 +81,11 @@ def _instead(problem: Problem, jump: Jump) -> str:
     """A set-point filtered by one pole more than the coordinate's order, with as many continuous derivatives."""
     plant = problem.plant
     order = plant.chains[jump.state.rstrip("'")]
-    terms = ["1", "w*s", *(f"(w*s)**{k}/{_factorial(k)}" for k in range(2, order + 1))]
+    terms = ["1", "w*s", *(f"(w*s)**{k}/{math.factorial(k)}" for k in range(2, order + 1))]
     return (
         f"Use a filtered set-point: 1 - ca.exp(-w*s) * ({' + '.join(terms)}) with s = ca.fmax(t - {jump.time:.4g}, 0) rises "
         f"from 0 to 1 and has {order} continuous derivative(s); choose the rate w, {problem.rate_unit}, that the limits allow."
     )
-
-
-def _factorial(k: int) -> int:
-    return k if k < 3 else k * _factorial(k - 1)
 
 
 def _motion(problem: Problem, count: int) -> Motion:
