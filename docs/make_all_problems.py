@@ -8,7 +8,7 @@ from typing import Any
 
 import fpirhc as fp
 from fpirhc.controllers import rivals as named
-from fpirhc.problem_files.shipped import missing
+from fpirhc.problem_files.shipped import missing, stated
 
 RIVALS = {*named.__all__, "Estimating"}
 DOCS = Path(__file__).resolve().parent
@@ -17,19 +17,20 @@ PAGE, TRIED = DOCS / "all-problems.md", DOCS / "rivals.json"
 ABOUT = """# All problems in one table
 
 The first rms error of every shipped problem, or the figure that it is judged by, in its unit, seed 0; smaller is better.
-`python docs/make_all_problems.py` writes the page from `problems/baselines` and `problems/gallery/baselines`, and from the tables
-of problems without a baseline, which tests compare with runs; nothing is computed a second time. FPI is the best row with a
-deformation, the rival the best row of `fp.rivals` or with an estimator, and the bound the row of the exact model. Beside them
+`python docs/make_all_problems.py` writes the page from the baselines in the folders of `problems`, and from the tables of problems
+without a baseline, which tests compare with runs; nothing is computed a second time. FPI is the best row with a deformation, the
+rival the best row of `fp.rivals` or with an estimator, and the bound the row of the exact model. Beside them
 `python docs/make_rivals.py` tries PID and ADRC over a grid of settings, and offset-free plans where a problem has no rival, and
 writes the best to `docs/rivals.json`. It is tuned on the run that it is judged by, which the rows of the files are not, with exact
 measurements of all derivatives where the problem has them. These favour a large gain, and often a PID law with its poles at a third
 of the rate of the cycles is the best there is; with noise or a dead time (`noisy_motor`, `delayed_mass`) the iteration leaves less.
 "None holds it" means that even the best has more than ten times the largest error of the table. A row that is not there has a dash.
-An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it is a draw.
+An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it is a draw, and where
+no correction lowers the error by a tenth nobody wins.
 
-Problems that are judged by another figure than an error and have no baseline are not here: `anaesthesia_people`,
-`anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`, `diabetes_announced` and `diabetes_order_five` have tables of their own.
-Problems whose plant is a simulator of another package are in [a table of their own](simulators.md).
+The last column is the sentence `why` of the problem's own file. With people, the error is that of the one person of the file, and
+it is not what counts: the tables of `anaesthesia_people`, `anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`,
+`diabetes_announced` and `diabetes_order_five` lead with the worst person, and no row of the last two is safe.
 
 | problem | quantity | plain | with FPI | best rival | exact model | winner | why |
 |---|---|---|---|---|---|---|---|
@@ -48,7 +49,7 @@ def page() -> str:
 
 def files() -> list[Path]:
     """The problems of the page."""
-    return [*sorted(PROBLEMS.glob("*.py")), *sorted(PROBLEMS.glob("gallery/*.py"))]
+    return [path for folder in ("", "gallery", "outside") for path in sorted((PROBLEMS / folder).glob("*.py"))]
 
 
 def row_of(path: Path, tried: dict[str, Any]) -> tuple[str, ...] | None:
@@ -74,21 +75,7 @@ def row_of(path: Path, tried: dict[str, Any]) -> tuple[str, ...] | None:
     cells = [_cell(base, plain), _cell(best, adapted), _cell(rival, rivals)]
     cells[2] = "none holds it" if lost and not rivals else cells[2]
     bound = _cell(min(exact, key=exact.__getitem__, default=""), exact)
-    winner, why = _judged(plain, adapted[best], rivals.get(rival))
-    if winner == "rival" and rival == tried.get("rival"):
-        why += ": " + (LARGE if _measured_at_once(path) else TUNED)
-    return path.stem, metric, *cells, bound, winner, why
-
-
-LARGE = "tuned on this run, where all is measured exactly and at once, it bears the largest gain that is tried"
-TUNED = "it is tuned on this run"
-
-
-def _measured_at_once(path: Path) -> bool:
-    """Whether a controller has every derivative in the cycle in which it is there, without noise and estimates."""
-    problem = fp.load_problem(str(path)).problem
-    late = any(problem.dead_time.inputs.values()) or problem.dead_time.measurement
-    return problem.sensing.ideal and not late and not problem.sensing.estimates
+    return path.stem, metric, *cells, bound, _winner(plain, adapted[best], rivals.get(rival)), stated(path, "why", "")
 
 
 def _of_baseline(path: Path, stored: Path) -> tuple[str, dict[str, float], dict[str, str]]:
@@ -96,19 +83,16 @@ def _of_baseline(path: Path, stored: Path) -> tuple[str, dict[str, float], dict[
     baseline = json.loads(stored.read_text(encoding="utf-8"))
     controllers, kinds = baseline["controllers"], baseline["settings"]["controllers"]
     first = next(iter(controllers.values()))["metrics"]
-    metric = fp.load_problem(str(path)).headline_metric or next((m for m in first if m.startswith(PREFIX)), "")
+    own = None if missing(path) else fp.load_problem(str(path)).headline_metric
+    metric = own or next((m for m in first if m.startswith(PREFIX)), "")
     errors = {n: float(c["metrics"][metric]["value"]) for n, c in controllers.items() if metric in c["metrics"]}
     return metric.removeprefix(PREFIX), errors, {n: kinds[n]["is"] for n in errors}
 
 
 def _of_table(path: Path) -> tuple[str, dict[str, float], dict[str, str]]:
-    """The same from the description; nothing where the problem is judged by another figure, or its packages are missing."""
-    if missing(path):
-        return "", {}, {}
+    """The same from the description."""
     task = fp.load_problem(str(path))
-    _, found, table = task.description.partition("    rms error, seed 0 ")
-    if task.headline_metric or not found:
-        return "", {}, {}
+    table = task.description.partition("    rms error, seed 0 ")[2]
     head, *lines = table.split("\n\n")[0].splitlines()
     rows = [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in lines]
     kinds = {n: type(task.controllers[n]).__name__ for n, *_ in rows}
@@ -121,19 +105,16 @@ def _cell(name: str, errors: dict[str, float]) -> str:
     return f"{errors[name]:.{2 if errors[name] < FIGURE else 4}g} ({name})"
 
 
-def _judged(plain: dict[str, float], adapted: float, rival: float | None) -> tuple[str, str]:
-    """The winner, and the sentence that says by how much."""
+def _winner(plain: dict[str, float], adapted: float, rival: float | None) -> str:
+    """Who has the smallest number."""
     without = min(plain.values())
-    gain = f"the iteration leaves {adapted / without:.2g} of the error without adaptation"
     if adapted * DRAW > without and (rival is None or rival * DRAW > without):
-        return "nobody", "no correction lowers the error by a tenth"
+        return "nobody"
     if rival is None:
-        return "FPI, no rival", gain
+        return "FPI, no rival"
     if max(adapted, rival) <= DRAW * min(adapted, rival):
-        return "draw", f"{gain}, and the rival as much"
-    if adapted < rival:
-        return "FPI", f"{gain}; the rival has {rival / adapted:.3g} times as much left"
-    return "rival", f"{gain}, {adapted / rival:.3g} times as much as the rival"
+        return "draw"
+    return "FPI" if adapted < rival else "rival"
 
 
 if __name__ == "__main__":

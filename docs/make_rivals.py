@@ -1,4 +1,4 @@
-"""Tries rivals on every shipped problem, and writes the best: python docs/make_rivals.py [PROBLEM ...]
+"""Tries rivals on every shipped problem that needs no other package, and writes the best: python docs/make_rivals.py [PROBLEM ...]
 
 Tried are PID by pole placement on the model, ADRC, and, where the file has no rival, its own plan with a filter that estimates
 disturbances, each over a grid of one rate or one drift; the errors are those of whole runs with seed 0, on which they are tuned. It
@@ -18,6 +18,7 @@ import make_all_problems as page
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.shipped import needed
 
 SHARES = (0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3)  # rate times period
 DRIFTS = tuple(10.0**k for k in range(-3, 4))  # of a disturbance, beside deviations of 1e-3 of all measured states
@@ -79,7 +80,7 @@ def main(names: list[str]) -> None:
     warnings.simplefilter("ignore")
     known = json.loads(page.TRIED.read_text(encoding="utf-8")) if page.TRIED.exists() else {}
     for path in page.files():
-        row = page.row_of(path, {})
+        row = None if needed(path) else page.row_of(path, {})
         if row is None or (names and row[0] not in names):
             continue
         one = best(fp.load_problem(str(path)), row[1], filters=row[4] == "-")

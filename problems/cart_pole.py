@@ -80,6 +80,10 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "What is wrong in the model acts where the force does, on the cart; deformed, the "
+    "cart moves as planned, and so the pole does."
+)
 
 
 def mechanism(q, v, p):

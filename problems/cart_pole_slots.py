@@ -79,3 +79,4 @@ controllers = {
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }
 headline = ("slots", "slots+FPI")
+why = "The pole's recovery from its tilt is what is left, and no model shortens it: a plan that knows the plant has the same error."

@@ -134,3 +134,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
+why = (
+    "The drive yields where the command acts, which one cycle of the iteration corrects; ADRC "
+    "takes the pull of swinging masses for a disturbance."
+)

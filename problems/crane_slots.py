@@ -84,6 +84,10 @@ controllers = {
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }
 headline = ("slots", "slots+FPI")
+why = (
+    "Wrong masses and friction stand in the cart's equation alone; once the cart follows "
+    "its plan the load does, and ADRC plans no swing."
+)
 
 
 def mechanism(q, v, p):

@@ -75,3 +75,7 @@ controllers = {
     "CTC+FPI increment": fp.Predicted(fp.ComputedTorque(law, increment), inputs=DEAD_TIME, by=fp.ByDesired()),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "The increment form compares a response with the command of 60 cycles before, which "
+    "caused it; behind such a delay a filter has to be slow."
+)

@@ -84,3 +84,7 @@ controllers = {
     "RHC not predicting": plain,
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "The pipe holds more water than the tanks react to, so the prediction decides; the "
+    "model's residual corrects it, and the iteration the rest."
+)

@@ -84,3 +84,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "Valve and leak are wrong in the lower tank, an integrator away from the pump: a "
+    "filter tells the plan of them, a deformation cannot."
+)

@@ -75,3 +75,7 @@ controllers = {
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }
 headline = ("slots", "slots+FPI")
+why = (
+    "Both springs are wrong by one factor, so the slots end at the right place, and the force "
+    "corrects what acts on its own derivative at once."
+)

@@ -109,3 +109,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "The finger acts where the voltage does; told of its delay the iteration answers within "
+    "cycles, and a filter has to average the encoder's jitter."
+)

@@ -152,6 +152,10 @@ controllers = {
     "Slotine-Li+FPI": fp.rivals.SlotineLi(6.0, damping, projection, bounds, deformation=sigmoid),
 }
 headline = ("CT", "CT+FPI")
+why = (
+    "Every error of the model is a torque at a driven joint, and angles are exact: ADRC with "
+    "a bandwidth of 300 1/s removes them by gain alone."
+)
 
 
 def mechanism(q, v, p):

@@ -139,3 +139,7 @@ controllers = {
     "Slotine-Li": fp.rivals.SlotineLi(8.0, damping, adaptation, bounds),
 }
 headline = ("CT", "CT+FPI")
+why = (
+    "A count of the encoder moves the acceleration by more than the motion does; ADRC needs "
+    "the angles alone, the iteration the acceleration."
+)

@@ -87,3 +87,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
+why = (
+    "The load is a torque at driven joints, measured without noise: ADRC at 300 1/s corrects "
+    "in every cycle, without a plan of wrong inertia."
+)

@@ -77,3 +77,7 @@ controllers = {
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
 }
 headline = ("slots", "slots+FPI")
+why = (
+    "The valves are wrong by different factors: a slot has an integral for its own "
+    "level, while a plan settles between two levels."
+)

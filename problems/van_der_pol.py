@@ -61,3 +61,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "The wrong springs act where the force does; a quick filter of an exact response is an "
+    "iteration of unit gain, so both leave the same."
+)

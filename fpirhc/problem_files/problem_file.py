@@ -7,7 +7,8 @@ It may also define
 - `headline_metric`, the name of the number by which controllers are compared and tuned, 'in_band' or 'rms_error.q1',
 - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
 - `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
-- `pictures`, a sequence of pictures for the report, in addition to the usual ones.
+- `pictures`, a sequence of pictures for the report, in addition to the usual ones,
+- `why`, a sentence about why the best controller is the best, for the page of all shipped problems.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ import ast
 from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from fpirhc.errors import ProblemFileError
 
@@ -39,13 +40,18 @@ def _problems_in(subfolder: str) -> dict[str, Path]:
 
 def needed(path: Path) -> tuple[str, ...]:
     """Packages that a problem file needs, its line `needs = ("mujoco",)`, without running the file."""
+    return tuple(map(str, stated(path, "needs", ())))
+
+
+def stated(path: Path, name: str, without: Any) -> Any:
+    """Literal value of a name of a problem file, such as `why`, without running the file; `without`: where there is none."""
     try:
         text = path.read_text(encoding="utf-8")
-        body = ast.parse(text).body if "\nneeds" in f"\n{text}" else []
-        values = [s.value for s in body if isinstance(s, ast.Assign) and ast.unparse(s.targets[0]) == "needs"]
-        return tuple(map(str, ast.literal_eval(values[0]))) if values else ()
+        body = ast.parse(text).body if f"\n{name} " in f"\n{text}" else []
+        values = [s.value for s in body if isinstance(s, ast.Assign) and ast.unparse(s.targets[0]) == name]
+        return ast.literal_eval(values[0]) if values else without
     except (OSError, SyntaxError, ValueError, TypeError):
-        return ()
+        return without
 
 
 def missing(path: Path) -> str:

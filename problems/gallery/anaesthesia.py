@@ -118,6 +118,10 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("CTC", "CTC+FPI")
+why = (
+    "Only the curve from drug to bis is wrong, and the iteration corrects the measured "
+    "bis'' at whatever slope; ADRC believes in one slope."
+)
 tuning = {
     "CTC": {"tracking.rate": fp.LogSpan(0.5, 5.0)},  # 1/min
     "CTC+FPI": {"tracking.rate": fp.LogSpan(0.5, 5.0), "deformation.gain": fp.LogSpan(-6.0, -0.5)},

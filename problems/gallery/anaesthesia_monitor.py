@@ -110,6 +110,7 @@ controllers = {
     "cascade, Haar": replace(cascade, deformation=fp.Haar(map_, noise=0.34, levels=3)),  # mg/l of a bis of 3 at 50
 }
 headline = ("pump alone", "cascade, Haar")
+why = "Both add up the error of the bis through the same late monitor; artefacts, which no model foresees, are left to both alike."
 cases = people.cases
 metrics = people.metrics
 headline_metric, pictures = "in_band", people.pictures

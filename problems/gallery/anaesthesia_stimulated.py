@@ -51,3 +51,4 @@ controllers = {
     "RHC exact model": calm.controllers["RHC exact model"],
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
+why = "The stimulation is in the measured bis'' at once; the iteration takes it as it is, a filter as far as noise lets it believe."

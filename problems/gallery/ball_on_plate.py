@@ -103,6 +103,10 @@ controllers = {
     "RHC offset-free": fp.Estimating(plain, filter),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "A camera gives the acceleration late and with noise, so the iteration's gain is small; "
+    "the filter asks for places and velocities alone."
+)
 tuning = {
     "RHC+FPI": {"deformation.map.map.gain": fp.LogSpan(-0.6, -0.02)},
     "RHC offset-free": {"estimator.drift.x": fp.LogSpan(1e-3, 1.0), "estimator.drift.y": fp.LogSpan(1e-3, 1.0)},

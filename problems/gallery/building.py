@@ -144,6 +144,10 @@ controllers = {
     "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "A house that loses more heat than the plan believes is too cold in the evening; the "
+    "iteration and the filter both see it within hours."
+)
 
 
 def outside_the_band(run):

@@ -283,6 +283,10 @@ controllers = {
     ),
 }
 headline = ("RHC", "RHC+FPI on the target")
+why = (
+    "A dose acts for hours and cannot be taken back: lags and unknown meals bound every "
+    "controller, more than its wrong model does."
+)
 cases = fp.Cases({name: changes(name) for name in PEOPLE}, places=table.places)
 GLUCOSE = "plant_output.glucose"
 metrics = (

@@ -44,4 +44,8 @@ controllers = {
     ),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
+why = (
+    "Between dose and sensor are six lags: what the iteration takes for a response is "
+    "noise and meals, and its doses are never negative."
+)
 cases, metrics, headline_metric, pictures = silent.cases, silent.metrics, silent.headline_metric, silent.pictures

@@ -79,6 +79,10 @@ controllers = {
     "CTC+FPI, model-referenced": fp.ComputedTorque(law, fp.ModelReferenced(map_)),
 }
 headline = ("CTC", "CTC+FPI")
+why = (
+    "No row is safe: a meal is in the fifth derivative at once, so the law asks for doses "
+    "that act hours later and cannot be taken out."
+)
 GLUCOSE = "output.glucose"
 metrics = (
     fp.figures.InBand(GLUCOSE, 70.0, 180.0, name="in_range"),

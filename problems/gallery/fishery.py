@@ -80,3 +80,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "One survey a year is compared with what the model expects of the effort; PID has "
+    "neither growth nor recruitment in it, and lags by years."
+)

@@ -113,3 +113,7 @@ problem = replace(
 controllers, headline = economic.controllers, economic.headline
 metrics, headline_metric = economic.metrics, economic.headline_metric
 pictures = (*economic.pictures, fp.OverTime("Signs", panels=tuple(f"command.{name}" for name in SIGNS)))
+why = (
+    "The balance of cars at the merge holds whatever the model's speeds are, and a new "
+    "plan every minute corrects what the speeds do."
+)

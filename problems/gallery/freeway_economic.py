@@ -112,6 +112,10 @@ controllers = {
     "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI")
+why = (
+    "The balance of cars at the merge holds whatever the model's speeds are; to follow the "
+    "density of a wrong plan undoes what the next corrects."
+)
 metrics = (
     fp.figures.Largest("plant_state.spent", name="time_spent"),
     fp.figures.Largest("plant_state.w2", name="queue"),

@@ -137,6 +137,10 @@ controllers = {
     "CTC exact model": fp.ExactModel(fp.ComputedTorque(law)),
 }
 headline = ("CTC", "CTC+FPI")
+why = (
+    "The density shows after a minute what slow merging does, and the iteration takes it "
+    "back; ADRC takes the traffic for an integrator."
+)
 pictures = (
     fp.HeatMap(
         "Density along the road",

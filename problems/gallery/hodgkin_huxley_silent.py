@@ -34,5 +34,9 @@ problem = replace(
 )
 controllers = wave.controllers
 headline = wave.headline
+why = (
+    "A constant current beside the commanded one is all that happens: whatever adds up "
+    "the error removes it, ADRC at 60 1/ms first."
+)
 tuning = wave.tuning
 pictures = wave.pictures[:1]

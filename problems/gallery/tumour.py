@@ -87,6 +87,10 @@ controllers = {
     "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
+why = (
+    "The logarithm of the volume is linear in the dose, and the wrong numbers act like a "
+    "dose that hardly changes: an integral takes it away."
+)
 tuning = {
     "CTC+FPI": {"deformation.gain": fp.LogSpan(1e-5, 1.5e-3)},  # day^2
     "RHC+FPI, model-referenced": {"deformation.map.gain": fp.LogSpan(-4.0, -0.1)},

@@ -34,5 +34,9 @@ controllers = {
     "RHC+FPI, gentle": quick.controllers["RHC"].with_deformation(small),
 }
 headline = quick.headline
+why = (
+    "The step of the dose is a constant disturbance: the filter's model of one is right, "
+    "and so is what the iteration adds from day to day."
+)
 tuning = quick.tuning
 pictures = quick.pictures

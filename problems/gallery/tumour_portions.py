@@ -45,3 +45,7 @@ reality = fp.Plant.of_states(
 problem = replace(often.problem, reality=fp.Reality(reality, integrator=FINE), integrator=FINE, period=0.5)  # day
 controllers = {name: often.controllers[name] for name in ("CTC", "RHC", "RHC+FPI, model-referenced", "RHC+FPI")}
 headline = often.headline
+why = (
+    "Half of the drug is gone within a cycle: the iteration passes at once what the model "
+    "expects, which PID at two doses a day does not know."
+)

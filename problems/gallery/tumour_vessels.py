@@ -79,3 +79,7 @@ controllers = {
     "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
+why = (
+    "The plan begins where the wrong model has the measured volume and its derivatives, "
+    "and the iteration acts on the third, as PID does."
+)

@@ -34,5 +34,9 @@ controllers = {
     "RHC+FPI, gentle": quick.controllers["RHC"].with_deformation(small),
 }
 headline = quick.headline
+why = (
+    "The model's error follows the thrust; the iteration corrects it with the newest "
+    "response, and a filter's plan takes it for constant."
+)
 tuning = quick.tuning
 pictures = quick.pictures

@@ -65,3 +65,4 @@ controllers = {
     "PD": fp.PID(proportional={"side": 0.1}, derivative={"side": 0.05}),
 }
 headline = ("RHC", "RHC+FPI")
+why = "Tyres answer late, so the iteration's gain stays below one; the filter has a gain of its own for side, rate and response."

@@ -56,3 +56,4 @@ controllers = {
     "PI of the course": fp.PID(proportional={"T1": 5.98, "T2": 11.96}, integral={"T1": 5.98 / 175, "T2": 11.96 / 175}),
 }
 headline = ("RHC", "RHC+FPI")
+why = "The iteration is told of a lag of 60 s through which heat comes; a filter without one takes the heat under way for a loss."

@@ -56,7 +56,6 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=12, step=PERIOD, lengths=tuple(1.2**k for k in range(12))),
     cost=fp.Quadratic(states=weights, deviation={"M1": 1e-3, "M2": 1e-3}),
 )
-
 plain = fp.RecedingHorizon(optimiser := fp.FixedPoint(iterations=1, tolerance=1e-3))  # N m
 seen = {f"{joint}{dash}": size for joint in rest for dash, size in {"": 0.01, "'": 0.01, "''": 0.1}.items()}
 filter = fp.DisturbanceKalman(drift=dict.fromkeys(rest, 100.0), measured=seen)
@@ -68,3 +67,4 @@ controllers = {
     "CTC": fp.ComputedTorque(fp.Exponential(rate=8.0)),
 }
 headline = ("RHC", "RHC+FPI")
+why = "Friction and tool are torques at driven joints, measured exactly: a quick filter has unit gain, and its plan knows of them."

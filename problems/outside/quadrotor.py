@@ -56,7 +56,6 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=20, step=5e-2),
     cost=fp.Quadratic(states=weights, deviation=dict.fromkeys(plant.inputs, 1.0)),
 )
-
 plain = fp.RecedingHorizon(optimiser := fp.FixedPoint(iterations=1, tolerance=1e-2))  # m/s^2
 deviations = {**{f"{n}{dash}": 0.01 for n in AXES for dash in ("", "'")}, "x''": 1.0, "y''": 1.0, "z''": 0.1}
 filter = fp.DisturbanceKalman(drift={"x": 1.0, "y": 1.0, "z": 10.0}, measured=deviations)  # slower where attitude lags
@@ -68,3 +67,4 @@ controllers = {
     "CTC": fp.ComputedTorque(fp.Exponential(rate=3.0)),
 }
 headline = ("RHC", "RHC+FPI")
+why = "Wind and payload change slowly and the attitude lags: a filter may be slower sideways, and one gain for all axes may not."

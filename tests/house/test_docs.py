@@ -215,6 +215,8 @@ def test_page_of_all_problems_is_that_of_baselines_and_tables():
     rows = {line.split(" | ")[0].strip("| "): line.split(" | ") for line in page.splitlines() if line.startswith("| ")}
     assert (rows["hodgkin_huxley"][6], rows["order_four"][6], rows["tumour"][6]) == ("rival", "FPI", "rival")
     assert (rows["three_link_arm"][6], rows["turbojet_slow"][6], rows["freeway"][6]) == ("rival", "FPI", "draw")
+    reasons = {name: rows[name][7].strip(" |") for name in (path.stem for path in maker.files())}
+    assert [name for name, why in reasons.items() if not re.fullmatch(r"[A-Z]([^.]|\.\d){60,160}\.", why)] == []
 
 
 @pytest.mark.slow
