@@ -30,7 +30,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
 from fpirhc.task.disturbance import disturbed_place
 from fpirhc.task.exogenous import model_values, real_values
-from fpirhc.task.external_plant import ExternalPlant
+from fpirhc.task.external_plant import ExternalPlant, quantities
 from fpirhc.task.problem import Problem
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
@@ -274,7 +274,8 @@ class Body(Mover):
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)
         self._body = body
-        self.measures = body.measures
+        units = quantities(problem.plant)
+        self.measures = {name: units[name] for name in body.measures}
 
     def exchange(self, seed: int) -> Exchange:
         return _Conversation(self.problem, self._body, seed)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import queue
 import threading
 import time as wall
-from collections.abc import Callable, Collection, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, NoReturn, Protocol, TypeVar
@@ -55,8 +56,9 @@ class ExternalPlant(Checked):
 
     Args:
         body: object with `reset(seed)` and `step(time, command)`, see `Body`; None: `make` makes it.
-        measures: name -> unit of every measured quantity, in the order of its answers: elements of the model's state ("q1", "q1'"),
-            outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled ("q1''").
+        measures: names of what it measures, or name -> unit, in the order of its answers: elements of the model's state ("q1",
+            "q1'"), outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled
+            ("q1''"). Units are those of the model; stated ones are compared with them.
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
         deadline: longest wall time of a step's answer, s; a later one is bad. With a deadline the body is called by a thread of its
             own: where it does not return, it is given up, and called again when it has returned. None: it may take its time, as a
@@ -76,7 +78,7 @@ class ExternalPlant(Checked):
     """
 
     body: Body | None = None
-    measures: Mapping[str, str] = field(default_factory=dict)
+    measures: Mapping[str, str] | Sequence[str] = field(default_factory=dict)
     holds: CountOrZero = 0
     deadline: Positive | None = None
     reset_deadline: Positive = 10.0
@@ -99,6 +101,9 @@ class ExternalPlant(Checked):
                 "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body"
             )
         mistakes = Mistakes("ExternalPlant")
+        for name, times in Counter([*self.measures]).items():
+            if times > 1:
+                mistakes.add(f"measures: {name} is named {times} times; an answer has every quantity once")
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
         mistake = "" if self.body is None else _wrong_body(self.body)
@@ -215,7 +220,8 @@ class ExternalPlant(Checked):
                     f"it does not measure {name} ({units[name]}), which the sensing of the problem needs; add it to measures, or "
                     "choose an estimator that does without: Sensing(estimator=...)"
                 )
-        for name, unit in self.measures.items():
+        stated = self.measures if isinstance(self.measures, Mapping) else {}
+        for name, unit in stated.items():
             if units.get(name, unit) != unit:
                 mistakes.add(f"it measures {name} in {unit}, the model has it in {units[name]}; write both in one unit")
         mistakes.raise_if_any()

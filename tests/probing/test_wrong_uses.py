@@ -74,9 +74,9 @@ WRONG: dict[str, tuple[Any, str]] = {
         "sensing of the problem needs; add it to measures, or choose an estimator that does without: "
         "Sensing(estimator=...)",
     ),
-    "names alone": (
-        lambda: outside(measures=["q", "q'", "q''"]),
-        "ExternalPlant.measures: expected {name: a text}, got ['q', \"q'\", \"q''\"]",
+    "a name twice": (
+        lambda: outside(measures=["q", "q", "q''"]),
+        "ExternalPlant: measures: q is named 2 times; an answer has every quantity once",
     ),
     "another unit": (
         lambda: outside(measures=MEASURES | {"q": "mm"}),

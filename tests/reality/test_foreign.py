@@ -207,10 +207,11 @@ def test_a_clock_that_shows_no_time_is_named(clock):
 def test_positions_alone_are_enough_for_an_estimator():
     """A body that measures y only runs with an estimator; errors are then those of the estimate."""
     problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))
-    foreign = fp.ExternalPlant(Wrapped(problem, ("y",)), measures={"y": "m"})
+    foreign = fp.ExternalPlant(Wrapped(problem, ("y",)), measures=["y"])
     one, other = run(problem), run(replace(problem, reality=foreign))
     assert np.abs(one["command"] - other["command"]).max() < 1e-9 * np.abs(one["command"]).max()
     assert np.array_equal(other["foreign.y"], other["measured.y"])
+    assert other.layout["foreign"].entry_units == ("m",)
 
 
 @pytest.mark.parametrize("kind", BAD)
@@ -507,7 +508,10 @@ WRONG: dict[str, tuple[Any, str]] = {
         "its body is the class Stepless; write Stepless() for an object of it",
     ),
     "a body that is none": (lambda: loose(object()), "its body is a value of the class object without reset and step"),
-    "measures as a list": (lambda: loose(measures=["y"]), "measures: expected {name: a text}, got ['y']"),
+    "not all as a list": (
+        lambda: task(reality=loose(measures=["y"])),
+        "it does not measure y' (m/s), which the sensing",
+    ),
     "nothing measured": (lambda: task(reality=loose(measures={})), "it does not measure y (m), which the sensing"),
     "not all": (lambda: task(reality=loose(measures={"y": "m", "y'": "m/s"})), "y'' (m/s^2), which the sensing"),
     "a name": (lambda: task(reality=loose(measures={**MEASURES, "yy": "m"})), "'yy' is unknown. Did you mean 'y'?"),

@@ -72,7 +72,7 @@ def compare(
     seed: Seed,
     controllers: Sequence[str] | None = None,
     headline: str | None = None,
-    compiled: bool = True,
+    compiled: bool | None = True,
     command: str = "",
     progress: Progress | None = None,
     changes: Mapping[str, Changes] | None = None,
@@ -86,7 +86,7 @@ def compare(
         seed: of the disturbances and the noise.
         controllers: names of controllers; None: all.
         headline: number of which the verdict speaks first, 'in_band' or 'rms_error.q1'; None: the problem's, or errors alone.
-        compiled: whether runs use compiled C.
+        compiled: whether runs use compiled C; None: unless they are short.
         command: the command line, for the report.
         progress: function of (controller, cycles done, cycles in all).
         changes: numbers of settings from a time on, by time in s, by controller.
@@ -184,7 +184,7 @@ def _entries(
     task: Task,
     controllers: Mapping[str, Controller],
     seed: int,
-    compiled: bool,
+    compiled: bool | None,
     progress: Progress | None,
     built: dict[str, Built],
     changes: Mapping[str, Changes],
@@ -212,7 +212,7 @@ def _entry(
     name: str,
     controller: Controller,
     seed: int,
-    compiled: bool,
+    compiled: bool | None,
     progress: Progress | None,
     built: dict[str, Built],
     changes: Changes,
@@ -227,6 +227,7 @@ def _entry(
     report(0, problem.cycles)
     live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
     loop = simulator(problem, ready, compiled=compiled, live=live)
+    compiled = loop.compiled if compiled is None else compiled
     run = judged_run(loop, seed=seed, name=name, progress=report, changes=changes)
     adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
     broken = list(cast(Sequence[str], run.settings.get("broken", ())))

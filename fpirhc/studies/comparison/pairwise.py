@@ -304,7 +304,7 @@ def partners(
     controllers: Mapping[str, Controller],
     *,
     seed: int,
-    compiled: bool,
+    compiled: bool | None,
     metrics: Sequence[Metric] | None = None,
 ) -> tuple[dict[str, tuple[Entry, Simulator]], dict[str, str]]:
     """Return runs without adaptation of the adaptive rows that have no pair, by row, and why others have none."""
