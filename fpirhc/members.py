@@ -1,13 +1,8 @@
 """Members of families, found by a search of the packages: an addition is one new file.
 
-A family is a contract (a class such as `Deformation`) and a package. Its members are the modules below that package, and
-the modules of other distributions that name themselves in the entry-point group `fpirhc.members`. A member's module
-
-- defines one or more concrete classes of the contract, and
-- carries `EXAMPLES`, values of these classes that the conformance laws use; a module whose members wrap another value has a
-  function `examples(inner)` instead, which returns values around any inner one.
-
-A controller or an estimator that needs a problem of its own stands there as an `Example`.
+A family is a contract and a package; modules of other distributions are in the entry-point group `fpirhc.members`. A member's
+module defines concrete classes of the contract, and has `EXAMPLES`, values that the conformance laws use, or, where its members
+wrap another value, `examples(inner)`. What needs a problem of its own stands there as an `Example`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
 """Devices on a CAN bus as the reality of a problem, by python-can.
 
-    bus = can.Bus(interface="socketcan", channel="can0")
-    speed, torque = Field(0x181, "<h", scale=0.1), Field(0x201, "<f")
-    body = can_body(bus, model, period=2e-3, measures={"w": speed}, inputs={"M": torque}, oldest=5e-3)
-
 A value is that of the newest message of its identifier, standard or extended, and its age that of the message's time stamp. Error
 frames are bad answers; remote frames, which ask for a value, are none.
 """
@@ -52,6 +48,10 @@ def can_body(
     clock: RealTime | None = None,
 ) -> ExternalPlant:
     """Return what hangs on a CAN bus as a reality.
+
+        bus = can.Bus(interface="socketcan", channel="can0")
+        speed, torque = Field(0x181, "<h", scale=0.1), Field(0x201, "<f")
+        body = can_body(bus, model, period=2e-3, measures={"w": speed}, inputs={"M": torque}, oldest=5e-3)
 
     Args:
         bus: `can.Bus(...)`.

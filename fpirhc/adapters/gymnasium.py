@@ -1,9 +1,5 @@
 """A Gymnasium environment as the reality of a problem.
 
-    env = gymnasium.make("Pendulum-v1")
-    measures = {"th": lambda seen: np.arctan2(seen[1], seen[0]), "th'": 2}
-    problem = fp.Problem(plant=model, reality=gymnasium_body(env, model, measures=measures), ...)
-
 The period of the problem must be the time that one step of the environment takes. An environment does not state it, so another one
 is refused only where it is written: `dataclasses.replace(gymnasium_body(...), period=0.05)`. Rewards are not read; an end that is
 not one of time (`terminated`) is a bad answer and ends the run.
@@ -27,6 +23,10 @@ Read = int | Callable[[Any], float]
 @adapter
 def gymnasium_body(env: Any, model: Plant, *, measures: Mapping[str, Read]) -> ExternalPlant:
     """Return an environment as a reality.
+
+        env = gymnasium.make("Pendulum-v1")
+        measures = {"th": lambda seen: np.arctan2(seen[1], seen[0]), "th'": 2}
+        problem = fp.Problem(plant=model, reality=gymnasium_body(env, model, measures=measures), ...)
 
     Args:
         env: environment whose actions are a `Box` of the model's inputs, in their order and units.

@@ -1,9 +1,5 @@
 """A baseline: a readable JSON file with one metric per line, and a checksum that shows edits by hand.
 
-    {"format": 1, "problem", "reason", "date", "seed", "versions", "varied",
-     "settings": {"hash", "problem", "controllers"}, "controllers": {name: {"outcomes", "metrics", "not_compared"}},
-     "checksum"}
-
 The checksum is over the content: white space and the order of keys do not matter. It is no signature. The file stands beside the
 problem, `baselines/NAME.json`, so that both change together; `unchecked.toml` there names problems without one, and why.
 """

@@ -1,15 +1,7 @@
-"""Laws that every member of a family keeps; one line tries them on a user's class.
+"""Laws that every member of a family keeps; one line tries them on a user's class, `check_deformation(MyMap(gain=-0.5), seed=1)`.
 
-    check_deformation(MyMap(gain=-0.5), seed=1)
-    check_tracking(MyLaw(rate=6.0), seed=1)
-    check_optimiser(MyOptimiser(tolerance=1e-6), tolerance=1e-6, seed=1)
-    check_controller(MyController(...), seed=1)
-    check_observer(MyBelief(...), seed=1)
-    check_plant(my_plant, seed=1)
-    check_live(problem, MyController(...))
-
-Each raises one AssertionError for the first law that is broken, with the numbers, and returns nothing (`check_live`: what became of
-every number). The laws are the tuples `LAWS` of the modules, one module per family.
+Each function raises one AssertionError for the first law that is broken, with the numbers, and returns nothing (`check_live`: what
+became of every number). The laws are the tuples `LAWS` of the modules, one module per family.
 """
 
 import lazy_loader as _lazy

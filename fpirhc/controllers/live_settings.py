@@ -2,9 +2,7 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-A path begins at the controller, or at the problem. The path of an interval stands for its ends, 'limits.inputs.Q1.0' and '.1'.
-Automatic settings, such as the scale of a sigmoid, follow from the others. A number that no block reads may be live where the loop
-is the same one for others. The exact parameters of a reality are data of every loop: 'reality.plant.parameters.m.exact'.
+Automatic settings, such as the scale of a sigmoid, follow from the others. See docs/live-settings.md.
 """
 
 from __future__ import annotations

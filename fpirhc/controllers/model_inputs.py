@@ -3,8 +3,7 @@
     parameters, time -> parameters with the values of this cycle -> controller
     last command -> dead time of the input -> whole cycles of the measurement's dead time -> lag of the actuator -> model
 
-A response that is measured at the end of a cycle belongs to the signals of that cycle, so a model that is compared with it is given
-the signals of the last cycle, `_signals_acted`. A parallel model and an observer stand behind the same path.
+A model is compared with a response that ends a cycle: it is given the signals of the last cycle, `_signals_acted`.
 """
 
 from __future__ import annotations

@@ -2,9 +2,7 @@
 
     model predicts -> what no sensor shows is taken from the prediction -> estimator -> observer corrects
 
-The response is the estimator's, from what is measured; controllers that learn from it are refused where it would be the model's.
-The state has each entry from where it is known best: believed entries from the observer, the others from the estimator. Outputs of
-a plant are measured or estimated, as 'output' beside 'state'.
+The state has each entry from where it is known best: believed entries from the observer, the others from the estimator.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """The motion of a plant: named quantities with units, two sets of parameters, and their CasADi Functions.
 
-With the state x = (q, q', ...), derivative-major, and a forcing w that adds to the highest derivatives,
+    response    r = f(x, u, p),        algebraic states    z(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w)
 
-    response    r = f(x, u, p),        algebraic states    z(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w).
-
-Those of a map are its divided differences over one control cycle; see `fpirhc.plant.maps`.
+with the state x = (q, q', ...), derivative-major, and a forcing w that adds to the highest derivatives.
 """
 
 from __future__ import annotations

@@ -2,9 +2,7 @@
 
     f_i = sum_j lambda_ij (G m)_j + w_i + n_i,        G: d cycles, then x_k = rho x_{k-1} + (1 - rho) m_k with rho = e^(-T / tau)
 
-w drifts (white noise, integrated p times), n is noise (white, or a difference of white noise where positions are differentiated).
-For every d, tau and share of the drift the differences are whitened, and lambda is least squares: the exact profile of the
-likelihood, as in L. Ljung, System Identification, 1999, sec. 7.4. It is consistent in closed loop: every loop has a cycle of delay.
+For every d, tau and share of the drift w the differences are whitened, and lambda is least squares. Theory: docs/probe.md.
 """
 
 from __future__ import annotations

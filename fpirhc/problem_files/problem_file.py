@@ -1,15 +1,4 @@
-"""Problem files: a shipped one is found by its name, a user's one by its path.
-
-A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}). The first line of its docstring is its title.
-It may also define
-- `headline`, a pair (controller without adaptation, the same one with it) for the verdict,
-- `cases`, a `Cases`: named cases for `fpirhc compare --cases`,
-- `headline_metric`, the name of the number by which controllers are compared and tuned, 'in_band' or 'rms_error.q1',
-- `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
-- `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
-- `pictures`, a sequence of pictures for the report, in addition to the usual ones,
-- `why`, a sentence about why the best controller is the best, for the page of all shipped problems.
-"""
+"""Problem files: a shipped one is found by its name, a user's one by its path."""
 
 from __future__ import annotations
 
@@ -111,6 +100,18 @@ class Task(FoundByName):
 @checked_call
 def load_problem(name_or_path: str | Path) -> Task:
     """Import a problem file and check its definitions.
+
+    A problem file defines `problem` (a Problem) and `controllers` ({name: Controller}). The first line of its docstring is its
+    title.
+    It may also define
+
+    - `headline`, a pair (controller without adaptation, the same one with it) for the verdict,
+    - `cases`, a `Cases`: named cases for `fpirhc compare --cases`,
+    - `headline_metric`, the name of the number by which controllers are compared and tuned, 'in_band' or 'rms_error.q1',
+    - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
+    - `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
+    - `pictures`, a sequence of pictures for the report, in addition to the usual ones,
+    - `why`, a sentence about why the best controller is the best, for the page of all shipped problems.
 
     Args:
         name_or_path: name of a shipped problem, or path of a file.

@@ -1,10 +1,8 @@
 """State and response from positions alone, by a filter whose own states are the derivatives.
 
-    y_0 = q,   y_j' = w (y_{j-1} - y_j),   j = 1 ... n,      q^(s) seen as w^s sum_i (-1)^i C(s, i) y_{n-s+i},
+    y_0 = q,   y_j' = w (y_{j-1} - y_j),   j = 1 ... n,      q^(s) seen as w^s sum_i (-1)^i C(s, i) y_{n-s+i}
 
-the s-th derivative of the position q through n low-passes of bandwidth w; the position itself is not filtered. The trapezoidal rule
-discretises the filter, with p = (2 - w T) / (2 + w T), so that constant derivatives are exact. The response is late by about n / w,
-and one count of an encoder makes it jump by w^n counts: a wide filter is noisy, a narrow filter is late.
+discretised by the trapezoidal rule, so that constant derivatives are exact. Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

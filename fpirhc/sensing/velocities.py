@@ -1,10 +1,8 @@
 """The response as the difference of the highest measured derivative, where the whole state is measured.
 
-A request is held for one cycle, so the difference of y^(n-1) over the period is exactly the mean response to the last request: the
-ideal pair, without delay. Noise of deviation sigma becomes sqrt(2) sigma / T. A first-order low-pass with the time constant tau and
-the pole p = exp(-T / tau) reduces it by the factor (1 - p) / sqrt(1 + p) and adds a delay of p / (1 - p) cycles,
+    f_k = p f_{k-1} + (1 - p) (y^(n-1)_k - y^(n-1)_{k-1}) / T,        p = exp(-T / tau)
 
-    f_k = p f_{k-1} + (1 - p) (y^(n-1)_k - y^(n-1)_{k-1}) / T.
+Without filter (p = 0) it is the mean response to the last request: the ideal pair. Theory: docs/theory-estimation.md.
 """
 
 from __future__ import annotations

@@ -1,16 +1,8 @@
 """Guaranteed bounds of a CasADi Function over a box of its arguments, by affine arithmetic.
 
-Interval arithmetic treats every occurrence of an argument as another argument: a determinant whose entries move together gets
-intervals that contain zero. An affine form keeps what moves together,
+    y = c + sum_i a_i s_i + e s_0,        |s_i| <= 1,        s_i of the i-th argument, s_0 of the form itself
 
-    y = c + sum_i a_i s_i + e s_0,        |s_i| <= 1,        s_i of the i-th argument, s_0 of the form itself,
-
-and every operation of the expanded Function maps forms to a form that contains all its values: sums are exact, products add
-the product of the radii to e, and a curved function is its tangent plus the bound of its second derivative. Every operation also
-adds the bound of its rounding. The excess of the bounds is quadratic in the width of the box. Comparisons and signs have bounds
-where they are decided all over the box, because bounds by derivatives do not see a jump.
-
-Source: L. H. de Figueiredo, J. Stolfi, Affine arithmetic: concepts and applications, Numerical Algorithms 37, 2004.
+Every operation of the expanded Function maps forms to a form that contains all its values. Theory: docs/certificate.md.
 """
 
 from __future__ import annotations

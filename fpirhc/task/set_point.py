@@ -1,10 +1,8 @@
-"""Set-points: values that a run is given while it runs, and a filter that makes a motion of them.
+"""Set-points: values that a run is given while it runs, and a filter, part of the controller's step, that makes a motion of them.
 
     (d/dt + a)^m y = a^m w       for every coordinate y with its set-point w
 
-The filter is discretised exactly for a set-point that is held over a cycle (`FilterBank`), so that motion, velocity and
-response belong together. It is a part of the controller's step. A horizon sees the free motion of the filter from its state of this
-cycle, with the set-point held; announced set-points are held until the node at which they change.
+It is discretised exactly for a set-point that is held over a cycle, so that motion, velocity and response belong together.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
 import pkgutil
@@ -83,6 +84,13 @@ def test_what_overrides_nothing_documented_has_a_docstring_of_its_own():
     described = {name: inspect.isfunction(value) or isinstance(value, property) for name, value in public.items()}
     assert sum(described.values()) > 1000
     assert sorted(name for name in public if described[name] and not inspect.getdoc(public[name])) == []
+
+
+def test_a_file_says_its_idea_in_at_most_six_lines():
+    """A reader comes to the contract at once; what is longer is theory, and has a page."""
+    texts = {one.relative_to(ROOT): one.read_text(encoding="utf-8") for one in (ROOT / "fpirhc").rglob("*.py")}
+    headers = {name: ast.get_docstring(ast.parse(text), clean=False) for name, text in texts.items()}
+    assert [name for name, header in headers.items() if not header or len(header.splitlines()) > 6] == []
 
 
 def test_an_adapter_has_at_most_sixty_lines_of_code():

@@ -1,10 +1,8 @@
 """The estimated parameters of a controller that learns: the block that moves them, and the checks before a run.
 
-The equation that rules learn from uses the last command u and the response q'' to it: u = Q(q, q', q''; p) is exact, so
+    h = M_hat^-1 (u - Q(q, q', q''; p_hat)) = M_hat^-1 Y(q, q', q'') (p - p_hat)
 
-    h = M_hat^-1 (u - Q(q, q', q''; p_hat)) = M_hat^-1 Y(q, q', q'') (p - p_hat).
-
-In terms of a deformation h = r - q'', where r is the response that the present model expects of the last command.
+with the last command u and the response q'' to it: u = Q(q, q', q''; p) is exact. Theory: docs/theory-rivals.md.
 """
 
 from __future__ import annotations

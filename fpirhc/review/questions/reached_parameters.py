@@ -1,10 +1,8 @@
 """Does the deformation reach the wrong parameters? It corrects the response of the controlled coordinates and nothing else.
 
-A parameter that is not in this response, such as the load behind a flexible shaft whose motor is controlled, leaves the response
-Jacobian that of a right model: there is nothing to adapt. Whether a parameter is in the response is a fact of the symbols. How much
-it counts is the change of the response,
+    |response(x^N, u*; exact, but this parameter believed) - response(x^N, u*; exact)|
 
-    |response(x^N, u*; exact, but this parameter believed) - response(x^N, u*; exact)|.
+A parameter that is not in this response, such as the load behind a flexible shaft whose motor is controlled, is not adapted to.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """A linear loop with long delay lines: what comes out of one is what went in, many cycles later.
 
-A line of N entries is N states that only wait. Without them the loop is z+ = F0 z + sum_j f_j w_j, where w_j is an entry of z some
-cycles ago, and its poles are the zeros of
+    det M(z) = 0,    M(z) = z I - F0 - sum_j f_j e_j' z^(-l_j)
 
-    det M(z),    M(z) = z I - F0 - sum_j f_j e_j' z^(-l_j).
-
-Their number outside a circle is n less the turns of det M along it, by the argument principle: far away det M(z) is z^n. A pole on
-the circle counts as one outside.
+are its poles without the lines' entries, counted by the argument principle. Theory: docs/theory-questions.md.
 """
 
 from __future__ import annotations

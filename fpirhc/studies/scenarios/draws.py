@@ -1,10 +1,8 @@
 """Scenarios, random or named: what is the same for every controller of a comparison.
 
 Random scenario k of a seed is always the same: its numbers come from a stream of its own, `SeedSequence(seed, spawn_key=(use, k))`,
-whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Every exact parameter
-is drawn from its range (see `fpirhc.plant.plant`): by its own spread, or without one multiplied by a factor of its own, the
-logarithm of which is uniform between log(1 - P/100) and log(1 + P/100). Dead times are those of the problem, or P percent shorter
-or longer, rounded away from it to whole cycles: another length of a queue is another loop, so there are three and no more.
+whatever the number of scenarios, of processes and of controllers, and in whatever order they run. Dead times are those of the
+problem, or shorter or longer by whole cycles: another length of a queue is another loop.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """An append-only file of results that survives being killed at any moment.
 
-Every line is one JSON object. The first line is a header with the conditions of the results; a file with another header is refused.
-The last entry of a line is its checksum, 'sum', so that a damaged digit is noticed; a file of an older version has none at all.
-Every line is with the system before `append` returns, so a killed process loses none. It is on the disk a second or 100 records
-later: what a machine loses that goes down is computed again. A last line that is torn is cut off. Only one process may have the
-file open.
+Every line is one JSON object; the first one has the conditions of the results, the last entry of each its checksum, 'sum'. A line
+is with the system before `append` returns, and on the disk a second or 100 records later. A torn last line is cut off. Only one
+process may have the file open.
 """
 
 from __future__ import annotations
