@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -98,8 +99,9 @@ def apart_from_a_run(
     return float(worst[0]), float(worst[1])
 
 
-def apart_with_samples_of_a_run(run: fp.Run, columns: list[str], path: Path, cycles: int) -> float:
-    """Return how far a unit's commands are from those of a run, at most, where it is given the samples of the run.
+def with_samples_of_a_run(run: fp.Run, columns: list[str], path: Path, cycles: int) -> tuple[float, np.ndarray, float]:
+    """Return what a unit does with the samples of a run: how far its commands are from those of the run, at most, the commands,
+    and the median of the times of a cycle, s.
 
     Args:
         run: a log.
@@ -108,11 +110,14 @@ def apart_with_samples_of_a_run(run: fp.Run, columns: list[str], path: Path, cyc
         cycles: from the start, at most.
     """
     rows, period = np.hstack([run[name].reshape(len(run.time), -1) for name in columns]), run.period
-    worst = 0.0
+    commands, times = [], []
     with master(path) as unit:
         inputs, outputs = unit.names("input"), unit.names("output")
         for k, row in enumerate(rows[:cycles]):
+            began = perf_counter()
             unit.set(inputs, row)
-            worst = max(worst, float(np.abs(unit.get(outputs) - run["command"][k]).max()))
+            commands.append(unit.get(outputs))
             unit.step(k * period, period)
-    return worst
+            times.append(perf_counter() - began)
+    made = np.array(commands)
+    return float(np.abs(made - run["command"][: len(made)]).max()), made, float(np.median(times))

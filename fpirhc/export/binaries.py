@@ -27,6 +27,7 @@ PLATFORMS = {  # and the names that zig has for them
     "x86_64-darwin": "x86_64-macos",
     "aarch64-darwin": "aarch64-macos",
 }
+WEB_STACK = 262144  # bytes, which hold the deepest plan
 
 # Headers of a libc, and of it what is reached, which makes no system calls.
 _THUMB = "thumb-linux-musleabihf"
@@ -81,24 +82,30 @@ def own_compiler() -> str:
 def web_module(files: Mapping[str, str]) -> bytes:
     """Return a WebAssembly module of C files, without imports."""
     package("ziglang", "compiler", "the target wasm")
-    # 256 kB hold the deepest plan; zig's own 16 MB are all that a page would ask for.
-    flags = ("-mexec-model=reactor", "-Wl,-z,stack-size=262144", "-Wl,--no-entry")
+    # zig's own 16 MB are all that a page would ask for.
+    flags = ("-mexec-model=reactor", f"-Wl,-z,stack-size={WEB_STACK}", "-Wl,--no-entry")
     return _compiled(files, [*_ZIG, "wasm32-wasi", *flags], "wasm32")
 
 
-def arm_programs(files: Mapping[str, str], around: Mapping[str, str], script: str) -> dict[str, bytes]:
-    """Return a program and a library of C files by processor, "m7.elf", "m7.a" and so on; M7 computes in double, M4F in float."""
+def arm_programs(
+    files: Mapping[str, str], around: Mapping[str, str], script: str
+) -> tuple[dict[str, bytes], dict[str, str]]:
+    """Return a program and a library of C files by processor, "m7.elf", "m7.a" and so on; M7 computes in double, M4F in float.
+
+    And by processor what the compiler says of the stack frames of the files.
+    """
     package("ziglang", "cortex", "the target cortex-m")
-    made: dict[str, bytes] = {}
+    made, said = dict[str, bytes](), dict[str, str]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for file, text in {**files, **around, "board.ld": script}.items():
             (folder / file).write_text(text, encoding="utf-8")
         for place, flags in _CORTEX.items():
             library, others = (
-                [_object(folder, file, place, flags) for file in part if file.endswith(".c")]
+                dict(_object(folder, file, place, flags) for file in part if file.endswith(".c"))
                 for part in (files, around)
             )
+            said[place] = "".join(library.values())
             program, archive = folder / f"{place}.elf", folder / f"{place}.a"
             image = (
                 "-static",
@@ -110,23 +117,25 @@ def arm_programs(files: Mapping[str, str], around: Mapping[str, str], script: st
             _done([*_ZIG, _THUMB, *flags, *image, "-o", str(program)], f"no program for {place}")
             _done([*_ZIG[:3], "ar", "rcs", str(archive), *map(str, library)], f"no library for {place}")
             made |= {path.name: path.read_bytes() for path in (program, archive)}
-    return made
+    return made, said
 
 
-def _object(folder: Path, file: str, place: str, flags: Sequence[str]) -> Path:
+def _object(folder: Path, file: str, place: str, flags: Sequence[str]) -> tuple[Path, str]:
+    """An object, and what the compiler says of the stack frames of its functions."""
     made = folder / f"{Path(file).stem}_{place}.o"
-    own = ("-std=c99", "-O2", "-ffp-contract=off", *_BARE, *flags)
-    _done([*_ZIG, _THUMB, *own, "-c", str(folder / file), "-o", str(made)], f"no object for {place}")
-    return made
+    own = ("-std=c99", "-O2", "-ffp-contract=off", "-Wframe-larger-than=0", *_BARE, *flags)
+    return made, _done([*_ZIG, _THUMB, *own, "-c", str(folder / file), "-o", str(made)], f"no object for {place}")
 
 
-def _done(command: Sequence[str], otherwise: str) -> None:
+def _done(command: Sequence[str], otherwise: str) -> str:
+    """Run a command and return what it complains of."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     except OSError as error:
         raise CompileError(f"{otherwise}: '{command[0]}' cannot be started: {error.strerror}") from None
     if done.returncode != 0:
         raise CompileError(f"{otherwise}: {done.stderr.strip()[-2000:]}")
+    return done.stderr
 
 
 def _compilers() -> dict[str, list[str]]:

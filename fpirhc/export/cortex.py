@@ -29,9 +29,10 @@ class Image:
         InvalidValue: it cannot be read, or is no whole 32-bit ELF file for ARM.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, of: Path | bytes) -> None:
+        path = of if isinstance(of, Path) else Path("an image")
         try:
-            self.bytes = path.read_bytes()
+            self.bytes = of.read_bytes() if isinstance(of, Path) else of
             if self.bytes[:6] != b"\x7fELF\x01\x01" or self.bytes[18:20] != b"\x28\x00":
                 raise ValueError
             self._read()
@@ -74,6 +75,7 @@ class Board:
         unicorn = package("unicorn", "cortex", "a Cortex-M without a board")
         self._registers = package("unicorn.arm_const", "cortex")
         self._source, self._to, self._sizes = source, to, dict[tuple[int, int], int]()
+        self._places = image.places
         self._counted, self._back, self._now = image.symbols.get(counted, (-1, 0))[0], -1, 0
         self.counts: list[int] = []
         self._unit: Any = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB)
@@ -91,6 +93,11 @@ class Board:
         """Run from reset to the program's end."""
         self._unit.reg_write(self._registers.UC_ARM_REG_SP, self._stack)
         self._unit.emu_start(self._begin, 0xFFFFFFFE)
+
+    def stack(self) -> int:
+        """Return the bytes of stack that were written: memory that no one has written is zero."""
+        behind = max(at + size for at, size in self._places if at >> 28 == self._stack >> 28)
+        return len(bytes(self._unit.mem_read(behind, self._stack - behind)).lstrip(b"\0"))
 
     def _block(self, unit: Any, address: int, size: int, _: object) -> None:
         """Count the instructions between the entry of the counted function and its return."""

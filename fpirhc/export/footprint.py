@@ -9,36 +9,54 @@ from __future__ import annotations
 import re
 import subprocess
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import casadi as ca
 
+from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.export.device import Device
 from fpirhc.export.targets.c import sources
 from fpirhc.plant.motion import NEWTON_ITERATIONS
 from fpirhc.symbolic.native import find_compiler
+from fpirhc.symbolic.paths import changed_at, paths_to
 
+_FEW = 2  # iterations that a step with few of them has
 _STILL = frozenset((ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, ca.OP_PARAMETER))
 
 
 def worst_case(device: Device) -> str:
-    """Return the worst case as a line: operations always, bytes where there is a compiler that counts them."""
+    """Return the worst case in operations, as a line."""
     most = operations(device.stepper.function)
-    text = f"{most} operations of a step{_iterations(device)}"
     missed = 0 if device.bare else device.most_missed
-    text += f", {missed + 1} times as many after {missed} missed cycles" if missed else ""
+    text = f"{most} operations of a step"
+    return (
+        text + (f", {missed + 1} times as many after {missed} missed cycles" if missed else "") + _fewer(device, most)
+    )
+
+
+def bytes_here(device: Device) -> str:
+    """Return the bytes of the controller on this machine as a line, empty without a compiler that counts them."""
     sizes = _bytes(device)
     if sizes is None:
-        return text
+        return ""
     flash, ram, stack = sizes
-    return f"{text}; {flash} bytes of code without exp and the like, {ram} of RAM, {stack} of stack (double, -Os, this machine)"
+    return f"here with -Os: {flash} bytes of code without exp and the like, {ram} of RAM, at most {stack} of stack\n"
 
 
-def _iterations(device: Device) -> str:
-    """What bounds the iterations of a plan, where the controller plans."""
-    planner = device.controller.planner
-    bounds = [] if planner is None else [f"{name} = {count}" for name, count in planner.optimiser.most_work.items()]
-    return f" with {' and '.join(bounds)} at most" if bounds else ""
+def _fewer(device: Device, most: int) -> str:
+    """What bounds the iterations of a call, and what a lower bound would bring; empty where that is little."""
+    controller, text = device.controller, ""
+    bounds = {} if controller.planner is None else controller.planner.optimiser.most_work
+    for name, count in bounds.items():
+        for path in paths_to(name, controller) if count > _FEW else ():
+            fewer = operations(compose_with_sensing(device.problem, changed_at(controller, path, _FEW)).function)
+            if fewer < most / 2:
+                text += (
+                    f"; with {path}={count}. With {_FEW} there are {fewer}: a plan that is not solved then has the status "
+                    "NOT_CONVERGED, and the next call goes on with it"
+                )
+    return text
 
 
 def operations(function: ca.Function) -> int:
@@ -106,6 +124,24 @@ def _bytes(device: Device) -> tuple[int, int, int] | None:
         except (OSError, subprocess.CalledProcessError):
             return None
         rows = [[int(word) for word in line.split()[:3]] for line in done.stdout.splitlines()[1:]]
-        frames = [re.findall(r"\t(\d+)\t", path.read_text()) for path in folder.glob("*.su")]
         struct = rows[-1][1] + rows[-1][2]
-        return sum(row[0] + row[1] for row in rows[:-1]), struct, sum(max(map(int, own), default=0) for own in frames)
+        return sum(row[0] + row[1] for row in rows[:-1]), struct, deepest(said_by_gcc(folder), device.name)
+
+
+def said_by_gcc(folder: Path) -> list[tuple[str, str]]:
+    """Return functions with the bytes of their stack frames, as -fstack-usage has left them in a folder."""
+    return [one for path in folder.glob("*.su") for one in re.findall(r":(\w+)\t(\d+)\t", path.read_text())]
+
+
+def said_by_clang(text: str) -> list[tuple[str, str]]:
+    """Return functions with the bytes of their stack frames, as -Wframe-larger-than=0 has told them."""
+    return [(name, size) for size, name in re.findall(r"stack frame size \((\d+)\).*? in '(\w+)'", text)]
+
+
+def deepest(frames: Iterable[tuple[str, str]], name: str) -> int:
+    """Return bytes of stack that no step exceeds: no function calls itself, so all their frames together.
+
+    What is called between two steps has less.
+    """
+    between = {f"{name}_{one}" for one in ("init", "reset", "set")}
+    return sum(int(size) for function, size in frames if function not in between)

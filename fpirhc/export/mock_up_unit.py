@@ -98,7 +98,22 @@ def mock_up_unit(device: Device, interface: Interface) -> Mapping[str, str | byt
         if platform in interface.folders:
             ending = ENDINGS[platform.rpartition("-")[2]]
             contents[f"binaries/{interface.folders[platform]}/{device.name}{ending}"] = library
-    return {f"{device.name}.fmu": _archive(contents), "README.md": _page(device, interface, variables, contents)}
+    return {
+        f"{device.name}.fmu": _archive(contents),
+        "README.md": _page(device, interface, variables, contents),
+        "sizes.txt": _sizes(device, contents),
+    }
+
+
+def _sizes(device: Device, contents: Mapping[str, str | bytes]) -> str:
+    """Bytes of each library, and those of the struct of unit.c that every instance allocates, on a processor of 64 bits."""
+    work, stepper = device.sizes, device.stepper
+    data = sum(layout.size for layout in data_of(device).values())
+    numbers = 3 * stepper.memory.size + stepper.signals.size + data + work["w"] + device.inputs.size
+    words = numbers + stepper.signals["command"].size + work["arg"] + work["res"] + work["iw"] + 3
+    libraries = {name: len(data) for name, data in contents.items() if name.startswith("binaries/")}
+    lines = [f"{name}: {size} bytes\n" for name, size in libraries.items()]
+    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n"])
 
 
 # Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest

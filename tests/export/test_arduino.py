@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
@@ -19,7 +20,7 @@ from uno import answered
 import fpirhc as fp
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.device import Device
-from fpirhc.export.footprint import operations, worst_case
+from fpirhc.export.footprint import bytes_here, operations, worst_case
 from fpirhc.export.target import device_of, target_called, write
 from fpirhc.plant.motion import NEWTON_ITERATIONS
 from fpirhc.symbolic.native import find_compiler
@@ -85,11 +86,18 @@ def test_operations_are_those_of_the_longest_way():
 
 @needs_compiler
 def test_a_worst_case_names_missed_cycles_and_bytes():
-    """After missed cycles a step does the work of all of them; a bare one never does."""
+    """After missed cycles a step does the work of all of them; a bare one never does. What fewer iterations bring is told."""
     gated, bare = worst_case(device("CTC+FPI (eq 6)", bare=False)), worst_case(device("CTC+FPI (eq 6)"))
     assert re.match(r"\d+ operations of a step, 501 times as many after 500 missed cycles", gated)
-    assert re.match(r"\d+ operations of a step(; \d+ bytes of code .*|)$", bare)
+    assert re.fullmatch(r"\d+ operations of a step", bare)
     assert int(bare.split()[0]) < 0.3 * int(gated.split()[0])
+    assert re.match(r"here with -Os: \d+ bytes of code .*, at most \d+ of stack", bytes_here(device("CTC+FPI (eq 6)")))
+    task = fp.load_problem("two_mass")
+    limited = replace(task.problem, limits=replace(task.problem.limits, states={"q1": (1.85, 2.35)}))
+    told = worst_case(device_of(limited, task.controllers["RHC+FPI"], "RHC+FPI", cycles=1))
+    found = re.match(r"(\d+) .* with optimiser\.most_iterations=100\. With 2 there are (\d+): ", told)
+    assert found is not None
+    assert int(found[2]) < int(found[1]) / 25
 
 
 @needs_compiler

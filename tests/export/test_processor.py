@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import queue
 import re
 import shutil
@@ -308,6 +309,13 @@ def test_a_cortex_m7_has_the_bits_of_this_machine(name, tmp_path):
     doubles, floats = (np.array([_numbers(line) for line in one[2:42]]) for one in (here, short))
     assert (doubles[:, 0] == floats[:, 0]).all()
     np.testing.assert_allclose(floats, doubles, rtol=1e-3, atol=1e-3 * np.abs(doubles).max())
+    said = (tmp_path / "m" / "sizes.txt").read_text()
+    for place, told in zip(("m7", "m4f"), re.findall(r"(\d+) of RAM, at most (\d+) of stack", said), strict=True):
+        image = Image(tmp_path / "m" / f"arm_{place}.elf")
+        board = cortex.Board(image, io.BytesIO(lines.encode()), io.BytesIO())
+        board.run()
+        assert board.stack() <= int(told[1]) + 200  # of the console
+        assert image.size(0x20000000) == int(told[0])
 
 
 def _numbers(line: str) -> list[float]:
@@ -361,7 +369,7 @@ unsigned SysTick_Config(unsigned ticks); void __WFI(void); void SysTick_Handler(
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 def test_the_example_for_boards_compiles_against_the_names_of_cmsis(tmp_path, monkeypatch):
     """The names that CMSIS declares stand in a header of the test; libraries are not built here."""
-    monkeypatch.setattr("fpirhc.export.targets.cortex_m.arm_programs", lambda *_: {})
+    monkeypatch.setattr("fpirhc.export.targets.cortex_m.arm_programs", lambda *_: ({}, {}))
     exported("torque", tmp_path, "cortex-m")
     (tmp_path / "cmsis.h").write_text(CMSIS)
     strict = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", '-DBOARD_HEADER="cmsis.h"']

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 import zipfile
 from pathlib import Path
 
@@ -73,6 +75,15 @@ def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_
     assert command < 1e-11
     assert apart_from_a_run(device.problem, device.controller, path, 500, late=True)[1] > 1.0
     assert "every command one period late" in (tmp_path / "README.md").read_text()
+    with zipfile.ZipFile(path) as archive:
+        archive.extractall(tmp_path / "in")
+    (tmp_path / "in" / "size.c").write_text('#include "sources/unit_fmu.c"\nchar size_of_it[sizeof(cycle_state)];\n')
+    compiled = [str(find_compiler()), "-Isources", "-c", "size.c", "-o", "size.o"]
+    subprocess.run(compiled, cwd=tmp_path / "in", check=True)
+    symbols = subprocess.run(["nm", "-S", "size.o"], cwd=tmp_path / "in", capture_output=True, text=True, check=True)
+    size = re.search(r"\w+ (\w+) \w size_of_it", symbols.stdout)
+    assert size is not None
+    assert f"an instance: {int(size[1], 16)} bytes of RAM" in (tmp_path / "sizes.txt").read_text()
 
 
 @needs_compiler

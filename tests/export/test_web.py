@@ -116,6 +116,7 @@ def in_wasmtime(folder: Path) -> str:
     if "_initialize" in e:
         e["_initialize"](store)
     e["init"](store)
+    assert f"memory: {e['memory'].data_len(store)} bytes" in (folder / "sizes.txt").read_text()
     memory, given, made, kept = e["memory"], *(e[n](store) for n in ("inputs", "command", "memory_of_controller"))
     data = (folder / "samples.bin").read_bytes()
     cycles, inputs, commands, _ = struct.unpack_from("<4i", data)

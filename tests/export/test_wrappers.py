@@ -273,7 +273,7 @@ def test_a_plant_whose_time_is_in_years_has_no_plugin(tmp_path):
 )
 def test_examples_for_boards_keep_the_pace_of_the_controller(period, unit, paced, monkeypatch):
     """An Arduino counts microseconds, and the system tick of a Cortex-M whole shares of a period, of at most a millisecond."""
-    monkeypatch.setattr("fpirhc.export.targets.cortex_m.arm_programs", lambda *_: {})
+    monkeypatch.setattr("fpirhc.export.targets.cortex_m.arm_programs", lambda *_: ({}, {}))
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)
     plant = fp.Plant(
         coordinates={"x": "m"},

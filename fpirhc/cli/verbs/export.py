@@ -38,7 +38,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
-    from fpirhc.export.footprint import worst_case
+    from fpirhc.export.footprint import bytes_here, worst_case
     from fpirhc.export.target import device_of, in_the_loop, processor_of, target_called, write
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.studies.comparison.compare import select
@@ -63,8 +63,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
     sizes = {"memory": device.stepper.memory.size, "trace": device.stepper.signals.size, "work": device.sizes["w"]}
     print(f"numbers of one controller: {', '.join(f'{size} of {what}' for what, size in sizes.items())}")
     print(f"worst case: {worst_case(device)}")
-    if target.told:
-        print((Path(options.out) / target.told).read_text(encoding="utf-8"), end="")
+    told = Path(options.out) / target.told
+    print(told.read_text(encoding="utf-8") if target.told else bytes_here(device), end="")
     if options.bare:
         print(
             "bare: no sample is checked; one that is no number stays in the memory until the next reset. Missed cycles are not "

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from fpirhc.errors import CompileError, InvalidValue, NotSupported
 from fpirhc.export.device import Device
+from fpirhc.export.footprint import deepest, said_by_gcc
 from fpirhc.export.target import Target, device_of
 from fpirhc.export.targets.c import IN_FLOAT, filled, layout_of, seconds, sources
 from fpirhc.plant.motion import SECONDS
@@ -167,8 +168,7 @@ def size_on(files: Mapping[str, str], name: str, board: _Board) -> _Size:
             if done.returncode:
                 raise CompileError(f"no program for the board {board.name}: {done.stderr.strip()[-2000:]}")
         code, data, bss = (int(word) for word in done.stdout.splitlines()[1].split()[:3])
-        frames = [[int(line.split("\t")[1]) for line in p.read_text().splitlines()] for p in folder.glob("*.su")]
-        return _Size(code + data + _STARTED, data + bss, sum(max(own, default=0) for own in frames) + 32)
+        return _Size(code + data + _STARTED, data + bss, deepest(said_by_gcc(folder), name) + 32)
 
 
 def _in_float(text: str) -> str:

@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fpirhc.export.binaries import arm_programs
+from fpirhc.export.cortex import Image
 from fpirhc.export.device import Device
+from fpirhc.export.footprint import deepest, said_by_clang
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, seconds, sources
@@ -23,7 +25,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     name = device.name
     own, script = sources(device), filled(device, "board.ld")
     around = {file: filled(device, file) for file in ("processor.c", "board.c")}
-    made = arm_programs(own, around, script)
+    made, said = arm_programs(own, around, script)
     return {
         **own,
         **around,
@@ -31,8 +33,20 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         "example.c": filled(device, "example.c", unit=device.problem.plant.time_unit, pace=_pace(device)),
         "layout.json": json.dumps(layout_of(device), indent=1),
         "samples.bin": recorded(device),
+        "sizes.txt": "".join(
+            _size(Image(made[f"{place}.elf"]), what, deepest(said_by_clang(said[place]), name))
+            for place, what in (("m7", "Cortex-M7, double"), ("m4f", "Cortex-M4F, float"))
+            if place in said
+        ),
         **{(f"{name}_{file}" if file.endswith(".elf") else f"lib{name}_{file}"): data for file, data in made.items()},
     }
+
+
+def _size(image: Image, what: str, stack: int) -> str:
+    return (
+        f"{what}: {image.size(0)} bytes of flash with exp and the like and the console of processor.c, "
+        f"{image.size(0x20000000)} of RAM, at most {stack} of stack\n"
+    )
 
 
 def _pace(device: Device) -> str:
@@ -54,4 +68,5 @@ TARGET = Target(
     _files,
     libm="own",
     processor=_processor,
+    told="sizes.txt",
 )

@@ -48,5 +48,8 @@ _FMI3 = Interface(
     folders={platform: platform for platform in PLATFORMS},
 )
 TARGET = Target(
-    "fmu", "FMI 3.0 unit for co-simulation, with sources and libraries", lambda one: mock_up_unit(one, _FMI3)
+    "fmu",
+    "FMI 3.0 unit for co-simulation, with sources and libraries",
+    lambda one: mock_up_unit(one, _FMI3),
+    told="sizes.txt",
 )
