@@ -54,7 +54,7 @@ plant = fp.Plant(
 
 problem = fp.Problem(
     plant=plant,
-    reference=fp.Trajectory(lambda t: {"cart": 0 * t, "angle": 0 * t}),
+    reference=fp.Setpoint({"cart": 0.0, "angle": 0.0}, rate=2.0),  # 1/s
     start={"cart": -1.0, "angle": 0.0},
     period=5e-3,  # s
     duration=26.5,  # s, five periods of the schedule

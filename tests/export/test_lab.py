@@ -92,10 +92,13 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
         path = next(p for p in paths if p.startswith(ends[0]) and p.endswith(ends[1]))
         moved[path] = ratio * paths[path].value
     exact, approximate, gain = moved
-    noise = [s.path for s in lab.sliders if s.rows]
+    noise = [s.path for s in lab.sliders if s.rows and s.rows[0].scaled]
     assert noise == (["sensing.sensors.speed.noise.deviation"] if name == "noisy_motor" else [])
     assert all(paths[path].unit == "rad/s" for path in noise)
-    assert "reference.scale" in paths
+    assert [s.path for s in lab.sliders if s.rows and s.path not in noise] == (
+        ["setpoints.cart.0", "setpoints.angle.0"] if name == "crane_slots" else []
+    )
+    assert ("reference.scale" in paths) == (name in ("two_mass", "turbojet"))
     moved |= {path: 0.7 * paths[path].value for path in noise}
     said = answers(lab, moved, tmp_path)
     for loop, one in zip(lab.loops, said, strict=True):
@@ -165,14 +168,17 @@ def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_stat
 
 
 def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):
-    """The first plan follows from the upper limit of the motor's voltage; a zero has no scale."""
+    """The first plan follows from the upper limit of the motor's voltage; a zero and a motion that rests have no scale."""
     monkeypatch.setattr(module, "package", lambda *_: None)
     lab = made("noisy_motor", duration=0.5, controllers=["RHC"])
     paths = {s.path for s in lab.sliders}
     assert {"exact.k", "approximate.k"} & paths or len(paths) > 5
     assert "only Python does that" in lab.without["limits.inputs.voltage.1"]
+    assert lab.without["reference.scale"] == "the reference stays where it begins whatever it is"
     assert lab.without["approximate.coulomb"] == "it is zero: nothing says how far a slider would go"
     assert not paths & set(lab.without)
+    people = {s.path: s for s in made("anaesthesia_people", controllers=["pump alone"]).sliders}
+    assert people["approximate.E0"].high == 100  # the parameter's own bound
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def test_a_scale_goes_from_the_first_point():
 
 @pytest.mark.parametrize(
     ("name", "title"),
-    [("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("fishery", "RHC+FPI"), ("crane_slots", "slots+FPI"),
+    [("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("fishery", "RHC+FPI"), ("mass_spring_slots", "slots+FPI"),
      ("delayed_mass", "RHC+FPI"), ("planar_arm", "AID+FPI")],
 )  # fmt: skip
 def test_a_live_scale_is_that_of_a_task_with_it(name, title):

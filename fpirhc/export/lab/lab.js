@@ -141,27 +141,34 @@ function remember() {
   const moved = DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : [[s.path, now[k]]]));
   link(moved);
   const among = (test) => moved.filter(([p]) => test(p));
-  const sides = /^(exact|approximate)\.(.*)/, late = /^dead_time\.inputs\.(.*)/, points = /^setpoints\.(.*)\.(\d+)$/;
+  const sides = /^(exact|approximate)\.(.*)/, points = /^setpoints\.(.*)\.(\d+)$/;
   const scaled = (p) => DATA.sliders.some((s) => s.path === p && s.rows.some((one) => one.scaled));
-  const listed = (list) => list.map(([p, v]) => `"${p}": ${v}`).join(", ");
+  const listed = (list) => "{" + list.map(([p, v]) => `"${p}": ${v}`).join(", ") + "}";
   const numbers = among((p) => sides.test(p) || scaled(p)).map(([p, v]) => [p.replace(sides, "plant.parameters.$2.$1"), v]);
-  const waits = among((p) => late.test(p)).map(([p, v]) => [p.replace(late, "$1"), v]);
   const aims = structuredClone(DATA.setPoints), changed = new Set();
   for (const [p, v] of among((p) => points.test(p))) {
     const [, name, k] = p.match(points);
     aims[name][k][1] = v;
     changed.add(name);
   }
-  const settings = among((p) => ![sides, late, points].some((one) => one.test(p)) && !scaled(p));
-  const lines = ["import fpirhc as fp", ...(waits.length ? ["from dataclasses import replace"] : []), "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, "problem = task.problem"];
-  if (numbers.length) lines.push(`problem = fp.with_settings(problem, {${listed(numbers)}})`);
-  if (waits.length) lines.push(`inputs = {**problem.dead_time.inputs, ${listed(waits)}}`, "problem = replace(problem, dead_time=replace(problem.dead_time, inputs=inputs))");
+  const settings = among((p) => ![sides, points].some((one) => one.test(p)) && !scaled(p));
   const aimed = changed.size ? `, setpoints={${[...changed].map((name) => `"${name}": ${JSON.stringify(aims[name])}`).join(", ")}}` : "";
-  for (const loop of DATA.loops) {
-    const own = settings.filter(([p]) => loop.live.includes(p));
-    const given = (own.length ? `, settings={${listed(own)}}` : "") + aimed;
-    lines.push(`print(fp.simulate(problem, task.controllers[${JSON.stringify(loop.name)}], seed=0${given}))`);
-  }
+  // Each loop as it was built for this page, and a run of it with other numbers; a controller that is built with them has another first
+  // plan. A change at time 0 leaves the plan, and a setting does not.
+  const texts = DATA.loops.map((loop) => {
+    const own = settings.filter(([p]) => loop.live.includes(p)), late = own.some(([p]) => p.startsWith("dead_time.inputs."));
+    const times = ["inputs", "longest"].map((key) => `${key}=${listed(Object.entries(loop.late[key]))}`).join(", ");
+    const problem = late ? `problem = replace(task.problem, dead_time=replace(task.problem.dead_time, ${times}))` : "problem = task.problem";
+    const built = `problem, task.controllers[${JSON.stringify(loop.name)}]`, of = (which) => own.filter(([p]) => p.startsWith("reference.") === which);
+    const given = (of(false).length ? `, settings=${listed(of(false))}` : "") + (of(true).length ? `, changes={0.0: ${listed(of(true))}}` : "") + aimed;
+    const live = own.length ? `, live=${JSON.stringify(own.map(([p]) => p))}` : "";
+    return numbers.length
+      ? [problem, `loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0, variant=fp.with_settings(problem, ${listed(numbers)})${given}))`]
+      : [problem, `print(fp.simulate(${built}, seed=0${given}))`];
+  });
+  const all = texts.flatMap((own, k) => (k && own[0] === texts[k - 1][0] ? own.slice(1) : own));
+  const lines = ["import fpirhc as fp", ...(all.some((one) => one.includes("replace(")) ? ["from dataclasses import replace"] : []), "",
+    `task = fp.load_problem(${JSON.stringify(DATA.file)})`, ...all];
   say("python", lines.join("\n"));
 }
 

@@ -211,7 +211,7 @@ def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, s
                 continue
             places = _places(loops, lambda loop, other=other: loop.started(other, {}), path, without)  # type: ignore[misc]
             if places:
-                low, high = sorted((value / _SPAN, value * _SPAN))
+                low, high = np.clip(sorted((value / _SPAN, value * _SPAN)), *parameter.bounds).tolist()
                 sliders.append(Slider(path, parameter.unit, float(value), low, high, places))
     return sliders
 
@@ -297,6 +297,10 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
             without[path] = "its bounds leave no room"
             continue
 
+        if path.startswith("reference.") and not _moves(having[0].ready.problem, path, step):
+            without[path] = "the reference stays where it begins whatever it is"
+            continue
+
         def started(loop: LabLoop, path: str = path, step: float = step) -> np.ndarray:
             return loop.started(loop.ready.problem, {path: step} if path in loop.ready.live.paths else {})
 
@@ -304,6 +308,14 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
         if places:
             sliders.append(Slider(path, unit_of_setting(path, having[0].ready.problem), value, low, high, places))
     return sliders
+
+
+def _moves(problem: Problem, path: str, number: float) -> bool:
+    """Whether another number of a reference gives another motion; motions towards set-points follow those of the run."""
+    times = np.arange(problem.cycles)[None] * problem.period
+    motions = (one.reference.function(one.plant)(times) for one in (problem, changed_at(problem, path, number)))
+    one, other = (np.vstack([part.full() for part in parts]) for parts in motions)
+    return bool(problem.reference.set_points) or not np.array_equal(one, other)
 
 
 def _places(
@@ -393,6 +405,7 @@ def _own(name: str) -> str:
 
 
 def _loop_data(loop: LabLoop) -> dict[str, Any]:
+    late = loop.ready.problem.dead_time
     return {
         "name": loop.name,
         "module": base64.b64encode(loop.module).decode(),
@@ -403,6 +416,7 @@ def _loop_data(loop: LabLoop) -> dict[str, Any]:
         "shown": len(loop.shown),
         "errors": len(loop.ready.loop.trace[loop.error].columns),
         "live": list(loop.ready.live.paths),
+        "late": {"inputs": dict(late.inputs), "longest": dict(late.longest)},
         "frame": loop.frame,
         "shapes": loop.shapes,
         "responses": loop.factor.size1_out(0) if loop.factor else 0,
