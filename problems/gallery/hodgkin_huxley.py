@@ -105,7 +105,7 @@ controllers = {
     "RHC+FPI, model-referenced": fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=-1.8))),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),  # the plain form, as published
     "RHC offset-free": fp.Estimating(plain, filter, at_once=True),
-    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-2))),
+    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(fp.FixedPoint(iterations=10, tolerance=1e-2))),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
 why = (
