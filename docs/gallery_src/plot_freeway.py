@@ -8,6 +8,9 @@ model has free traffic that is slower, a light that lets more cars through, and 
 where vehicles merge.
 """
 
+import sys
+from pathlib import Path
+
 import matplotlib.pyplot as plt
 
 import fpirhc as fp
@@ -89,15 +92,24 @@ rate.set_xlabel("time [h]")
 # %%
 # A third task is economic: the least time that all cars spend, on the road and in
 # queues. A plan of seven minutes meters the ramp, and at most 100 cars may wait. The rates
-# of the exact model are those of the published run.
+# of the exact model are those of the published run. These runs take minutes, so they are
+# kept in files, which ``python plot_freeway.py --renew`` writes anew. The offset-free plan
+# finds nothing to estimate, and its rates are those of RHC.
+
+
+def kept(task, name):
+    """A run that is kept beside this page."""
+    path = Path(__file__).parent / "kept" / f"{task.name}, {name}.npz"
+    if "--renew" in sys.argv:
+        fp.simulate(task.problem, task.controllers[name], seed=0, compiled=False).save(
+            path
+        )
+    return fp.load_run(path)
+
 
 economic = fp.load_problem("freeway_economic")
-runs = {
-    name: fp.simulate(economic.problem, controller, seed=0, compiled=False)
-    for name, controller in economic.controllers.items()
-    if name
-    != "RHC offset-free"  # it finds nothing to estimate, and its rates are those of RHC
-}
+names = ("RHC", "RHC+FPI", "RHC exact model")
+runs = {name: kept(economic, name) for name in names}
 figure, (rate, queue) = plt.subplots(
     2, 1, sharex=True, figsize=(8, 4.5), layout="constrained"
 )
@@ -153,12 +165,7 @@ print(
 # With the exact model the plan lowers the third segment's sign before the queue is full:
 # traffic waits on the road, and the ramp empties into the gap.
 
-run = fp.simulate(
-    coordinated.problem,
-    coordinated.controllers["RHC exact model"],
-    seed=0,
-    compiled=False,
-)
+run = kept(coordinated, "RHC exact model")
 figure, (signs, rate, queue) = plt.subplots(
     3, 1, sharex=True, figsize=(8, 6), layout="constrained"
 )

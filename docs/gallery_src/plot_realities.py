@@ -4,12 +4,16 @@ A rigid model and realities that are not
 
 The model is a mass of 1.5 kg, u = m x''. What moves is a mass of 1 kg behind an actuator with a lag,
 behind a spring, on bristles, or seen by a slow sensor. Where does each form of the iteration help,
-and what did the review say before? Every number on this page is computed when it is built. How a
-reality is written, also one with other states than the model, is in `docs/extending/reality.md`.
+and what did the review say before? Runs and reviews take some minutes, so their numbers are kept in a file,
+which ``python plot_realities.py --renew`` writes anew. How a reality is written, also one with other states
+than the model, is in `docs/extending/reality.md`.
 """
 
+import json
+import sys
 import textwrap
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import matplotlib.pyplot as plt
@@ -136,7 +140,33 @@ def row(reality):
     ]
 
 
-errors = np.array([row(reality) for reality in realities.values()])
+QUESTIONS = "reality converge?", "lag of the reality", "resonance"
+
+
+def answers(reality):
+    """What the review says of the reality, by controller: verdict, question, evidence."""
+    real = replace(problem, reality=reality)
+    adaptive = {n: c for n, c in controllers.items() if "none" not in n}
+    review = fp.review(real, adaptive, mismatch=0.0, seed=0)
+    return {
+        name: [
+            (str(a.verdict), a.question, a.evidence)
+            for a in found
+            if any(words in a.question for words in QUESTIONS)
+        ]
+        for name, found in review.controllers.items()
+    }
+
+
+file = Path(__file__).parent / "kept" / "realities.json"
+if "--renew" in sys.argv:
+    found = {
+        "errors": {name: row(reality) for name, reality in realities.items()},
+        "answers": {n: answers(r) for n, r in realities.items() if r is not None},
+    }
+    file.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+kept = json.loads(file.read_text(encoding="utf-8"))
+errors, reviews = np.array(list(kept["errors"].values())), kept["answers"]
 laws, size = ("RHC", "CTC"), len(forms)
 print("rms error of x, mm" + " " * 6 + "".join(f"{law:<{11 * size}s}" for law in laws))
 print(
@@ -150,29 +180,25 @@ for name, numbers in zip(realities, errors, strict=True):
 # along the reference. A cell has the factor by which the form made the error of the run
 # smaller, and the review's answer to "Does the loop with the reality converge?".
 
-reviews, agree = {}, []
+agree = []
 print(" " * 24 + "".join(f"{law:<{13 * (size - 1)}s}" for law in laws))
 print(
     " " * 24
     + "".join(f"{form.removeprefix('model-'):<13s}" for form in [*forms][1:] * 2)
 )
-for (name, reality), numbers in zip(realities.items(), errors, strict=True):
-    if reality is None:
+for name, numbers in zip(realities, errors, strict=True):
+    if name not in reviews:
         continue
-    real, cells = replace(problem, reality=reality), []
-    adaptive = {n: c for n, c in controllers.items() if "none" not in n}
-    reviews[name] = fp.review(real, adaptive, mismatch=0.0, seed=0).controllers
+    cells = []
     without = dict(zip(laws, numbers[::size], strict=True))
     for one, error in zip(controllers, numbers, strict=True):
-        if one in adaptive:
-            [answer] = [
-                a
-                for a in reviews[name][one]
-                if a.question == "Does the loop with the reality converge?"
+        if one in reviews[name]:
+            [verdict] = [
+                v for v, question, _ in reviews[name][one] if "converge?" in question
             ]
             factor = without[one[:3]] / error
-            cells.append(f"{f'{factor:.3g} {answer.verdict!s}':<13s}")
-            agree.append((factor > 1) == (str(answer.verdict) == "yes"))
+            cells.append(f"{f'{factor:.3g} {verdict}':<13s}")
+            agree.append((factor > 1) == (verdict == "yes"))
     print(f"{name:24s}" + "".join(cells))
 print(f"The answer was right in {sum(agree)} of {len(agree)} cases.")
 
@@ -189,11 +215,11 @@ print(f"The answer was right in {sum(agree)} of {len(agree)} cases.")
 # in the review; here it is made in every tenth. `fpirhc review my_problem.py` asks all of this
 # about a problem of your own.
 
-for name, answers in reviews.items():
-    for answer in answers["CTC, increment"]:
-        if "lag of the reality" in answer.question or "resonance" in answer.question:
-            print(f"{name}: {answer.verdict!s}. {answer.question}")
-            print(textwrap.indent(textwrap.fill(answer.evidence, 80), "    "))
+for name, found in reviews.items():
+    for verdict, question, evidence in found["CTC, increment"]:
+        if "converge?" not in question:
+            print(f"{name}: {verdict}. {question}")
+            print(textwrap.indent(textwrap.fill(evidence, 80), "    "))
 
 # %%
 # The picture: how many times smaller the error becomes by adaptation.

@@ -219,6 +219,24 @@ def test_page_of_all_problems_is_that_of_baselines_and_tables():
     assert [name for name, why in reasons.items() if not re.fullmatch(r"[A-Z]([^.]|\.\d){60,160}\.", why)] == []
 
 
+def test_runs_that_pages_of_the_gallery_keep_are_those_of_the_baselines():
+    """`--renew` writes them anew; the figure that the problem is judged by is that of `check`, by name of the file."""
+    for file in (DOCS / "gallery_src" / "kept").glob("*.npz"):
+        name, controller = file.stem.split(", ")
+        task, run = fp.load_problem(name), fp.load_run(file)
+        stored = json.loads((task.path.parent / "baselines" / f"{name}.json").read_text(encoding="utf-8"))
+        value = stored["controllers"][controller]["metrics"][task.headline_metric]["value"]
+        assert fp.measure(task.problem, run, task.metrics)[task.headline_metric][""] == pytest.approx(value, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_a_row_of_realities_that_is_kept_is_that_of_its_page(monkeypatch):
+    """The errors of all controllers with the model's own reality, computed anew."""
+    monkeypatch.setattr("sys.argv", ["plot_realities.py"])
+    page = runpy.run_path(str(DOCS / "gallery_src" / "plot_realities.py"))
+    assert page["row"](None) == pytest.approx(page["kept"]["errors"]["model's own"], rel=1e-3)
+
+
 @pytest.mark.slow
 def test_a_rival_that_was_tried_is_that_of_its_command(monkeypatch):
     """One cheap problem tried again: the same controller and the same error, which stand on the page."""
