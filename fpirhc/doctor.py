@@ -28,6 +28,7 @@ _EXPORT = (  # module or program, what it is for, and what brings it
     ("fmpy", "functional mock-up units", "pip install 'fpirhc[fmu]'"),
     ("unicorn", "a Cortex-M without a board", "pip install 'fpirhc[cortex]'"),
     ("avr-gcc", "sizes on Arduino boards", "packages gcc-avr and avr-libc"),
+    ("cppcheck", "deviations from MISRA C", "package cppcheck"),
 )
 
 

@@ -13,7 +13,6 @@ import sys
 import tempfile
 import warnings
 import zipfile
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +24,9 @@ from fpirhc.errors import NotSupported
 from fpirhc.export.binaries import WEB_STACK
 from fpirhc.export.cortex import Board, Image
 from fpirhc.export.footprint import deepest, said_by_gcc
+from fpirhc.export.misra import deviations, reasons
 from fpirhc.export.target import device_of, processor_of, target_called, write
+from fpirhc.export.targets.c import sources
 from fpirhc.symbolic.native import find_compiler
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -271,60 +272,14 @@ def _numbers_of(board: Board, image: Image, run: fp.Run, looped: fp.Run, solved:
     return [*sizes, f"{np.mean(counts):.0f}", f"{max(counts)}", *each, f"{apart:.1g}"]
 
 
-_REASONS = {
-    "2.2": "a value that a later line overwrites, in generated code",
-    "2.3": "a type of the settings that the optimiser can do without",
-    "2.4": "a tag of a type that is used by its name",
-    "2.5": "macros of sizes for the caller",
-    "5.5": "a macro has the name of the symbol that it stands for",
-    "5.6": "the same type is named in several files",
-    "5.9": "names of functions that are static in several files",
-    "8.4": "the function of another file is declared where it is called",
-    "8.7": "the same function has external linkage in files of its own",
-    "8.9": "tables of start values stand at file scope, next to each other",
-    "8.14": "restrict: the optimiser's numbers are nobody else's",
-    "9.3": "a table of zeros has one initialiser",
-    "10.3": "comparisons are numbers in generated code",
-    "10.4": "whole numbers and flags in one expression",
-    "10.6": "a product of whole numbers goes into a wider one",
-    "10.8": "a whole number becomes a real one after its sum",
-    "11.3": "a struct of numbers alone is read as their array, without gaps",
-    "11.9": "0 for a pointer, in generated code",
-    "12.1": "precedence of conditional expressions",
-    "12.3": "declarations and assignments joined by commas",
-    "13.3": "copies of generated code advance two pointers in one line",
-    "13.4": "a number is assigned to several places",
-    "14.2": "the loops of the optimiser, and over missed cycles, end within",
-    "14.4": "a pointer that may be null, or a comparison that is a number, is a condition",
-    "15.5": "a function returns where it is done",
-    "15.6": "a body of one line without braces",
-    "15.7": "the last way of several does nothing",
-    "17.7": "memcpy and memset return what nobody needs",
-    "17.8": "an argument is advanced where it stands",
-    "18.4": "places in the array of numbers are reached by addition",
-    "19.2": "the first byte of a number is read on an AVR",
-    "20.1": "what the search includes stands before it, behind generated code",
-    "20.7": "a macro of a type",
-}
-
-
 def misra_rows() -> list[list[str]]:
     """Lines of the table of deviations: the rule, how often each controller deviates, and why."""
-    counts = [_deviations(*case) for case in PLAIN]
-    rules = sorted(set().union(*counts), key=lambda rule: [int(part) for part in rule.split(".")])
-    return [[rule, *(str(count[rule]) for count in counts), _REASONS.get(rule, "")] for rule in rules]
-
-
-def _deviations(problem: str, title: str) -> Counter[str]:
-    """How often the files of a controller deviate from each rule."""
-    task = fp.load_problem(problem)
-    device = device_of(task.problem, task.controllers[title], title, name="c", cycles=1)
-    with tempfile.TemporaryDirectory() as name:
-        write(device, target_called("c"), Path(name))
-        files = [str(path) for path in sorted(Path(name).glob("c*.c"))]
-        command = ["cppcheck", "--addon=misra", "--std=c99", "-q", "--template={id}", *files]
-        said = subprocess.run(command, capture_output=True, text=True, check=True).stderr
-    return Counter(re.findall(r"misra-c2012-([\d.]+)", said))
+    devices = (
+        device_of(task.problem, task.controllers[title], title, name="c", cycles=1)
+        for task, title in ((fp.load_problem(problem), title) for problem, title in PLAIN)
+    )
+    counts = [deviations(sources(device)) for device in devices]
+    return [[rule, *(str(count[rule]) for count in counts), why] for rule, why in reasons(set().union(*counts))]
 
 
 def board_row(problem: str, title: str, bare: bool) -> list[str]:

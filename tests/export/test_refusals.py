@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 
@@ -106,3 +107,32 @@ def test_a_compiler_that_does_not_work_is_named_and_no_folder(compiler, words, r
     monkeypatch.chdir(tmp_path)
     assert main(["export", "two_mass", "CTC+FPI (eq 6)", *words.split(), "--out", "new", "--cycles", "1"]) == 2
     assert reason.format(here=binaries._here(), compiler=path) in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a script of a shell")
+def test_deviations_from_misra_are_counted_for_any_controller(tmp_path, monkeypatch, capsys):
+    """A script stands for cppcheck, which takes a minute; without it nothing is written."""
+    words = [
+        "export",
+        "crane_slots",
+        "slots+FPI",
+        "--name",
+        "crane",
+        "--cycles",
+        "1",
+        "--misra",
+        "--out",
+        str(tmp_path / "new"),
+    ]
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: None)
+    assert main(words) == 2
+    assert capsys.readouterr().err == "fpirhc: --misra needs cppcheck, which is not installed: package cppcheck\n"
+    assert not (tmp_path / "new").exists()
+    program = tmp_path / "cppcheck"
+    program.write_text("#!/bin/sh\nfor one in *_step.c; do echo misra-c2012-10.3; echo misra-c2012-2.2; done >&2\n")
+    program.chmod(0o700)
+    monkeypatch.setattr(shutil, "which", lambda *_, **__: str(program))
+    assert main(words) == 0
+    said = (tmp_path / "new" / "misra.md").read_text()
+    assert "2 deviations from 2 rules" in said
+    assert said.index("| 2.2 | 1 | a value that") < said.index("| 10.3 | 1 | comparisons")

@@ -35,17 +35,23 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bare", action="store_true", help=text)
     text = "build what was exported, here or for an emulated Cortex-M7, run the plant with it, and say how far apart the runs are"
     parser.add_argument("--check", action="store_true", help=text)
+    text = "write misra.md too: where the C deviates from MISRA C:2012 and why, by cppcheck, in a minute or two"
+    parser.add_argument("--misra", action="store_true", help=text)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.export.footprint import bytes_here, worst_case
+    from fpirhc.export.misra import checker, report
     from fpirhc.export.target import device_of, in_the_loop, processor_of, target_called, write
     from fpirhc.problem_files.problem_file import load_problem
     from fpirhc.studies.comparison.compare import select
+    from fpirhc.whole_file import write_whole
 
     target = target_called(options.to)
     if options.check:
         processor_of(target)
+    if options.misra:
+        checker()
     task = load_problem(options.problem)
     controller = select(task, [options.controller])[options.controller]
     device = device_of(
@@ -60,6 +66,10 @@ def _run(options: argparse.Namespace) -> ExitCode:
     )
     for file in write(device, target, Path(options.out)):
         print(f"wrote {file}")
+    if options.misra:
+        page = Path(options.out) / "misra.md"
+        write_whole(report(device), page, "MISRA report")
+        print(f"wrote {page}")
     sizes = {"memory": device.stepper.memory.size, "trace": device.stepper.signals.size, "work": device.sizes["w"]}
     print(f"numbers of one controller: {', '.join(f'{size} of {what}' for what, size in sizes.items())}")
     print(f"worst case: {worst_case(device)}")
