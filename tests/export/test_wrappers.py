@@ -25,6 +25,7 @@ from fpirhc.symbolic.native import find_compiler
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 LIVE = ("deformation.gain", "limits.inputs.Q1")
 GAIN, CYCLES = -0.25, 40
+CHANGE, LATER = 30, -0.3  # another gain from a cycle on
 
 
 def exported(folder: Path, target: str) -> Device:
@@ -36,7 +37,7 @@ def exported(folder: Path, target: str) -> Device:
 
 
 def answered(device: Device) -> tuple[np.ndarray, np.ndarray]:
-    """Samples, one of them bad, and what the stepper answers to them with another gain: status and command of each cycle."""
+    """Samples, one of them bad, and what the stepper answers to them with other gains: status and command of each cycle."""
     generator, period = np.random.default_rng(3), device.problem.period
     rows = np.tile([0.0, 1.9, 5.4, 0.0, 0.0, 0.1, -0.2], (CYCLES, 1)) + 1e-3 * generator.standard_normal((CYCLES, 7))
     rows[:, 0] = period * np.arange(CYCLES)
@@ -44,7 +45,9 @@ def answered(device: Device) -> tuple[np.ndarray, np.ndarray]:
     assert isinstance(device.stepper, fp.Stepper)
     device.stepper.change({"deformation.gain": GAIN})
     memory, answers = device.stepper.start(), []
-    for row in rows:
+    for k, row in enumerate(rows):
+        if k == CHANGE:
+            device.stepper.change({"deformation.gain": LATER})
         command, memory = device.stepper.step_measured(row[0], row[1:], memory)
         answers.append([float(device.stepper.trace()["status"].ravel()[0]), *command])
     return rows, np.array(answers)
@@ -73,12 +76,12 @@ SIMSTRUC = r"""
 #include <stddef.h>
 typedef double real_T; typedef int int_T; typedef struct { double value; size_t entries; } mxArray;
 typedef struct {
-  void* work; double period, time, *in[8], *out[2]; mxArray param[8]; int params, ports, widths[8]; const char* error;
+  void* work; double period, time, *in[8], *out[2]; mxArray param[8]; int params, tunable, ports, widths[8]; const char* error;
 } SimStruct;
 #define ssSetNumSFcnParams(S, n) ((S)->params = (n))
 #define ssGetNumSFcnParams(S) ((S)->params)
 #define ssGetSFcnParamsCount(S) 3
-#define ssSetSFcnParamTunable(S, k, yes) ((void)(k))
+#define ssSetSFcnParamTunable(S, k, yes) ((S)->tunable += (yes))
 #define ssSetNumInputPorts(S, n) ((S)->ports = (n))
 #define ssSetNumOutputPorts(S, n) ((n) == 2)
 #define ssSetInputPortWidth(S, k, n) ((S)->widths[k] = (n))
@@ -91,6 +94,7 @@ typedef struct {
 #define ssSetOffsetTime(S, k, t) ((void)(t))
 #define ssSetPWorkValue(S, k, p) ((S)->work = (p))
 #define ssGetPWorkValue(S, k) ((S)->work)
+static void** ssGetPWork(SimStruct* S) { return S->work ? &S->work : NULL; }
 #define ssSetErrorStatus(S, text) ((S)->error = (text))
 #define ssGetSFcnParam(S, k) (&(S)->param[k])
 #define mxIsDouble(a) ((void)(a), 1)
@@ -109,10 +113,19 @@ MODEL = r"""
 int main(void) {
   SimStruct S = {.param = {{-0.25, 1}, {-300, 1}, {300, 1}}};
   double in[7], out[2], status;
+  int cycle = 0;
   mdlInitializeSizes(&S), mdlInitializeSampleTimes(&S), mdlStart(&S);
-  if (S.error || S.ports != 2 || S.widths[0] != 4 || S.widths[1] != 2 || S.period != 0.001) return 1;
+  if (S.tunable != 3 || S.error || S.ports != 2 || S.widths[0] != 4 || S.widths[1] != 2 || S.period != 0.001) return 1;
   S.in[0] = in + 1, S.in[1] = in + 5, S.out[0] = out, S.out[1] = &status;
   while (scanf("%la %la %la %la %la %la %la", in, in + 1, in + 2, in + 3, in + 4, in + 5, in + 6) == 7) {
+    if (cycle++ == 30) {
+      S.param[0].value = 3, mdlCheckParameters(&S); /* refused, and the old number stays */
+      if (!S.error) return 1;
+      S.error = NULL, S.param[0].value = -0.3, mdlCheckParameters(&S), mdlProcessParameters(&S);
+      S.param[1].value = 350, S.param[2].value = 400, mdlCheckParameters(&S); /* above the limit of the machine */
+      if (!S.error) return 1;
+      S.error = NULL;
+    }
     S.time = in[0];
     mdlOutputs(&S, 0), mdlOutputs(&S, 0), mdlUpdate(&S, 0); /* outputs may be asked for again */
     printf("%a %a %a\n", status, out[0], out[1]);
@@ -143,18 +156,26 @@ ROS = {
     "rclcpp/rclcpp.hpp": r"""
 #pragma once
 #include <cstdio>
+#include <functional>
 #include <map>
 #include <memory>
 #include <string>
 #include <vector>
+namespace rcl_interfaces::msg { struct SetParametersResult { bool successful = false; std::string reason; }; }
 namespace rclcpp {
 struct Duration { double value; double seconds() const { return value; } };
 struct Time { double value = 0; };
 inline Duration operator-(Time a, Time b) { return {a.value - b.value}; }
-struct Parameter { std::vector<std::string> texts; double number = 0;
+struct Parameter { std::string name; double number; std::vector<std::string> texts = {};
+  const std::string& get_name() const { return name; }
   std::vector<std::string> as_string_array() const { return texts; } double as_double() const { return number; } };
 struct Logger {};
+struct Handle { using SharedPtr = std::shared_ptr<Handle>; };
+namespace node_interfaces { using OnSetParametersCallbackHandle = Handle; }
 struct Node { std::map<std::string, Parameter> all;
+  std::function<rcl_interfaces::msg::SetParametersResult(const std::vector<Parameter>&)> asked;
+  template <class F> Handle::SharedPtr add_on_set_parameters_callback(F f) {
+    asked = f; return std::make_shared<Handle>(); }
   Parameter get_parameter(const std::string& name) const { return all.at(name); } Logger get_logger() const { return {}; } };
 }
 #define RCLCPP_ERROR(logger, ...) ((void)(logger), std::fprintf(stderr, __VA_ARGS__))
@@ -185,8 +206,8 @@ struct ControllerInterface {
   std::shared_ptr<rclcpp::Node> get_node() const { return node; }
   unsigned get_update_rate() const { return rate; }
   template <class T> void auto_declare(const std::string& name, const T& value) { put(name, value); }
-  void put(const std::string& name, const std::vector<std::string>& value) { node->all[name].texts = value; }
-  void put(const std::string& name, double value) { node->all[name].number = value; }
+  void put(const std::string& name, const std::vector<std::string>& value) { node->all[name] = {name, 0, value}; }
+  void put(const std::string& name, double value) { node->all[name] = {name, value, {}}; }
   std::shared_ptr<rclcpp::Node> node = std::make_shared<rclcpp::Node>();
   unsigned rate = 1000;
   std::vector<Interface> state_interfaces_, command_interfaces_;
@@ -221,7 +242,12 @@ int main() {
   if (c.on_configure({}) != Back::SUCCESS || c.on_activate({}) != Back::SUCCESS) return 6;
   c.state_interfaces_.resize(6), c.command_interfaces_.resize(2);
   double in[7];
+  int cycle = 0;
   while (std::scanf("%la %la %la %la %la %la %la", in, in + 1, in + 2, in + 3, in + 4, in + 5, in + 6) == 7) {
+    if (cycle++ == 30) {
+      if (c.node->asked({{"deformation.gain", -0.3}, {"limits.inputs.Q1.0", 400.0}}).successful) return 9; /* all or none */
+      if (!c.node->asked({{"deformation.gain", -0.3}, {"another", 0.0}}).successful) return 10;
+    }
     for (int k = 0; k < 6; ++k) c.state_interfaces_[k].value = in[k + 1];
     c.state_interfaces_[0].held = std::isnan(in[1]);
     if (c.update(rclcpp::Time{in[0]}, rclcpp::Duration{0.001}) != controller_interface::return_type::OK) return 7;
@@ -308,7 +334,9 @@ def test_a_library_answers_as_the_stepper_bit_by_bit(tmp_path):
     assert called.arm_change(first, settings.index("deformation.gain"), ctypes.c_double(GAIN)) == 1
     rows, answers = answered(device)
     command, said, apart = (ctypes.c_double * 2)(), [], False
-    for row in rows:
+    for k, row in enumerate(rows):
+        if k == CHANGE:
+            assert called.arm_change(first, settings.index("deformation.gain"), ctypes.c_double(LATER)) == 1
         sample = (ctypes.c_double * 7)(*row)
         called.arm_cycle(other, sample, command)
         before = list(command)

@@ -1,14 +1,19 @@
 // @title@ as a controller of ros2_control. Made by fpirhc.
 //
 // State interfaces are the numbers of a sample after the time, command interfaces those of a command, in the order of layout.json. Their
-// names are parameters; the defaults are made of the names of the plant. Settings are parameters that are read when it is configured.
-// update() allocates nothing. The controller manager must run at the rate of the period.
+// names are parameters; the defaults are made of the names of the plant. Settings are parameters that may be changed while it runs.
+// update() allocates nothing and waits for nobody. The controller manager must run at the rate of the period.
 
+#include <algorithm>
+#include <array>
+#include <atomic>
 #include <cmath>
 #include <cstddef>
 #include <cstring>
 #include <limits>
+#include <mutex>
 #include <string>
+#include <string_view>
 #include <type_traits>
 #include <vector>
 
@@ -57,8 +62,16 @@ class Controller : public controller_interface::ControllerInterface {
     if (std::abs(rate - 1) > 1e-6) return failed("the update rate must be one cycle per period");
     if (named("state_interfaces").names.size() != @NAME@_INPUTS - 1) return failed("state_interfaces: expected @given@ names");
     if (named("command_interfaces").names.size() != @NAME@_COMMANDS) return failed("command_interfaces: expected @sent@ names");
-    @name@_init(&controller_);  // settings begin from those of the build, in whose order they are accepted
-@set@    return Return::SUCCESS;
+    @name@_init(&controller_);
+#if @live@
+    std::vector<rclcpp::Parameter> given;
+    for (const auto path : PATHS) given.push_back(get_node()->get_parameter(std::string(path)));
+    @name@_init(&wanted_);
+    const auto answer = tuned(given);
+    if (!answer.successful) return failed(answer.reason.c_str());
+    tuning_ = get_node()->add_on_set_parameters_callback([this](const auto& given) { return tuned(given); });
+#endif
+    return Return::SUCCESS;
   }
 
   Return on_activate(const rclcpp_lifecycle::State&) override {
@@ -68,6 +81,13 @@ class Controller : public controller_interface::ControllerInterface {
   }
 
   controller_interface::return_type update(const rclcpp::Time& time, const rclcpp::Duration&) override {
+#if @live@
+    if (changed_ && mutex_.try_lock()) {  // else in the next cycle
+      controller_.settings = wanted_.settings;
+      changed_ = false;
+      mutex_.unlock();
+    }
+#endif
     @name@_inputs in;
     @name@_command out;
     casadi_real *sample = reinterpret_cast<casadi_real*>(&in), *command = reinterpret_cast<casadi_real*>(&out);
@@ -94,6 +114,32 @@ class Controller : public controller_interface::ControllerInterface {
     return Return::ERROR;
   }
 
+#if @live@
+  // Called by the executor, beside update(): all are accepted, or none. Twice, since an interval may move beyond its old end.
+  rcl_interfaces::msg::SetParametersResult tuned(const std::vector<rclcpp::Parameter>& given) {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    const auto kept = wanted_.settings;
+    rcl_interfaces::msg::SetParametersResult answer;
+    for (int twice = 0; twice < 2; ++twice) {
+      answer.successful = true;
+      for (const auto& one : given) {
+        const auto at = std::find(PATHS.begin(), PATHS.end(), one.get_name());
+        if (at == PATHS.end() || @name@_set(&wanted_, @name@_setting(at - PATHS.begin()), one.as_double())) continue;
+        answer.successful = false;
+        answer.reason = one.get_name() + " is no number, or outside its bounds";
+      }
+    }
+    if (!answer.successful) wanted_.settings = kept;
+    changed_ = true;
+    return answer;
+  }
+
+  static constexpr std::array<std::string_view, @live@> PATHS = {@paths@};
+  rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr tuning_;
+  std::mutex mutex_;  // of what is wanted
+  std::atomic<bool> changed_{false};
+  @name@_controller wanted_;  // of which the settings alone are used
+#endif
   @name@_controller controller_;
   @name@_status status_ = @NAME@_OK;
   rclcpp::Time begin_;

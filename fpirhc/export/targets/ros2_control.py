@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from xml.sax.saxutils import escape
 
 from fpirhc.errors import InvalidValue
-from fpirhc.export.device import Device, identifiers
+from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, seconds, sources
 from fpirhc.plant.motion import SECONDS
@@ -25,7 +25,8 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         states=_texts(states),
         commands=_texts(commands),
         declared=_declared(device),
-        set=_set(device),
+        live=str(len(device.bounds)),
+        paths=_texts(list(device.bounds)),
         given=str(len(states)),
         sent=str(len(commands)),
         seconds=repr(SECONDS[device.problem.plant.time_unit]),
@@ -74,15 +75,3 @@ def _texts(names: list[str]) -> str:
 def _declared(device: Device) -> str:
     numbers = device.stepper.numbers
     return "".join(f'    auto_declare<double>("{path}", {float(numbers[path])!r});\n' for path in device.bounds)
-
-
-def _set(device: Device) -> str:
-    """Lines that put the settings in force."""
-    items = [f"{device.name.upper()}_SET_{one.upper()}" for one in identifiers(list(device.bounds))]
-    lines = []
-    for path, item in zip(device.bounds, items, strict=True):
-        value = f'get_node()->get_parameter("{path}").as_double()'
-        lines.append(
-            f'    if (!{device.name}_set(&controller_, {item}, {value}))\n      return failed("{path} is outside its bounds");\n'
-        )
-    return "".join(lines)

@@ -5,7 +5,7 @@
    Without fused multiplications the bits are those of fpirhc; Microsoft's compiler has /fp:precise for it, its default.
 
    Input ports, in this order: @ports@. Output ports: the command, its status (0: OK).
-   Parameters of the block, in this order: @settings@.
+   Parameters of the block, in this order: @settings@. They may be changed while a model runs.
    The command follows from the inputs of its own sample; the memory moves on in mdlUpdate. */
 
 #define S_FUNCTION_NAME @name@_sfun
@@ -15,6 +15,7 @@
 
 #include "@name@.h"
 
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -30,7 +31,7 @@ static void mdlInitializeSizes(SimStruct* S) {
   int k;
   ssSetNumSFcnParams(S, SETTINGS);
   if (ssGetNumSFcnParams(S) != ssGetSFcnParamsCount(S)) return;
-  for (k = 0; k < SETTINGS; ++k) ssSetSFcnParamTunable(S, k, 0);
+  for (k = 0; k < SETTINGS; ++k) ssSetSFcnParamTunable(S, k, 1);
   if (!ssSetNumInputPorts(S, PORTS) || !ssSetNumOutputPorts(S, 2)) return;
   for (k = 0; k < PORTS; ++k) {
     ssSetInputPortWidth(S, k, WIDTHS[k]);
@@ -48,7 +49,49 @@ static void mdlInitializeSampleTimes(SimStruct* S) {
   ssSetOffsetTime(S, 0, 0.0);
 }
 
-@number@#define MDL_START
+#if @live@
+static const char* const PATHS[] = {@paths@};
+
+/* A parameter of the block; NaN, which no setting takes, where it is no number. */
+static double number(SimStruct* S, int k) {
+  const mxArray* p = ssGetSFcnParam(S, k);
+  int one = mxIsDouble(p) && !mxIsComplex(p) && !mxIsSparse(p) && mxGetNumberOfElements(p) == 1;
+  return one ? *mxGetPr(p) : mxGetNaN();
+}
+
+/* Put the parameters in force; those that are refused are an error. Twice, since an interval may move beyond its old end. */
+static void put(SimStruct* S, @name@_controller* c) {
+  static char text[256];
+  int k, twice, refused = -1;
+  for (twice = 0; twice < 2; ++twice)
+    for (k = 0, refused = -1; k < SETTINGS; ++k)
+      if (!@name@_set(c, (@name@_setting)k, number(S, k))) refused = k;
+  if (refused < 0) return;
+  sprintf(text, "@name@: %.180s is no number, or outside its bounds", PATHS[refused]);
+  ssSetErrorStatus(S, text);
+}
+
+/* NULL before the start, which puts the parameters itself. */
+static block* started(SimStruct* S) { return ssGetPWork(S) ? (block*)ssGetPWorkValue(S, 0) : NULL; }
+
+/* Simulink asks before it takes a change, which is tried and taken back. */
+#define MDL_CHECK_PARAMETERS
+static void mdlCheckParameters(SimStruct* S) {
+  block* b = started(S);
+  @name@_settings kept;
+  if (!b) return;
+  kept = b->c.settings;
+  put(S, &b->c);
+  b->c.settings = kept;
+}
+
+#define MDL_PROCESS_PARAMETERS
+static void mdlProcessParameters(SimStruct* S) {
+  if (started(S)) put(S, &started(S)->c);
+}
+#endif
+
+#define MDL_START
 static void mdlStart(SimStruct* S) {
   block* b = (block*)calloc(1, sizeof *b);
   ssSetPWorkValue(S, 0, b);
@@ -57,7 +100,10 @@ static void mdlStart(SimStruct* S) {
     return;
   }
   @name@_init(&b->c);
-@set@  b->before = b->c.memory;
+#if @live@
+  put(S, &b->c);
+#endif
+  b->before = b->c.memory;
 }
 
 static void mdlOutputs(SimStruct* S, int_T tid) {
