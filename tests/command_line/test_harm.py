@@ -114,6 +114,12 @@ def test_a_run_of_it_says_the_same_as_its_comparison(file, compared, capsys):
     assert printed.startswith(RED)
     assert red(shown(capsys, "run", "line.py", "CTC+model-referenced", "--no-compile")) == []
     assert red(shown(capsys, "run", "line.py", "CTC", "--no-compile")) == []
+    assert main(["run", "line.py", "CTC+gentle", "--no-compile"]) == 0
+    bars = capsys.readouterr().err
+    assert all(
+        f"\n{one}" in re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", bars).replace("\r", "\n")
+        for one in ("CTC+gentle without", "null test")
+    )
 
 
 def test_a_run_with_another_gain_is_judged_with_it(file, capsys, monkeypatch):

@@ -369,9 +369,12 @@ def test_gain_of_a_map_on_targets(monkeypatch, limit, radius, verdict, said, cha
     """A_c = -0.5 is the effective gain 0.25: numbers are those of A_c, and a loop that converges at the plant refuses nothing."""
     monkeypatch.setattr("fpirhc.review.questions.gain.limit_of_loop", lambda deformation, loops: (limit, "a pole"))
     controller, loops = SimpleNamespace(deformation=fp.Affine(-0.5)), SimpleNamespace(radii=np.array([0.5, radius]))
-    case: Any = SimpleNamespace(controller=controller, by_gain=object(), loops=loops)
+    case: Any = SimpleNamespace(
+        controller=controller, by_gain=object(), loops=loops, grid=SimpleNamespace(real=object())
+    )
     one = gain_of_target(case)
     assert one is not None
+    said += "; of the model by itself, without the reality"
     assert (one.verdict, one.evidence, one.change) == (verdict, f"gain = -0.5; {said}", change)
     assert one.numbers == pytest.approx({"gain": -0.5, "limit": -2 * limit, "recommended": -limit})
     case.by_gain = None
@@ -383,7 +386,10 @@ def test_of_a_map_without_a_gain_of_its_own_the_effective_one_is_told(monkeypatc
     monkeypatch.setattr("fpirhc.review.questions.gain.limit_of_loop", lambda deformation, loops: (0.2, "a pole"))
     nameless = SimpleNamespace(effective_gain=lambda: 0.25, gain_name="nothing")
     case: Any = SimpleNamespace(
-        controller=SimpleNamespace(deformation=nameless), by_gain=object(), loops=SimpleNamespace(radii=np.array([2.0]))
+        controller=SimpleNamespace(deformation=nameless),
+        by_gain=object(),
+        loops=SimpleNamespace(radii=np.array([2.0])),
+        grid=SimpleNamespace(real=None),
     )
     one = gain_of_target(case)
     assert one is not None

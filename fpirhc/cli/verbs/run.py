@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from fpirhc.cli.options import (
@@ -24,7 +25,6 @@ from fpirhc.cli.verb import ExitCode, Verb
 if TYPE_CHECKING:
     from fpirhc.controllers.base import Controller
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.view import Progress
     from fpirhc.task.problem import Problem
 
 
@@ -71,6 +71,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     folder = results_folder(options.out, task.name)
     settings, points = by_kind(numbers(options.settings))
     with progress_bars() as progress:
+        progress(name, 0, task.problem.cycles)  # while its loop is built
         run, problem, built = _simulated(
             task.problem,
             controller,
@@ -79,7 +80,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
             seed=seed,
             name=name,
             compiled=not options.no_compile,
-            progress=_named(progress, name),
+            progress=partial(progress, name),
         )
     which = options.case or ("" if options.scenario is None else f"scenario {options.scenario}")
     stem = "".join(c if c.isalnum() or c == "-" else "_" for c in f"{name} {which}".strip())
@@ -87,7 +88,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
     save_figure(run.plot(), folder / f"{stem}.png")
     announce_backend([run])
     facts = {"seed": seed, "compiled": not options.no_compile, "metrics": task.metrics}
-    harm = () if points else harm_of_adaptation(name=name, **built, **facts)  # of a run with the file's set-points
+    with progress_bars() as progress:  # of a run with the file's set-points
+        harm = () if points else harm_of_adaptation(name=name, **built, **facts, progress=progress)
     show_run(
         run, measure(problem, run, task.metrics), harm, [folder / f"{stem}{ending}" for ending in (".npz", ".png")]
     )
@@ -152,10 +154,6 @@ def _with_gains(controller: Controller, settings: Mapping[str, Any]) -> Controll
         return with_settings(controller, {p: v for p, v in settings.items() if p.startswith("deformation.")})
     except FpirhcError:
         return controller
-
-
-def _named(progress: Progress, name: str) -> Callable[[int, int], None]:
-    return lambda done, total: progress(name, done, total)
 
 
 VERB = Verb(

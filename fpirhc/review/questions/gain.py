@@ -22,7 +22,7 @@ from fpirhc.review.grid import is_late, review_grid
 from fpirhc.review.loops import LoopsByGain, largest_product
 from fpirhc.review.prediction import NominalRuns
 from fpirhc.review.question import SEE_CONVERGENCE, Answer, Case, ControllerQuestion, Verdict, by_run
-from fpirhc.review.questions.margins import keeps_margins
+from fpirhc.review.questions.margins import keeps_margins, whose_loop
 from fpirhc.review.questions.right_model import RIGHT_MODEL, leaves_right_model_alone
 from fpirhc.review.questions.speed import fast_enough, gain_times, plan_keeps_up
 from fpirhc.symbolic.evaluate import attempted
@@ -292,10 +292,9 @@ def gain_of_target(case: Case) -> Answer | None:
     numbers = {"gain": value * scale, "limit": limit * scale, "recommended": limit * scale / 2}
     text = f"{name} = {value * scale:.4g}; "
     if not math.isfinite(limit):
-        return Answer(
-            GAIN, Verdict.YES, f"{text}no gain up to {FAR:g} times as large is a limit of the whole loop", "", numbers
-        )
-    text += f"the smallest limit is {limit * scale:.3g}, set by {sets}"
+        text += f"no gain up to {FAR:g} times as large is a limit of the whole loop{whose_loop(case)}"
+        return Answer(GAIN, Verdict.YES, text, "", numbers)
+    text += f"the smallest limit is {limit * scale:.3g}, set by {sets}{whose_loop(case)}"
     along = case.loops.radii.max() < 1  # in the box it is another matter
     verdict = Verdict.YES if value / limit < 1 else Verdict.CAUTION if along else Verdict.NO
     return Answer(GAIN, verdict, text, f"Use {name} = {limit * scale / 2:.3g}, half of it.", numbers)

@@ -248,11 +248,15 @@ def _first(poles: Callable[[np.ndarray], np.ndarray], most: float, enough: float
     return math.inf
 
 
+def whose_loop(case: Case) -> str:
+    """The end of a sentence about a linear loop: that the reality is not in it, where there is one."""
+    return "" if case.grid.real is None else "; of the model by itself, without the reality"
+
+
 def _asked(case: Case) -> Answer:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
     answer = margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
-    if case.grid.real is not None:
-        answer = replace(answer, evidence=f"{answer.evidence}; of the model by itself, without the reality")
+    answer = replace(answer, evidence=f"{answer.evidence}{whose_loop(case)}")
     late = adapts and case.controller.deformation.iteration.slows_desired
     return replace(answer, change=answer.change.replace(_LOWER, _PASSING, 1)) if late else answer
 

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from fpirhc.studies.comparison.changes import ROUNDING, Change, Finding, Outcome
 from fpirhc.studies.comparison.entry import Entry, no_bound_because
 from fpirhc.studies.comparison.timing import measure_price
 from fpirhc.studies.comparison.verdict import beaten_by, judge
+from fpirhc.studies.view import Progress
 from fpirhc.summary import in_percent, numbers_written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
@@ -249,6 +251,7 @@ def harm_of_adaptation(
     compiled: bool,
     metrics: Sequence[Metric] | None = None,
     settings: Numbers | None = None,
+    progress: Progress | None = None,
 ) -> tuple[str, ...]:
     """Return a sentence for a run in which adaptation raises the error, and one for a null test that it fails.
 
@@ -256,12 +259,13 @@ def harm_of_adaptation(
 
     Args:
         settings: numbers of live settings in place of those of the controller and the problem; loops are compiled once for all.
+        progress: called with (name of a run, cycles done, cycles in all).
     """
     if not controller.deformation.adapts:
         return ()
     try:
         loops = _both(problem, controller, compiled, settings or {})
-        return _harm(loops[1].problem, (f"{name} without adaptation", name), loops, seed, metrics)
+        return _harm(loops[1].problem, (f"{name} without adaptation", name), loops, seed, metrics, progress)
     except FpirhcError:
         return ()
 
@@ -283,17 +287,20 @@ def _harm(
     loops: tuple[Simulator, Simulator],
     seed: int,
     metrics: Sequence[Metric] | None,
+    progress: Progress | None,
 ) -> tuple[str, ...]:
     sizes, model, counted = scales(problem), ModelAsPlant(problem, seed=seed), weighed(problem, loops[1].controller)
     losses: list[str] = []
     cured: Mapping[str, float] = dict.fromkeys(problem.judged_names, 0.0)
     if problem.equations_known:
-        plain, adaptive = (_entry(problem, n, one, seed, metrics) for n, one in zip(pair, loops, strict=True))
+        plain, adaptive = (_entry(problem, n, one, seed, metrics, progress) for n, one in zip(pair, loops, strict=True))
         yardstick = yardstick_of(problem, seed=seed)
         finding = judge(plain, adaptive, yardstick)
         if finding.outcome is Outcome.WORSE:
             finding = judge(plain, with_causes(problem, adaptive, loops[1].controller), yardstick)
         losses, cured = [finding.text] * (finding.outcome is Outcome.WORSE), plain.metrics.rms_error
+    if progress:
+        progress("null test", 0, 2)
     test = null_test(model, loops, pair, sizes, counted, cured=cured)
     return (*losses, *([test.text] if test.harmful else []))
 
@@ -323,9 +330,16 @@ def partners(
     return unadapted, missing
 
 
-def _entry(problem: Problem, name: str, loop: Simulator, seed: int, metrics: Sequence[Metric] | None) -> Entry:
+def _entry(
+    problem: Problem,
+    name: str,
+    loop: Simulator,
+    seed: int,
+    metrics: Sequence[Metric] | None,
+    progress: Progress | None = None,
+) -> Entry:
     """A row of a comparison with what a verdict reads."""
-    run = judged_run(loop, seed=seed, name=name)
+    run = judged_run(loop, seed=seed, name=name, progress=progress and partial(progress, name))
     counted = weighed(problem, loop.controller)
     adapts = loop.controller.deformation.adapts
     return Entry(name, run, measure(problem, run, metrics), None, adapts, None, None, weighed=counted)
