@@ -25,7 +25,6 @@ from table import write_table
 
 import fpirhc as fp
 from fpirhc.simulation import lanes
-from fpirhc.simulation.lanes import run_many
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.opencl import Kernel, loaded_kernel
 from fpirhc.simulation.simulate import Simulator
@@ -66,9 +65,9 @@ def smallest(works: dict[str, Callable[[], object]]) -> dict[str, float]:
 def row(name: str, controller: str, ready: Simulator) -> list[str]:
     """Both times, their ratio and the largest relative difference of an rms error."""
     exact = plants(ready, PLANTS)
-    many, single = run_many(ready, exact), alone(ready, exact[:ALONE])
+    many, single = ready.run_many(exact), alone(ready, exact[:ALONE])
     apart = max(np.abs(many.rms_error[n][:ALONE] / single[:, k] - 1).max() for k, n in enumerate(many.rms_error))
-    spent = smallest({"lanes": lambda: run_many(ready, exact), "alone": lambda: alone(ready, exact[:ALONE])})
+    spent = smallest({"lanes": lambda: ready.run_many(exact), "alone": lambda: alone(ready, exact[:ALONE])})
     lanes, ordinary = (
         1e6 * spent[k] / count / ready.problem.cycles for k, count in (("lanes", PLANTS), ("alone", ALONE))
     )
@@ -168,7 +167,7 @@ def by_others() -> list[list[str]]:
     ready = fp.simulator(by_hand.TASK.problem, by_hand.CONTROLLER)
     exact, left_out = plants(ready, PLANTS), []
     ways: dict[str, Errors] = {
-        "`run_many`": lambda some: np.column_stack(list(run_many(ready, some).rms_error.values())),
+        "`run_many`": lambda some: np.column_stack(list(ready.run_many(some).rms_error.values())),
         "ordinary compiled loop, every signal logged": lambda some: alone(ready, some[:ALONE]),
     }
     makers = {"bare C loop": in_c, "numpy": in_numpy, "numba": in_numba, "JAX `vmap`": in_jax}
@@ -196,7 +195,7 @@ def many(name: str, ready: Simulator, count: int, cycles: int) -> list[str]:
     ready = shortened(ready, cycles)
     exact, begun = plants(ready, count // 10), time.process_time()
     for _ in range(10):
-        run_many(ready, exact)
+        ready.run_many(exact)
     spent = time.process_time() - begun
     return [name, f"{count:,}".replace(",", " "), str(cycles), f"{spent:.1f}", f"{spent / 2:.1f}"]
 
@@ -213,9 +212,9 @@ def on_device(device: str, name: str, ready: Simulator, count: int) -> list[str]
     ready = shortened(ready, 500)
     exact, walls, errors = plants(ready, count), {}, {}
     for where in (None, device):
-        first = run_many(ready, exact[:8], device=where)
+        first = ready.run_many(exact[:8], device=where)
         begun = time.perf_counter()
-        errors[where] = np.array(list(run_many(ready, exact, device=where).rms_error.values()))
+        errors[where] = np.array(list(ready.run_many(exact, device=where).rms_error.values()))
         walls[where] = 1e6 * (time.perf_counter() - begun) / len(exact) / ready.problem.cycles
         if not first.lanes:
             return [name, first.why, "", "", "", ""]

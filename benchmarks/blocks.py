@@ -19,7 +19,7 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.simulation.loop import close_loop
-from fpirhc.simulation.simulate import run_tables
+from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.native import native
 from fpirhc.task.problem import Problem

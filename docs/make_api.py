@@ -29,6 +29,7 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "Comparison": "fpirhc.studies.comparison.comparison",
     "Floquet": "fpirhc.controllers.slots.slotted",
     "LyapunovView": "fpirhc.simulation.lyapunov_view",
+    "ManyRuns": "fpirhc.simulation.lanes",
     "Metrics": "fpirhc.simulation.metrics",
     "OutputChain": "fpirhc.controllers.slots.slot",
     "Prediction": "fpirhc.review.response_prediction",
@@ -36,6 +37,7 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "Regressor": "fpirhc.plant.regressor",
     "Review": "fpirhc.review.question",
     "ScenarioComparison": "fpirhc.studies.scenarios.scenario_comparison",
+    "Simulator": "fpirhc.simulation.simulate",
     "Suggestion": "fpirhc.review.questions.noise",
     "Tuning": "fpirhc.studies.tune",
     "assess_gain": "fpirhc.contraction.spectrum",
@@ -61,6 +63,7 @@ BESIDE = {  # for authors of members and for tools; imported from the module
 }
 WITH_MEMBERS = {
     "Run",
+    "Simulator",
     "Stepper",
     "Comparison",
     "Plan",

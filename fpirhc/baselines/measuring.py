@@ -18,7 +18,8 @@ from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.simulation import metrics as run_metrics
 from fpirhc.simulation.metrics import known_metrics, measure
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import run_tables, simulate
+from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.tables import run_tables
 from fpirhc.studies.open_loop import solve_first
 from fpirhc.studies.view import Progress
 from fpirhc.symbolic.native import find_compiler

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
+from typing import Protocol, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -24,66 +25,83 @@ from fpirhc.plant.parameter import Parameter
 from fpirhc.simulation.metrics import known_metrics
 from fpirhc.simulation.metrics.base import Metric, first_measured, measured_errors
 from fpirhc.simulation.opencl import loaded_kernel
-from fpirhc.simulation.simulate import Simulator, run_tables
+from fpirhc.simulation.run import Run
 from fpirhc.simulation.sums import Sums, Values
+from fpirhc.simulation.tables import run_tables
 from fpirhc.status import Status
+from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.dataflow import DEVICE, SIDE_BY_SIDE, Callee, Words
 from fpirhc.symbolic.driver import SIGNATURE, driver_of, entry_of, is_driver
-from fpirhc.symbolic.evaluate import Latest
+from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.flat_code import FlatCode
 from fpirhc.symbolic.native import find_compiler, shared_library
 from fpirhc.task.problem import Problem
 
 _ASKED = 2  # runs after which it is known what depends on the exact parameters
 _GROUPS, _ITEMS = 256, 65_536  # of lanes in one call, and of a device
+Columns: TypeAlias = float | Sequence[float] | np.ndarray
 _ROOM = 2**27  # bytes of tables and of what is kept, beyond which runs take turns
+
+
+class Ready(Protocol):
+    """What lanes ask a `Simulator`, which has them."""
+
+    @property
+    def problem(self) -> Problem: ...
+    @property
+    def loop(self) -> Composite: ...
+    @property
+    def evaluator(self) -> Evaluator: ...
+    def first_memory(
+        self, variant: Problem | None = None, settings: Mapping[str, float] | None = None
+    ) -> tuple[Problem, np.ndarray]: ...
+    def starting_at(self, start: Mapping[str, float]) -> Ready: ...
+    def run(self, *, seed: int, variant: Problem | None = None, settings: Mapping[str, float] | None = None) -> Run: ...
 
 
 @dataclass(frozen=True, eq=False)
 class ManyRuns:
-    """Errors of many plants."""
+    """Errors of many scenarios."""
 
     # by coordinate, shape (plants,), in its unit; NaN where a run ended before `measure_from`
     rms_error: Mapping[str, np.ndarray]
     max_error: Mapping[str, np.ndarray]  # the same, largest sizes
     statuses: Mapping[str, np.ndarray]  # cycles with each status that occurred, by its name, shape (plants,)
     stops: Mapping[int, str]  # why the runs of some plants ended early, by number of the plant
-    # plants that ran side by side in one register, or work item of a device; 0: one after the other by the ordinary loop
+    # scenarios that ran side by side in one register, or work item of a device; 0: one after the other by the ordinary loop
     lanes: int
     why: str  # no lanes; empty where there are some
 
 
-def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str | None = None) -> ManyRuns:
-    """Run one loop for many plants, which differ in their exact parameters.
-
-    Args:
-        ready: from `fp.simulator`.
-        exact: parameters of the plants, shape (plants, parameters), in the order of the parameters of what moves, which is the
-            reality where the problem has one.
-        seed: of the noise of disturbances and sensors, the same for every plant.
-        device: part of the name of an OpenCL device ('': the first graphics processor, else the first one), for loops that are
-            scalar code; None: the vector registers of this machine.
-
-    Raises:
-        InvalidName: no device has this name.
-        InvalidShape: another number of parameters.
-        InvalidValue: a parameter that is not finite, or outside its bounds.
-        NotInstalled: pyopencl (pip install 'fpirhc[opencl]'), or a device with double precision.
-    """
-    exact = np.atleast_2d(np.asarray(exact, dtype=float))
-    _check_parameters(ready.problem.moved.parameters, exact)
-    judged = ready.loop.trace["error"].elements
+def run_many(
+    ready: Ready,
+    exact: np.ndarray | None = None,
+    *,
+    settings: Mapping[str, Columns] | None = None,
+    starts: Mapping[str, Columns] | None = None,
+    seed: int = 0,
+    device: str | None = None,
+) -> ManyRuns:
+    """See `Simulator.run_many`."""
+    rows = _Rows.of(ready.problem, exact, settings or {}, starts or {})
+    judged, count = ready.loop.trace["error"].elements, len(rows.exact)
     lanes = _LANES.of((ready,), (device,), lambda: Lanes(ready, _errors_alone(), device))
-    rms, largest = (np.full((len(exact), len(judged)), np.nan) for _ in range(2))
-    counts, left = np.zeros((len(exact), len(Status)), dtype=int), np.ones(len(exact), dtype=bool)
-    if not lanes.why and len(exact):
-        columns, left = lanes.of_parameters(exact, seed)
+    rms, largest = (np.full((count, len(judged)), np.nan) for _ in range(2))
+    counts, left = np.zeros((count, len(Status)), dtype=int), np.ones(count, dtype=bool)
+    scenarios = _Scenarios(ready, rows)
+    if not lanes.why and count and (settings or starts):
+        for k, values in lanes.of_scenarios(scenarios, seed).items():
+            rms[k], largest[k] = ([values[m][n] for n in judged] for m in ("rms_error", "max_error"))
+            counts[k] = [values["status"].get(one.name, 0) for one in Status]
+            left[k] = False
+    elif not lanes.why and count:
+        columns, left = lanes.of_parameters(rows.exact, seed)
         rms, largest = (np.column_stack([columns[m][n] for n in judged]) for m in ("rms_error", "max_error"))
         counts = np.column_stack([np.ma.filled(columns["status"][one.name], 0) for one in Status])
     stops = {}
     for number in map(int, np.flatnonzero(left)):
-        variant = ready.problem.with_exact(exact[number])
-        run = ready.run(seed=seed, variant=variant)
+        own, variant, numbers = scenarios[number]
+        run = own.run(seed=seed, variant=variant, settings=numbers)
         errors = measured_errors(variant, run)
         rms[number], largest[number] = np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0)
         counts[number] = np.bincount(run["status"].ravel().astype(int), minlength=len(Status))
@@ -92,6 +110,63 @@ def run_many(ready: Simulator, exact: np.ndarray, *, seed: int = 0, device: str 
     by_name = (dict(zip(judged, columns.T.copy(), strict=True)) for columns in (rms, largest))
     statuses = {one.name: counts[:, one].copy() for one in Status if counts[:, one].any()}
     return ManyRuns(next(by_name), next(by_name), statuses, stops, lanes.width, lanes.why)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """In what scenarios differ."""
+
+    exact: np.ndarray  # shape (scenarios, parameters)
+    settings: Mapping[str, np.ndarray]  # numbers by path, shape (scenarios,)
+    starts: Mapping[str, np.ndarray]  # first values by state, shape (scenarios,)
+
+    @classmethod
+    def of(
+        cls, problem: Problem, exact: np.ndarray | None, settings: Mapping[str, Columns], starts: Mapping[str, Columns]
+    ) -> _Rows:
+        """Return what was given, with a row for every scenario."""
+        plants = np.atleast_2d(np.asarray(problem.real_parameters if exact is None else exact, dtype=float))
+        _check_parameters(problem.moved.parameters, plants)
+        named = [{n: np.atleast_1d(np.asarray(v, dtype=float)) for n, v in some.items()} for some in (settings, starts)]
+        sizes = {"exact": len(plants), **{f"'{n}'": v.size for some in named for n, v in some.items()}}
+        several = {name: size for name, size in sizes.items() if size != 1}
+        if len({*several.values()}) > 1 or any(v.ndim != 1 for some in named for v in some.values()):
+            told = ", ".join(f"{size} for {name}" for name, size in several.items())
+            raise InvalidShape(
+                f"run_many({told}): expected a number for every scenario, as many everywhere, or one for all"
+            )
+        count = next(iter(several.values()), 1)
+        for some in named:
+            for name, values in some.items():
+                if not np.isfinite(values).all():
+                    number = int(np.argmin(np.isfinite(values)))
+                    raise InvalidValue(
+                        f"run_many: scenario {number}: '{name}' is {values[number]:g}, which is not finite"
+                    )
+        whole = [{name: np.broadcast_to(values, count) for name, values in some.items()} for some in named]
+        return cls(np.broadcast_to(plants, (count, plants.shape[1])), *whole)
+
+
+class _Scenarios:
+    """The loop, the problem and the live settings of every scenario, by number."""
+
+    def __init__(self, ready: Ready, rows: _Rows) -> None:
+        self._ready, self._rows = ready, rows
+        self._begun: dict[tuple[float, ...], Ready] = {}
+
+    def __len__(self) -> int:
+        return len(self._rows.exact)
+
+    def __getitem__(self, number: int) -> tuple[Ready, Problem, dict[str, float] | None]:
+        exact, settings, starts = self._rows.exact, self._rows.settings, self._rows.starts
+        begin = {name: float(values[number]) for name, values in starts.items()}
+        key = tuple(begin.values())
+        if key not in self._begun:
+            self._begun[key] = self._ready.starting_at(begin) if begin else self._ready
+        own = self._begun[key]
+        changed = not np.array_equal(exact[number], own.problem.real_parameters)
+        problem = own.problem.with_exact(exact[number]) if changed else own.problem
+        return own, problem, {path: float(values[number]) for path, values in settings.items()} or None
 
 
 def _check_parameters(parameters: Mapping[str, Parameter], exact: np.ndarray) -> None:
@@ -148,9 +223,7 @@ class Lanes:
         InvalidName, NotInstalled: no such device.
     """
 
-    def __init__(
-        self, ready: Simulator, metrics: Sequence[Metric], device: str | None = None, *, why: str = ""
-    ) -> None:
+    def __init__(self, ready: Ready, metrics: Sequence[Metric], device: str | None = None, *, why: str = "") -> None:
         self._ready, self.why = ready, why or _why_no_lanes(ready, device)
         self._first: list[OneRun] = []
         self._alike = False
@@ -168,7 +241,7 @@ class Lanes:
 
     def one_run(
         self,
-        ready: Simulator,
+        ready: Ready,
         problem: Problem,
         seed: int,
         settings: Mapping[str, float] | None = None,
@@ -235,6 +308,17 @@ class Lanes:
         columns, outside = self._sums.columns(ready.problem, sums)
         return columns, bad | outside
 
+    def of_scenarios(self, scenarios: _Scenarios, seed: int) -> dict[int, Values]:
+        """Return the metrics of scenarios with one noise by number, but for those that the ordinary loop has to run."""
+        several = enumerate(scenarios[k] for k in range(len(scenarios)))
+        runs = {
+            number: self.one_run(own, problem, seed, numbers)
+            for number, (own, problem, numbers) in several
+            if own.evaluator is self._ready.evaluator
+        }
+        found = zip(runs, self.values(list(runs.values())) if runs else (), strict=True)
+        return {number: values for number, values in found if values is not None}
+
     @cached_property
     def _begun(self) -> np.ndarray:
         return self._sums.start(self._ready.problem)
@@ -248,7 +332,7 @@ def _tables(problem: Problem, seed: int) -> np.ndarray:
     return np.hstack([*run_tables(problem, seed, problem.cycles), np.empty((problem.cycles, 0))])
 
 
-def _why_no_lanes(ready: Simulator, device: str | None) -> str:
+def _why_no_lanes(ready: Ready, device: str | None) -> str:
     if not ready.problem.equations_known:
         return "a plant outside is run one after the other"
     if ready.problem.cycles <= first_measured(ready.problem):
@@ -305,7 +389,7 @@ class _Library:
         return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, self.lanes, *rows.shape[1:]), 1, -1))
 
 
-def _starts(ready: Simulator, exact: np.ndarray) -> np.ndarray:
+def _starts(ready: Ready, exact: np.ndarray) -> np.ndarray:
     """First memories (plants, memory): one and the same but for the parameters, unless the start depends on these."""
     place = ready.loop.memory.slice("_exact")
     # The first plant, and for every parameter the one that differs most in it.
@@ -319,7 +403,7 @@ def _starts(ready: Simulator, exact: np.ndarray) -> np.ndarray:
     return np.array([ready.first_memory(ready.problem.with_exact(one))[1] for one in exact])
 
 
-def _built(ready: Simulator, sums: Sums, device: str | None) -> _Library:
+def _built(ready: Ready, sums: Sums, device: str | None) -> _Library:
     """Compile the loop."""
     functions = ready.loop.function, sums.function()
     if device is not None:
@@ -338,7 +422,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _around(ready: Simulator, sums: Sums, step: Callee, summing: Callee) -> str:
+def _around(ready: Ready, sums: Sums, step: Callee, summing: Callee) -> str:
     """The text of a run, behind that of a cycle."""
     loop = ready.loop
     before = np.cumsum([0, *(loop.function.numel_in(k) for k in range(1, loop.function.n_in()))])

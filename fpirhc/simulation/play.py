@@ -6,8 +6,8 @@ import numpy as np
 
 from fpirhc.simulation.loop import HELD_INPUT, HeldInput, close_loop, start_memory
 from fpirhc.simulation.ranges import ranges_of
-from fpirhc.simulation.simulate import run_tables
 from fpirhc.simulation.step_arguments import Setpoints
+from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
@@ -27,11 +27,13 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.changes import Changes, InForce, in_force
+from fpirhc.simulation.lanes import Columns, ManyRuns, run_many
 from fpirhc.simulation.loop import close_loop, start_memory
-from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, disturbance_values, moving
+from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, moving
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.run import Run, with_common_columns
-from fpirhc.simulation.step_arguments import Setpoints, set_point_record, set_point_table
+from fpirhc.simulation.step_arguments import Setpoints, set_point_record
+from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, Latest, attempted
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -79,6 +81,19 @@ class Simulator:
         """Return the loop whose runs have these numbers of its live settings, without another build."""
         problem, controller, _ = self.live.changed(settings)
         return replace(self, problem=problem, controller=controller, held=settings)
+
+    def starting_at(self, start: Mapping[str, float]) -> Simulator:
+        """Return the loop with other first values of some states; it is not compiled again where its code is the same.
+
+        Raises:
+            InvalidProblem: unknown states, or values that the problem refuses.
+        """
+        problem = replace(self.problem, start={**self.problem.start, **start})
+        live = live_settings(problem, self.live.unresolved, self.live.paths)
+        loop = close_loop(problem, live.controller, live if live.paths else None)
+        if loop.function.serialize() == self.loop.function.serialize():
+            return replace(self, problem=problem, controller=live.controller, loop=loop, live=live)
+        return replace(built(problem, self.live.unresolved, self.compiled, (), self.live.paths), held=self.held)
 
     @property
     def remembers(self) -> bool:
@@ -165,6 +180,43 @@ class Simulator:
             facts["model is reality"] = model.plant is not problem.plant
         title = name or type(self.controller).__name__
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
+
+    def run_many(
+        self,
+        exact: np.ndarray | None = None,
+        *,
+        settings: Mapping[str, Columns] | None = None,
+        starts: Mapping[str, Columns] | None = None,
+        seed: Seed = 0,
+        device: str | None = None,
+    ) -> ManyRuns:
+        """Run many scenarios and return their errors, without logs: side by side in vector registers where the loop can be.
+
+        A scenario has its own exact parameters, numbers of live settings and first states, and all have the same noise. Every
+        argument has a row or number for each scenario, or one for all. Exact parameters alone take the least time: with
+        settings every scenario's problem is checked (milliseconds), and for every different start the loop is composed again
+        (a tenth of a second) and not compiled.
+
+        Args:
+            exact: parameters, shape (scenarios, parameters), in the order of the parameters of what moves, which is the reality
+                where the problem has one; None: the problem's.
+            settings: numbers of live settings by path, shape (scenarios,) each; an interval by its ends.
+            starts: first values of states by name, shape (scenarios,) each, in their units; other states begin where the problem
+                says.
+            seed: of the noise of disturbances and sensors.
+            device: part of the name of an OpenCL device ('': the first graphics processor, else the first one), for loops that
+                are scalar code; None: the vector registers of this machine.
+
+        Raises:
+            InvalidName: a setting that is not live; no device has this name.
+            InvalidProblem: unknown states, or first values that the problem refuses.
+            InvalidShape: another number of parameters; arguments of different numbers of scenarios.
+            InvalidValue: a number that is not finite, or that a parameter or setting does not accept.
+            NotInstalled: pyopencl (pip install 'fpirhc[opencl]'), or a device with double precision.
+        """
+        if settings:
+            settings = {**self.live.flat(self.held), **settings}
+        return run_many(self, exact, settings=settings, starts=starts, seed=seed, device=device)
 
 
 @checked_call
@@ -301,37 +353,6 @@ def with_judgements(run: Run, problem: Problem, controller: Controller) -> Run:
     log.setflags(write=False)
     facts = {**run.settings, "broken": broken} if broken else run.settings
     return replace(run, layout=run.layout + Layout(tuple(signal for signal, _ in judged)), log=log, settings=facts)
-
-
-def run_tables(
-    problem: Problem,
-    seed: int,
-    cycles: int,
-    *,
-    disturbed: bool = True,
-    setpoints: Setpoints | None = None,
-    later: Sequence[tuple[int, Problem]] = (),
-) -> list[np.ndarray]:
-    """Return what the loop reads in every cycle: disturbances, the sensors' random series, set-points, where there are any.
-
-    Args:
-        seed: of the noise of disturbances and sensors; each has its own stream.
-        disturbed: whether disturbances act; the sensors' noise always does.
-        later: (first cycle, problem) with other numbers of disturbances and sensors from a cycle on.
-    """
-    times, sensing, disturbances = np.arange(cycles) * problem.period, problem.sensing, problem.disturbances
-    random = float(disturbed) * disturbance_values(problem, times, seed), sensing.table(times, seed)
-    tables = [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
-    moved = [
-        (cycle, other)
-        for cycle, other in later
-        if other.sensing is not sensing or other.disturbances is not disturbances
-    ]
-    for cycle, other in moved:
-        changed = run_tables(other, seed, cycles, disturbed=disturbed, setpoints=setpoints)
-        for table, rows in zip(tables, changed, strict=True):
-            table[cycle:] = rows[cycle:]
-    return tables
 
 
 def run_cycles(

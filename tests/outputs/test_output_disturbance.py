@@ -19,7 +19,7 @@ from test_outputs import OPTIMISER, SAME, curve, hill, on_outputs, planned, seda
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
-from fpirhc.simulation.simulate import run_tables
+from fpirhc.simulation.tables import run_tables
 
 LAW = fp.Exponential(rate=1.0)
 WAVE = fp.Sine(2.0, 0.1, 0.3)

@@ -14,8 +14,7 @@ import tasks
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import DeviceFailed, InvalidName, InvalidShape, InvalidValue, NotInstalled
-from fpirhc.simulation.lanes import run_many
+from fpirhc.errors import DeviceFailed, InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotInstalled
 from fpirhc.simulation.metrics.base import measured_errors
 from fpirhc.simulation.simulate import Simulator
 
@@ -133,7 +132,7 @@ def test_errors_are_those_of_the_ordinary_loop(name):
     close = 1e-9 if name == "lost samples" else 1e-12
     ready = fp.simulator(*CASES[name]())
     exact = plants(ready, 11, 0.05)
-    many = run_many(ready, exact)
+    many = ready.run_many(exact)
     assert many.lanes > 1, many.why
     assert not many.stops
     for k in (0, 3, 10):
@@ -161,7 +160,7 @@ def test_a_device_has_the_errors_of_the_lanes(name):
     """Its functions round otherwise again; statuses are the same, and so is a plant that runs away."""
     ready, device = fp.simulator(*CASES[name]()), some_device()
     exact = plants(ready, 11, 0.05)
-    lanes, many = run_many(ready, exact), run_many(ready, exact, device=device)
+    lanes, many = ready.run_many(exact), ready.run_many(exact, device=device)
     assert many.lanes == 1, many.why
     for one, other in ((many.rms_error, lanes.rms_error), (many.max_error, lanes.max_error)):
         for coordinate, errors in one.items():
@@ -177,11 +176,11 @@ def test_what_a_device_cannot_run_is_told():
         tasks.two_mass.problem, duration=0.5, measure_from=0.1, limits=fp.Limits(states={"q1": (-10.0, 10.0)})
     )
     ready = fp.simulator(limited, tasks.two_mass.controllers["RHC"])
-    many = run_many(ready, plants(ready, 2), device=device)
+    many = ready.run_many(plants(ready, 2), device=device)
     assert many.lanes == 0
     assert many.why.startswith("the loop has a part that is not written for devices: fpirhc_plan")
     with pytest.raises(InvalidName, match="no OpenCL device is called 'abacus'"):
-        run_many(fp.simulator(*CASES["map"]()), plants(fp.simulator(*CASES["map"]()), 2), device="abacus")
+        fp.simulator(*CASES["map"]()).run_many(plants(fp.simulator(*CASES["map"]()), 2), device="abacus")
 
 
 def test_a_device_that_fails_is_named(monkeypatch):
@@ -204,14 +203,14 @@ def test_a_device_that_fails_is_named(monkeypatch):
             patched.setattr(cl, name, exhausted)
             ready = fp.simulator(short, adaptive())
             with pytest.raises(DeviceFailed, match=told):
-                run_many(ready, plants(ready, 2), device=device)
+                ready.run_many(plants(ready, 2), device=device)
 
 
 def test_a_device_needs_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyopencl", None)
     ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False)
     with pytest.raises(NotInstalled, match=r"a device needs pyopencl, .*pip install 'fpirhc\[opencl\]'"):
-        run_many(ready, plants(ready, 2), device="")
+        ready.run_many(plants(ready, 2), device="")
 
 
 def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
@@ -222,9 +221,9 @@ def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
     )
     exact = plants(ready, 8, 0.01)
     place = tasks.two_mass.problem.plant.parameter.elements.index("m1")
-    calm = run_many(ready, exact)
+    calm = ready.run_many(exact)
     exact[5, place] *= 0.05
-    many = run_many(ready, exact)
+    many = ready.run_many(exact)
     assert dict(many.stops) == {5: by_itself(ready, exact[5])[-1]}
     assert np.isnan(many.rms_error["q1"][5])
     kept = np.arange(8) != 5
@@ -246,7 +245,7 @@ def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compi
     if not compiler:
         monkeypatch.setenv("FPIRHC_CC", "none")
     exact = plants(ready, 2)
-    many = run_many(ready, exact)
+    many = ready.run_many(exact)
     assert many.lanes == 0
     assert many.why.startswith(why)
     np.testing.assert_array_equal([many.rms_error[n][1] for n in ("q1", "q2")], by_itself(ready, exact[1])[0])
@@ -255,11 +254,11 @@ def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compi
 def test_wrong_parameters_are_named():
     ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False)
     with pytest.raises(InvalidShape, match=r"exact of shape \(1, 2\)\): expected one row per plant with m1, "):
-        run_many(ready, np.ones((1, 2)))
+        ready.run_many(np.ones((1, 2)))
     exact = plants(ready, 3)
     exact[1, 0] = np.nan
     with pytest.raises(InvalidValue, match=r"plant 1: .* is nan, which is not finite"):
-        run_many(ready, exact)
+        ready.run_many(exact)
 
 
 def drifting() -> Simulator:
@@ -281,7 +280,7 @@ def drifting() -> Simulator:
 def test_plants_are_those_of_the_reality_and_each_starts_where_it_settles():
     """Between two that are one and the same there may be another."""
     ready, exact = drifting(), np.array([[1.0, 1.0], [1.0, 3.0], [1.0, 1.0]])
-    many = run_many(ready, exact)
+    many = ready.run_many(exact)
     for k, one in enumerate(exact):
         rms, largest, *_ = by_itself(ready, one)
         np.testing.assert_allclose(many.rms_error["y"][k], rms, rtol=1e-12)
@@ -290,10 +289,43 @@ def test_plants_are_those_of_the_reality_and_each_starts_where_it_settles():
 
 def test_a_plant_outside_its_bounds_is_named_wherever_it_stands():
     with pytest.raises(InvalidValue, match="plant 1: 'c' is 5, which is outside 0 to 4 m/s"):
-        run_many(drifting(), np.array([[1.0, 1.0], [1.0, 5.0], [1.0, 1.0]]))
+        drifting().run_many(np.array([[1.0, 1.0], [1.0, 5.0], [1.0, 1.0]]))
 
 
 def test_no_plants_have_no_errors():
-    many = run_many(drifting(), np.empty((0, 2)))
+    many = drifting().run_many(np.empty((0, 2)))
     assert many.rms_error["y"].shape == many.max_error["y"].shape == (0,)
     assert not many.stops
+
+
+def test_scenarios_have_settings_and_starts_of_their_own():
+    """A loop with plans keeps a first plan from its start, so every start composes it again; a setting serves all starts."""
+    for controller in ("CTC+FPI (eq 6)", "RHC+FPI"):
+        problem = replace(tasks.two_mass.problem, duration=1.0, measure_from=0.0)
+        ready = fp.simulator(problem, tasks.two_mass.controllers[controller], live=["deformation.gain"])
+        exact, gains, q1 = plants(ready, 3, 0.05), [-0.4, -0.5, -0.6], [1.9, 2.1, 2.1]
+        many = ready.run_many(exact, settings={"deformation.gain": gains}, starts={"q1": q1, "q2": 2.5})
+        assert many.lanes > 1, many.why
+        for k in range(3):
+            start = replace(problem, start={**problem.start, "q1": q1[k], "q2": 2.5})
+            other = fp.simulator(start, tasks.two_mass.controllers[controller], live=["deformation.gain"])
+            variant = start.with_exact(exact[k])
+            run = other.run(seed=0, variant=variant, settings={"deformation.gain": gains[k]})
+            errors = measured_errors(variant, run)
+            np.testing.assert_allclose(
+                [v[k] for v in many.rms_error.values()], np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-12
+            )
+
+
+def test_scenarios_that_disagree_are_named():
+    ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False, live=["deformation.gain"])
+    with pytest.raises(
+        InvalidShape, match=r"run_many\(2 for 'deformation.gain', 3 for 'q1'\): expected a number for every"
+    ):
+        ready.run_many(settings={"deformation.gain": [-1.0, -2.0]}, starts={"q1": [0.0, 1.0, 2.0]})
+    with pytest.raises(InvalidValue, match="scenario 1: 'q1' is nan, which is not finite"):
+        ready.run_many(starts={"q1": [0.0, np.nan]})
+    with pytest.raises(InvalidName, match=r"deformation\.gian"):
+        ready.run_many(settings={"deformation.gian": -1.0})
+    with pytest.raises(InvalidProblem, match="q3"):
+        ready.run_many(starts={"q3": 1.0})

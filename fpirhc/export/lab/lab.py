@@ -32,7 +32,8 @@ from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.run import judged_motion
-from fpirhc.simulation.simulate import Simulator, run_tables, simulator
+from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.simulation.tables import run_tables
 from fpirhc.studies.comparison.compare import select
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.paths import changed_at, content_at, paths_to

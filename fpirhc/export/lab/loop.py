@@ -16,7 +16,8 @@ from fpirhc.export.targets.c import template, with_own_math
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.run import judged_motion
-from fpirhc.simulation.simulate import Simulator, run_tables
+from fpirhc.simulation.simulate import Simulator
+from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.driver import SIGNATURE
 from fpirhc.symbolic.live import PREFIX, LiveNumber
 from fpirhc.task.problem import Problem
