@@ -23,10 +23,6 @@ SPEED, PERIOD = 20.0, 1e-2  # m/s, s
 WHEELBASE = 2.5789  # m, BMW 320i
 
 
-def constant(value, unit):
-    return fp.Parameter(approximate=value, exact=value, unit=unit)
-
-
 def bicycle(q, v, u, p):
     return {"side": p.speed * ca.sqrt(p.speed**2 - v.side**2) / p.wheelbase * ca.tan(u.steer)}
 
@@ -35,10 +31,15 @@ def lanes(t):
     return {"side": 3.5 / (1 + ca.exp(-2.5 * (t - 2.5))) - 3.5 / (1 + ca.exp(-2.5 * (t - 6.0)))}
 
 
+def above(q, v, p):
+    edges = [fp.Shape.line((-10, side), (10, side)) for side in (-1.75, 1.75, 5.25)]
+    return [*edges, fp.Shape.box((0, q.side), 4.5, 1.6, ca.asin(v.side / p.speed))]
+
+
 plant = fp.Plant(
     coordinates={"side": "m"},
     inputs={"steer": "rad"},
-    parameters={"speed": constant(SPEED, "m/s"), "wheelbase": constant(WHEELBASE, "m")},
+    parameters={"speed": fp.Parameter(SPEED, SPEED, "m/s"), "wheelbase": fp.Parameter(WHEELBASE, WHEELBASE, "m")},
     response=bicycle,
 )
 problem = fp.Problem(
@@ -66,3 +67,4 @@ controllers = {
 }
 headline = ("RHC", "RHC+FPI")
 why = "Tyres answer late, so the iteration's gain stays below one; the filter has a gain of its own for side, rate and response."
+pictures = (fp.Planar("The car from above", plant, above, controllers=headline),)

@@ -11,15 +11,13 @@ wind of 3 m/s and carries 0.15 kg. The model is the point mass r'' = thrust - g.
     CTC                    0.042      0.038      0.013
 """
 
-import math
-
 import casadi as ca
 
 import fpirhc as fp
 from fpirhc.adapters.rotorpy import rotorpy_body
 
 needs = ("rotorpy",)
-PERIOD, TURN, AXES = 1e-2, 2 * math.pi * 0.2, ("x", "y", "z")  # s, rad/s
+PERIOD, TURN, AXES = 1e-2, 2 * ca.pi * 0.2, ("x", "y", "z")  # s, rad/s
 
 plant = fp.Plant(
     coordinates=dict.fromkeys(AXES, "m"),
@@ -30,13 +28,14 @@ plant = fp.Plant(
 start = {"x": 2.0, "y'": 2 * TURN}
 
 
-def make(told, seed):
-    wind = (told["wind"], 0.0, 0.0)
-    return rotorpy_body(plant, period=PERIOD, start=start, wind=wind, payload=told["payload"]).body
+def above(q, _v, _p):
+    return [fp.Shape.disc((q.x + a, q.y + b), 0.1) for a in (-0.2, 0.2) for b in (-0.2, 0.2)]
 
 
 reality = fp.ExternalPlant(
-    make=make,
+    make=lambda told, _: (
+        rotorpy_body(plant, period=PERIOD, start=start, wind=(told["wind"], 0.0, 0.0), payload=told["payload"]).body
+    ),
     measures={n + dash: unit for dash, unit in {"": "m", "'": "m/s", "''": "m/s^2"}.items() for n in AXES},
     parameters={
         "wind": fp.Parameter(0.0, 3.0, "m/s", spread=fp.Uniform(absolute=3.0)),
@@ -68,3 +67,4 @@ controllers = {
 }
 headline = ("RHC", "RHC+FPI")
 why = "Wind and payload change slowly and the attitude lags: a filter may be slower sideways, and one gain for all axes may not."
+pictures = (fp.Planar("The quadrotor from above", plant, above, controllers=headline),)

@@ -337,6 +337,7 @@ def test_a_mechanism_stands_still_where_nothing_can_move(runs):
     """Moments of the run, a panel for each controller, three shapes each."""
     figure = Figure()
     planar().draw(figure, runs)
+    figure.draw_without_rendering()
     assert [a.get_title() for a in figure.axes] == ["slow", "quick"]
     assert [len(a.lines) for a in figure.axes] == [9, 9]
     assert [len(a.patches) for a in figure.axes] == [18, 18]

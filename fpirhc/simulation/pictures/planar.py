@@ -130,7 +130,7 @@ class Planar(Picture):
             for k, one in enumerate(numbers):
                 self._draw_still(axis, one, 0.15 + 0.85 * (k + 1) / len(numbers))
             axis.set_title(drawing.literal(name), fontsize=10)
-            axis.set_aspect("equal", adjustable="datalim")
+            axis.set_aspect("equal", adjustable="box")
             axis.autoscale_view()
 
     def _draw_still(self, axis: Axes, numbers: np.ndarray, strength: float) -> None:
