@@ -20,7 +20,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import commanding_blocks, like, reference_block
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import Response, Undeformed, given_response
 from fpirhc.controllers.sensing_chain import given_states, raw_signal
 from fpirhc.errors import InvalidValue, OutputError
 from fpirhc.fields.kinds import Positive
@@ -62,6 +62,8 @@ class Processor(Undeformed):
     Args:
         program: the program with its arguments, or a function that opens a port.
         deadline: longest wall time of an answer, s.
+        responses: method `response` of the controller that it has, where that is given others than the plant's controlled ones, as
+            slots are; None: the plant's.
 
     Raises:
         InvalidValue: no program. In `blocks`, OutputError: it cannot be started, or has another controller.
@@ -69,6 +71,7 @@ class Processor(Undeformed):
 
     program: Sequence[str] | Callable[[], Port] = field(metadata={"setting": False})
     deadline: Positive = 10.0
+    responses: Callable[[Problem], Response | None] | None = field(default=None, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         if callable(self.program):
@@ -84,13 +87,16 @@ class Processor(Undeformed):
         closing, delays = commanding_blocks(problem, [scalar(_ANSWER)])
         return [reference_block(problem), self._block(problem), *closing], delays
 
+    def response(self, problem: Problem) -> Response | None:
+        return None if self.responses is None else self.responses(problem)
+
     def _block(self, problem: Problem) -> Block:
         """Block (time, sample) -> command and status; the model's response to it stands beside, for readers of a log.
 
         Where something is estimated the sample is what the sensors show: the program has the estimators of its own.
         """
-        plant, raw = problem.plant, raw_signal(problem)
-        seen = (*measured_signals(plant), plant.response_signal("realised"))
+        plant, raw, own = problem.plant, raw_signal(problem), given_response(problem, self)
+        seen = (*measured_signals(plant), plant.response_signal("realised") if own is None else own.signal)
         sample = Layout((time_signal(plant), *(seen if raw is None else (*given_states(problem), raw))))
         answers = _answers(self, sample.size, len(plant.inputs))
         response = plant.equations.controlled_response
@@ -209,7 +215,7 @@ class _Console:
             )
             raise OutputError(
                 f"the processor has another controller: expected {given} numbers a sample and {commands} a command, got {sizes}; "
-                "export the controller of this problem again"
+                "export the controller of this problem again, and or give that of slots as Processor(..., responses=slots.response)"
             )
 
     def ask(self, line: str) -> list[str]:

@@ -134,7 +134,7 @@ def in_the_loop(device: Device, target: Target, folder: Path) -> tuple[int, floa
 
     The difference is the largest one, relative to the largest command.
     """
-    outside = Processor(processor_of(target)(folder, device.name))
+    outside = Processor(processor_of(target)(folder, device.name), responses=device.controller.response)
     run, other = (simulate(device.problem, one, seed=0) for one in (device.controller, outside))
     if other.stop:
         raise OutputError(f"the run with the exported program ended early: {other.stop}")

@@ -81,8 +81,9 @@ class Stepper(NumbersNow, Checked):
     `stepper.step(..., setpoints={"q1": 2.5})`, and need no live setting; `setpoints` are in force.
 
     `function` is the step itself, a CasADi Function (memory, each of `reads`) -> (memory, trace, command), for code generation of
-    one's own. `reads`, `memory`, `signals` and `settings` are the layouts of what it takes and gives: names, units, and start
-    values, which are the numbers of the build for parameters, settings and set-points. It has gate and monitor inside; not inside
+    one's own. `reads`, `memory`, `signals`, `settings` and `parameters` are the layouts of what it takes and gives: names, units,
+    and start values, which are the numbers of the build for parameters, settings and set-points. It has gate and monitor
+    inside; not inside
     are missed cycles, a solver that raises, and the check of settings (`bounds`).
 
     A controller that does better without its adaptation is warned of once, `HarmfulAdaptation`, after four runs of 300 cycles on
@@ -160,6 +161,11 @@ class Stepper(NumbersNow, Checked):
 
         def __getattr__(self, name: str) -> object:
             raise missing(type(self), name)
+
+    @property
+    def parameters(self) -> Layout:
+        """The parameters among `reads`, which start with those of the model; empty where none is read."""
+        return Layout(tuple(s for s in self.reads.signals if s.name == "parameters"))
 
     def __repr__(self) -> str:
         """What it is of, how it runs, and how it keeps its deadline."""

@@ -37,6 +37,7 @@ CASES = {
     "tanks": ("leaking_tanks", "RHC+FPI"),
     "map": ("fishery", "RHC+FPI"),
     "motor": ("noisy_motor", "RHC+FPI"),
+    "slots": ("crane_slots", "slots+FPI"),
 }
 
 
@@ -75,7 +76,9 @@ def lines_of(folder: Path) -> str:
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", slow_but(("torque", "plan", "tanks", "map", "motor"), "torque", "motor"))
+@pytest.mark.parametrize(
+    "name", slow_but(("torque", "plan", "tanks", "map", "motor", "slots"), "torque", "motor", "slots")
+)
 def test_a_loop_with_the_program_is_the_run(name, tmp_path):
     """Every state and command, twice from the start: what differs is the last digits of exp and the like.
 
@@ -83,7 +86,7 @@ def test_a_loop_with_the_program_is_the_run(name, tmp_path):
     """
     device = exported(name, tmp_path, "c")
     run = fp.simulate(device.problem, device.controller, seed=0)
-    outside = Processor([program(tmp_path)])
+    outside = Processor([program(tmp_path)], responses=device.controller.response)
     for _ in range(2):
         other = fp.simulate(device.problem, outside, seed=0)
         np.testing.assert_allclose(other["command"], run["command"], rtol=1e-10, atol=1e-9)
