@@ -24,6 +24,7 @@ SECTIONS = {
     "Testing and errors": ("conformance", "errors"),
 }
 BESIDE = {  # for authors of members and for tools; imported from the module
+    "Axis": "fpirhc.studies.sweep",
     "Certificate": "fpirhc.studies.open_loop",
     "Combination": "fpirhc.plant.regressor",
     "Comparison": "fpirhc.studies.comparison.comparison",
@@ -36,9 +37,11 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "Probe": "fpirhc.probing.probe",
     "Regressor": "fpirhc.plant.regressor",
     "Review": "fpirhc.review.question",
+    "RobustBoxes": "fpirhc.studies.robust",
     "ScenarioComparison": "fpirhc.studies.scenarios.scenario_comparison",
     "Simulator": "fpirhc.simulation.simulate",
     "Suggestion": "fpirhc.review.questions.noise",
+    "Sweep": "fpirhc.studies.sweep",
     "Tuning": "fpirhc.studies.tune",
     "assess_gain": "fpirhc.contraction.spectrum",
     "check_controller": "fpirhc.conformance",
@@ -57,9 +60,11 @@ BESIDE = {  # for authors of members and for tools; imported from the module
     "linear_parameters": "fpirhc.plant.regressor",
     "output_chain": "fpirhc.controllers.slots.slot",
     "response_jacobian": "fpirhc.contraction.spectrum",
+    "robust_boxes": "fpirhc.studies.robust",
     "spectrum_over_box": "fpirhc.contraction.spectrum",
     "spectrum_over_run": "fpirhc.contraction.spectrum",
     "structural_order": "fpirhc.plant.plant",
+    "sweep": "fpirhc.studies.sweep",
 }
 WITH_MEMBERS = {
     "Run",
@@ -74,6 +79,9 @@ WITH_MEMBERS = {
     "LyapunovView",
     "Review",
     "figures",
+    "RobustBoxes",
+    "Sweep",
+    "Tuning",
 }
 INHERITED = {"Stepper": ["   :inherited-members:"]}  # its numbers in force
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -36,6 +36,9 @@ from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.flat_code import FlatCode
 from fpirhc.symbolic.native import find_compiler, shared_library
 from fpirhc.task.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _ASKED = 2  # runs after which it is known what depends on the exact parameters
 _GROUPS, _ITEMS = 256, 65_536  # of lanes in one call, and of a device
@@ -72,6 +75,14 @@ class ManyRuns:
     lanes: int
     why: str  # no lanes; empty where there are some
 
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a row per scenario: `rms_error.q1`, `max_error.q1`, `status.OK` and so on, and `stop`, why a run ended early."""
+        import pandas as pd
+
+        groups = {"rms_error": self.rms_error, "max_error": self.max_error, "status": self.statuses}
+        frame = pd.DataFrame({f"{name}.{one}": column for name, some in groups.items() for one, column in some.items()})
+        return frame.assign(stop=frame.index.map(self.stops.get))
+
 
 def run_many(
     ready: Ready,
@@ -79,29 +90,29 @@ def run_many(
     *,
     settings: Mapping[str, Columns] | None = None,
     starts: Mapping[str, Columns] | None = None,
-    seed: int = 0,
+    seed: int | Sequence[int] | np.ndarray = 0,
     device: str | None = None,
 ) -> ManyRuns:
     """See `Simulator.run_many`."""
-    rows = _Rows.of(ready.problem, exact, settings or {}, starts or {})
+    rows = _Rows.of(ready.problem, exact, settings or {}, starts or {}, seed)
     judged, count = ready.loop.trace["error"].elements, len(rows.exact)
     lanes = _LANES.of((ready,), (device,), lambda: Lanes(ready, _errors_alone(), device))
     rms, largest = (np.full((count, len(judged)), np.nan) for _ in range(2))
     counts, left = np.zeros((count, len(Status)), dtype=int), np.ones(count, dtype=bool)
     scenarios = _Scenarios(ready, rows)
-    if not lanes.why and count and (settings or starts):
-        for k, values in lanes.of_scenarios(scenarios, seed).items():
+    if not lanes.why and count and (settings or starts or np.ndim(seed)):
+        for k, values in lanes.of_scenarios(scenarios).items():
             rms[k], largest[k] = ([values[m][n] for n in judged] for m in ("rms_error", "max_error"))
             counts[k] = [values["status"].get(one.name, 0) for one in Status]
             left[k] = False
     elif not lanes.why and count:
-        columns, left = lanes.of_parameters(rows.exact, seed)
+        columns, left = lanes.of_parameters(rows.exact, int(rows.seeds[0]))
         rms, largest = (np.column_stack([columns[m][n] for n in judged]) for m in ("rms_error", "max_error"))
         counts = np.column_stack([np.ma.filled(columns["status"][one.name], 0) for one in Status])
     stops = {}
     for number in map(int, np.flatnonzero(left)):
-        own, variant, numbers = scenarios[number]
-        run = own.run(seed=seed, variant=variant, settings=numbers)
+        own, variant, noise, numbers = scenarios[number]
+        run = own.run(seed=noise, variant=variant, settings=numbers)
         errors = measured_errors(variant, run)
         rms[number], largest[number] = np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0)
         counts[number] = np.bincount(run["status"].ravel().astype(int), minlength=len(Status))
@@ -119,16 +130,31 @@ class _Rows:
     exact: np.ndarray  # shape (scenarios, parameters)
     settings: Mapping[str, np.ndarray]  # numbers by path, shape (scenarios,)
     starts: Mapping[str, np.ndarray]  # first values by state, shape (scenarios,)
+    seeds: np.ndarray  # of the noise, shape (scenarios,)
 
     @classmethod
     def of(
-        cls, problem: Problem, exact: np.ndarray | None, settings: Mapping[str, Columns], starts: Mapping[str, Columns]
+        cls,
+        problem: Problem,
+        exact: np.ndarray | None,
+        settings: Mapping[str, Columns],
+        starts: Mapping[str, Columns],
+        seed: int | Sequence[int] | np.ndarray,
     ) -> _Rows:
         """Return what was given, with a row for every scenario."""
         plants = np.atleast_2d(np.asarray(problem.real_parameters if exact is None else exact, dtype=float))
         _check_parameters(problem.moved.parameters, plants)
         named = [{n: np.atleast_1d(np.asarray(v, dtype=float)) for n, v in some.items()} for some in (settings, starts)]
-        sizes = {"exact": len(plants), **{f"'{n}'": v.size for some in named for n, v in some.items()}}
+        seeds = np.atleast_1d(np.asarray(seed))
+        if seeds.ndim != 1 or seeds.dtype.kind not in "iu" or (seeds < 0).any():
+            raise InvalidValue(
+                f"run_many(seed={seed!r}): expected a whole number of at least 0, or one for every scenario"
+            )
+        sizes = {
+            "exact": len(plants),
+            "seed": seeds.size,
+            **{f"'{n}'": v.size for some in named for n, v in some.items()},
+        }
         several = {name: size for name, size in sizes.items() if size != 1}
         if len({*several.values()}) > 1 or any(v.ndim != 1 for some in named for v in some.values()):
             told = ", ".join(f"{size} for {name}" for name, size in several.items())
@@ -144,11 +170,11 @@ class _Rows:
                         f"run_many: scenario {number}: '{name}' is {values[number]:g}, which is not finite"
                     )
         whole = [{name: np.broadcast_to(values, count) for name, values in some.items()} for some in named]
-        return cls(np.broadcast_to(plants, (count, plants.shape[1])), *whole)
+        return cls(np.broadcast_to(plants, (count, plants.shape[1])), whole[0], whole[1], np.broadcast_to(seeds, count))
 
 
 class _Scenarios:
-    """The loop, the problem and the live settings of every scenario, by number."""
+    """The loop, the problem, the seed and the live settings of every scenario, by number."""
 
     def __init__(self, ready: Ready, rows: _Rows) -> None:
         self._ready, self._rows = ready, rows
@@ -157,7 +183,7 @@ class _Scenarios:
     def __len__(self) -> int:
         return len(self._rows.exact)
 
-    def __getitem__(self, number: int) -> tuple[Ready, Problem, dict[str, float] | None]:
+    def __getitem__(self, number: int) -> tuple[Ready, Problem, int, dict[str, float] | None]:
         exact, settings, starts = self._rows.exact, self._rows.settings, self._rows.starts
         begin = {name: float(values[number]) for name, values in starts.items()}
         key = tuple(begin.values())
@@ -166,7 +192,8 @@ class _Scenarios:
         own = self._begun[key]
         changed = not np.array_equal(exact[number], own.problem.real_parameters)
         problem = own.problem.with_exact(exact[number]) if changed else own.problem
-        return own, problem, {path: float(values[number]) for path, values in settings.items()} or None
+        numbers = {path: float(values[number]) for path, values in settings.items()} or None
+        return own, problem, int(self._rows.seeds[number]), numbers
 
 
 def _check_parameters(parameters: Mapping[str, Parameter], exact: np.ndarray) -> None:
@@ -308,12 +335,12 @@ class Lanes:
         columns, outside = self._sums.columns(ready.problem, sums)
         return columns, bad | outside
 
-    def of_scenarios(self, scenarios: _Scenarios, seed: int) -> dict[int, Values]:
-        """Return the metrics of scenarios with one noise by number, but for those that the ordinary loop has to run."""
+    def of_scenarios(self, scenarios: _Scenarios) -> dict[int, Values]:
+        """Return the metrics of scenarios by number, but for those that the ordinary loop has to run."""
         several = enumerate(scenarios[k] for k in range(len(scenarios)))
         runs = {
-            number: self.one_run(own, problem, seed, numbers)
-            for number, (own, problem, numbers) in several
+            number: self.one_run(own, problem, noise, numbers)
+            for number, (own, problem, noise, numbers) in several
             if own.evaluator is self._ready.evaluator
         }
         found = zip(runs, self.values(list(runs.values())) if runs else (), strict=True)

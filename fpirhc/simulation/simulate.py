@@ -187,13 +187,13 @@ class Simulator:
         *,
         settings: Mapping[str, Columns] | None = None,
         starts: Mapping[str, Columns] | None = None,
-        seed: Seed = 0,
+        seed: Seed | Sequence[int] | np.ndarray = 0,
         device: str | None = None,
     ) -> ManyRuns:
         """Run many scenarios and return their errors, without logs: side by side in vector registers where the loop can be.
 
-        A scenario has its own exact parameters, numbers of live settings and first states, and all have the same noise. Every
-        argument has a row or number for each scenario, or one for all. Exact parameters alone take the least time: with
+        A scenario has its own exact parameters, numbers of live settings, first states and noise. Every argument has a row or
+        number for each scenario, or one for all. Exact parameters alone take the least time: with
         settings every scenario's problem is checked (milliseconds), and for every different start the loop is composed again
         (a tenth of a second) and not compiled.
 
@@ -211,7 +211,7 @@ class Simulator:
             InvalidName: a setting that is not live; no device has this name.
             InvalidProblem: unknown states, or first values that the problem refuses.
             InvalidShape: another number of parameters; arguments of different numbers of scenarios.
-            InvalidValue: a number that is not finite, or that a parameter or setting does not accept.
+            InvalidValue: a number that is not finite, or that a parameter or setting does not accept; a wrong seed.
             NotInstalled: pyopencl (pip install 'fpirhc[opencl]'), or a device with double precision.
         """
         if settings:

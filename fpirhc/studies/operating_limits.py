@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from fpirhc.summary import Column, Table, in_percent, line, number
 from fpirhc.task.dead_time import MOST
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
 _NEAR = 1.05  # between the value that fails and the one that holds
@@ -123,6 +126,16 @@ class OperatingLimits(Study):
             why = self.untried.get((controller, quantity), "")
             raise InvalidName(f"no limit '{key}'{f' ({why})' if why else ''}.{nearest(key, result)}")
         return result[key]
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a row per controller and quantity: `controller`, `quantity`, `unit`, `holds`, `fails`, `why`."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            {"controller": one.controller, "quantity": one.quantity.name, "unit": one.quantity.unit}
+            | {"holds": one.holds, "fails": one.fails, "why": one.why}
+            for one in self.limits
+        )
 
     @property
     def view(self) -> View:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +34,9 @@ from fpirhc.studies.scenarios.draws import SEARCHING, draws_differ
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, behind_equals, in_percent, line
 from fpirhc.task.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
 _BOXES = 99  # of 1 % to 99 %
@@ -82,6 +86,14 @@ class RobustBoxes(Study):
 
     def __repr__(self) -> str:
         return line(self, self.problem, *(f"{one.controller}: {_percent(one.percent)}" for one in self.boxes))
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a row per controller: boxes in percent, relative errors, and the smallest box with a counterexample."""
+        import pandas as pd
+
+        from_percent = (math.nan if b.counterexample is None else b.counterexample.from_percent for b in self.boxes)
+        frame = pd.DataFrame([asdict(box) for box in self.boxes])
+        return frame.assign(counterexample_from=list(from_percent)).drop(columns="counterexample", errors="ignore")
 
     @property
     def view(self) -> View:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,9 @@ from fpirhc.studies.scenarios.ledger import Ledger, begun_with
 from fpirhc.studies.tuned_file import as_python
 from fpirhc.studies.view import Progress
 from fpirhc.symbolic.paths import content_at, paths_to
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LEDGER = "trials.jsonl"
 _MOST = 1_000_000  # trials, all of which a proposal follows from
@@ -79,6 +82,17 @@ class Tuning:
         """Lines of a problem file that give its controllers the best settings."""
         notes = {e.name: f"cost {e.cost_before:.4g} before, {e.cost:.4g} after" for e in self.entries}
         return as_python({e.name: e.settings for e in self.entries}, notes)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return a row per setting: `controller`, `setting`, `before`, `best`, and `cost_before` and `cost` of the controller."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            {"controller": e.name, "setting": path, "before": e.before[path], "best": best}
+            | {"cost_before": e.cost_before, "cost": e.cost}
+            for e in self.entries
+            for path, best in e.settings.items()
+        )
 
     def facts(self) -> dict[str, Any]:
         """Plain data for a file."""

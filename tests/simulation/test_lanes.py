@@ -317,6 +317,14 @@ def test_scenarios_have_settings_and_starts_of_their_own():
             )
 
 
+def test_scenarios_have_noise_of_their_own():
+    ready = fp.simulator(replace(noisy(), duration=0.5, measure_from=0.1), LAW)
+    many = ready.run_many(seed=[3, 1, 4])
+    assert many.lanes > 1, many.why
+    errors = measured_errors(ready.problem, ready.run(seed=4))
+    assert many.to_dataframe()["rms_error.q1"][2] == pytest.approx(np.sqrt(np.mean(errors[:, 0] ** 2)), rel=1e-9)
+
+
 def test_scenarios_that_disagree_are_named():
     ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False, live=["deformation.gain"])
     with pytest.raises(
@@ -327,5 +335,7 @@ def test_scenarios_that_disagree_are_named():
         ready.run_many(starts={"q1": [0.0, np.nan]})
     with pytest.raises(InvalidName, match=r"deformation\.gian"):
         ready.run_many(settings={"deformation.gian": -1.0})
+    with pytest.raises(InvalidValue, match=r"run_many\(seed=\[0, -1\]\): expected a whole number"):
+        ready.run_many(seed=[0, -1])
     with pytest.raises(InvalidProblem, match="q3"):
         ready.run_many(starts={"q3": 1.0})

@@ -165,6 +165,7 @@ def test_what_cannot_be_tried_has_its_reason():
     assert "the model is right; name a parameter, such as b" in found.untried["law", "mismatch"]
     with pytest.raises(InvalidName, match="the model is right"):
         found.of("law", "mismatch")
+    assert found.to_dataframe()["fails"].tolist() == [found.of("law", "lost").fails]
 
 
 def test_a_controller_that_fails_as_the_problem_stands():

@@ -130,6 +130,8 @@ def test_every_controller_gets_the_same_budget_and_none_gets_worse(task, tmp_pat
     adaptive = tuned.entries[1]
     assert adaptive.cost < 0.5 * adaptive.cost_before
     assert tuned.untouched == ("CTC exact",)
+    rows = tuned.to_dataframe().set_index("setting")
+    assert rows.loc["deformation.gain", "best"] == adaptive.settings["deformation.gain"]
     # The cost is what a comparison would report, of the settings as they were written down.
     changed = with_tuned(task, {e.name: e.settings for e in tuned.entries})
     run = fp.simulate(task.problem, changed.controllers["CTC+FPI"], seed=0, compiled=False)
