@@ -1,6 +1,6 @@
 """Which form of the iteration: plain, increment and model-referenced side by side on all shipped problems.
 
-    python benchmarks/which_form.py [names of problems]     prints the tables; --write puts them into docs/which-form.md
+    python benchmarks/which_form.py [names of problems]     prints tables with their rows; --write writes the page
 
 Each problem keeps its controller, horizon, limits and measuring time; only the deformation is exchanged: eq (6) with the gains
 -0.5, -1.5, -2.5 in each of the three forms. Five conditions:
@@ -191,40 +191,47 @@ def shown(name: str, values: list[float], *, mark: bool) -> list[str]:
 
 
 def adaptive() -> list[str]:
-    """Names of the shipped problems whose headline has a deformation that may be exchanged."""
+    """Names of the shipped problems whose headline has a deformation of any form; an iteration on targets pairs by itself."""
     names = []
     for name in shipped_problems():
         one = task(name)
         try:
             one.controller.with_deformation(fp.Identity())
-            check_gain_sign(one.problem, resolved(one.problem, one.controller).deformation)
+            ready = resolved(one.problem, one.controller)
+            check_gain_sign(one.problem, ready.deformation)
         except (TypeError, FpirhcError):
             continue
-        names.append(name)
+        names += [name] if ready.deforms != "target" else []
     return sorted(names)
 
 
 def main() -> None:
-    """Measure, print, and count the wins."""
-    names = [a for a in sys.argv[1:] if not a.startswith("-")] or adaptive()
+    """Measure and print the rows of each problem, and count the wins of all rows."""
     heads = ["problem", *(f"{form} {gain:g}" for form in FORMS for gain in GAINS)]
-    wins = {form: dict.fromkeys(CONDITIONS, 0) for form in FORMS}
-    for condition, alter in CONDITIONS.items():
-        rows = []
-        for name in names:
-            altered = alter(task(name))
-            if altered is None:
-                continue
-            values = measured(altered, change if condition == "exact" else error)
-            if not np.isfinite(values).any():
-                continue
-            rows.append(shown(name, values, mark=condition != "exact"))
-            _count(wins, condition, values)
-        write_table(f"forms {condition}", heads, rows, PAGE)
-    advice = [[name, *_advice(task(name))] for name in names]
-    write_table("forms review", ["problem", "as shipped", "dead time", "lag"], advice, PAGE)
-    summary = [[form, *(str(v) for v in counts.values())] for form, counts in wins.items()]
+    known = adaptive()
+    for name in [a for a in sys.argv[1:] if not a.startswith("-")] or known:
+        one = task(name)
+        for condition, alter in CONDITIONS.items():
+            altered = alter(one)
+            values = [] if altered is None else measured(altered, change if condition == "exact" else error)
+            row = [shown(name, values, mark=condition != "exact")] if np.isfinite(values).any() else []
+            write_table(f"forms {condition}", heads, renewed(f"forms {condition}", name, row, known), PAGE)
+        advice = renewed("forms review", name, [[name, *_advice(one)]], known)
+        write_table("forms review", ["problem", "as shipped", "dead time", "lag"], advice, PAGE)
+    summary = [[form, *(str(wins(condition)[form]) for condition in CONDITIONS)] for form in FORMS]
     write_table("forms wins", ["best or within 10 % of the best", *CONDITIONS], summary, PAGE)
+
+
+def renewed(table: str, name: str, own: list[list[str]], known: list[str]) -> list[list[str]]:
+    """The rows of known problems that the page has, sorted, with a problem's own in place of its old one."""
+    return sorted([row for row in written(table) if row[0] in known and row[0] != name] + own)
+
+
+def written(table: str) -> list[list[str]]:
+    """The rows of a table of the page."""
+    text = PAGE.read_text(encoding="utf-8").partition(f"<!-- begin {table} -->")[2].partition("<!-- end")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    return rows[2:]
 
 
 def _advice(one: Task) -> list[str]:
@@ -233,13 +240,15 @@ def _advice(one: Task) -> list[str]:
     return ["–" if t is None else recommended_form(t.problem)[0] for t in tasks]
 
 
-def _count(wins: dict[str, dict[str, int]], condition: str, values: list[float]) -> None:
-    """Each form with its best gain; with an exact model its worst one, for it is to change nothing."""
-    groups = np.array(values).reshape(len(FORMS), len(GAINS))
-    pick = np.nanmax if condition == "exact" else np.nanmin
-    scores = [float(pick(g)) if np.isfinite(g).any() else np.inf for g in groups]
-    for form, score in zip(FORMS, scores, strict=True):
-        wins[form][condition] += score <= max(NEAR * min(scores), 1e-9)
+def wins(condition: str) -> dict[str, int]:
+    """Rows of the page that a form wins with its best gain; with an exact model, which it is not to change, with its worst."""
+    won, pick = dict.fromkeys(FORMS, 0), np.nanmax if condition == "exact" else np.nanmin
+    for _, *cells in written(f"forms {condition}"):
+        groups = np.array([float(c.strip("*").replace("–", "nan")) for c in cells]).reshape(len(FORMS), len(GAINS))
+        scores = [float(pick(g)) if np.isfinite(g).any() else np.inf for g in groups]
+        for form, score in zip(FORMS, scores, strict=True):
+            won[form] += score <= max(NEAR * min(scores), 1e-9)
+    return won
 
 
 if __name__ == "__main__":
