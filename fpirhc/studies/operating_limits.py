@@ -11,13 +11,14 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fpirhc.controllers.contract import Controller, believing
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
-from fpirhc.fields.checked import checked_call
+from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import AboveZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.sensing.base import response_names
@@ -26,8 +27,11 @@ from fpirhc.simulation.metrics import measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.scenarios.bench import ranges, relative_error
-from fpirhc.studies.view import Progress, Study, View, circumstances
+from fpirhc.studies.scenarios.bench import Conditions, ranges, relative_error
+from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.studies.scenarios.fingerprint import fingerprint
+from fpirhc.studies.scenarios.ledger import kept_in
+from fpirhc.studies.view import Progress, Study, View, circumstances, finite_alone
 from fpirhc.summary import Column, Table, in_percent, line, number
 from fpirhc.task.dead_time import MOST
 from fpirhc.task.disturbance import Noise
@@ -36,6 +40,7 @@ from fpirhc.task.problem import Problem
 if TYPE_CHECKING:
     import pandas as pd
 
+LEDGER = "limits.jsonl"
 FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
 _NEAR = 1.05  # between the value that fails and the one that holds
 _HALVINGS = 14  # below the first value that is tried
@@ -83,6 +88,17 @@ class Point:
 
     value: float
     error: float
+    why: str
+
+
+@dataclass(frozen=True)
+class PointFields(Checked):
+    """The fields of the record of one run."""
+
+    controller: str
+    quantity: str
+    value: float
+    error: float | None
     why: str
 
 
@@ -152,6 +168,7 @@ def operating_limits(
     fails: AboveZero = FAILS,
     seed: Seed = 0,
     compiled: bool = True,
+    folder: Path | None = None,
     command: str = "",
     progress: Progress | None = None,
 ) -> OperatingLimits:
@@ -174,6 +191,7 @@ def operating_limits(
         fails: relative error from which a run has failed.
         seed: of noise and lost samples, the same in all runs.
         compiled: whether runs use compiled C.
+        folder: to which finished runs are written; those that it holds are not repeated. None: nothing is kept.
         command: the command line, for the report.
         progress: function of (controller, quantities done, quantities in all).
 
@@ -181,6 +199,7 @@ def operating_limits(
         InvalidName: an unknown quantity.
         InvalidProblem: unknown controllers, gains of the wrong sign.
         InvalidValue: `fails` is not positive.
+        OutputError: the folder cannot be written, or holds results under other conditions.
     """
     begin = time.perf_counter()
     chosen = select(task, controllers)
@@ -188,17 +207,21 @@ def operating_limits(
     quantities, unfit = _quantities(task.problem, over)
     judge = Judge(task, fails, seed)
     limits, untried = [], {(name, what): why for name in chosen for what, why in unfit.items()}
-    for name, controller in chosen.items():
-        loops = _Loops(judge, believing(task.problem, controller), compiled)
-        for done, quantity in enumerate(quantities):
+    conditions = Conditions(seed, COMPARING, 0.0, compiled)
+    path = None if folder is None else folder / LEDGER
+    with kept_in(path, lambda: {**fingerprint(task, conditions), "fails": fails}, PointFields) as (records, keep):
+        known = _Known(records, keep)
+        for name, controller in chosen.items():
+            loops = _Loops(judge, believing(task.problem, controller), compiled)
+            for done, quantity in enumerate(quantities):
+                if progress:
+                    progress(name, done, len(quantities))
+                try:
+                    limits.append(_limit(name, quantity, loops, known))
+                except FpirhcError as error:
+                    untried[name, quantity.name] = str(error)
             if progress:
-                progress(name, done, len(quantities))
-            try:
-                limits.append(_limit(name, quantity, loops))
-            except FpirhcError as error:
-                untried[name, quantity.name] = str(error)
-        if progress:
-            progress(name, len(quantities), len(quantities))
+                progress(name, len(quantities), len(quantities))
     return OperatingLimits(
         fails=fails,
         seed=seed,
@@ -212,12 +235,32 @@ def operating_limits(
 # --- The search ---------------------------------------------------------------------------------------------------------
 
 
-def _limit(name: str, quantity: Quantity, loops: _Loops) -> OperatingLimit:
-    points = {quantity.start: loops.point(quantity, quantity.start)}
+class _Known:
+    """Runs that a ledger holds, and what it is told of new ones."""
+
+    def __init__(self, records: Sequence[Mapping[str, Any]], keep: Callable[[Mapping[str, Any]], None]) -> None:
+        self._keep, self._points = keep, {}
+        for one in records:
+            error = math.inf if one["error"] is None else one["error"]
+            self._points[one["controller"], one["quantity"], one["value"]] = Point(one["value"], error, one["why"])
+
+    def point(self, name: str, quantity: Quantity, value: float, run: Callable[[], Point]) -> Point:
+        """Return the run with a value."""
+        key = name, quantity.name, value
+        if key not in self._points:
+            one = self._points[key] = run()
+            error = finite_alone(one.error)
+            self._keep({"controller": name, "quantity": quantity.name, "value": value, "error": error, "why": one.why})
+        return self._points[key]
+
+
+def _limit(name: str, quantity: Quantity, loops: _Loops, known: _Known) -> OperatingLimit:
+    start = quantity.start
+    points = {start: known.point(name, quantity, start, lambda: loops.point(quantity, start))}
 
     def failed(value: float) -> bool:
         if value not in points:
-            points[value] = _tried(quantity, value, loops)
+            points[value] = known.point(name, quantity, value, lambda: _tried(quantity, value, loops))
         return bool(points[value].why)
 
     holds, fails = (math.nan, quantity.start) if failed(quantity.start) else _bracket_of(quantity, failed)

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fpirhc.controllers.contract import Controller, believing
 from fpirhc.errors import FpirhcError, InvalidValue
-from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import AboveZero, Accuracy, Seed
+from fpirhc.fields.checked import Checked, checked_call
+from fpirhc.fields.kinds import AboveZero, Accuracy, CountOrZero, Seed
 from fpirhc.plant.motion import with_space
 from fpirhc.plant.plant import Parametric, drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task
@@ -28,16 +29,19 @@ from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.sums import Values
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.operating_limits import FAILS, Judge, Point, bracket
-from fpirhc.studies.scenarios.bench import ranges, relative_error
+from fpirhc.studies.scenarios.bench import Conditions, ranges, relative_error
 from fpirhc.studies.scenarios.dead_times import DeadTimes
 from fpirhc.studies.scenarios.draws import SEARCHING, draws_differ
-from fpirhc.studies.view import Progress, Study, View, circumstances
+from fpirhc.studies.scenarios.fingerprint import fingerprint
+from fpirhc.studies.scenarios.ledger import kept_in
+from fpirhc.studies.view import Progress, Study, View, circumstances, finite_alone
 from fpirhc.summary import Column, Table, behind_equals, in_percent, line
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
 
+LEDGER = "robust.jsonl"
 RISK, CONFIDENCE = 0.05, 0.999  # where nothing else is said
 _BOXES = 99  # of 1 % to 99 %
 _MOST_DRAWS = 100_000  # plants of a box: hours of runs
@@ -55,6 +59,16 @@ class Counterexample:
     units: Mapping[str, str]  # of both, by the same names
     why: str  # it fails
     from_percent: int  # the smallest box, in whole percent, at whose edge in this direction a plant fails
+
+
+@dataclass(frozen=True)
+class BoxFields(Checked):
+    """The fields of the record of one box: with the `errors` of its plants, or with what a search `found`."""
+
+    controller: str
+    percent: CountOrZero
+    error: float | None
+    why: str
 
 
 @dataclass(frozen=True)
@@ -111,6 +125,7 @@ def robust_boxes(
     fails: AboveZero = FAILS,
     seed: Seed = 0,
     compiled: bool = True,
+    folder: Path | None = None,
     command: str = "",
     progress: Progress | None = None,
 ) -> RobustBoxes:
@@ -134,6 +149,7 @@ def robust_boxes(
             limit of a state has failed too.
         seed: of the draws and of the noise.
         compiled: whether runs use compiled C.
+        folder: to which finished boxes and searches are written; those that it holds are not repeated. None: nothing is kept.
         command: the command line, for the report.
         progress: function of (controller, boxes asked, boxes in all, at most).
 
@@ -141,6 +157,7 @@ def robust_boxes(
         InvalidProblem: unknown controllers, gains of the wrong sign.
         InvalidValue: a share that is none or needs too many plants, `fails` that is not positive, or a plant without parameters
             or dead times to draw.
+        OutputError: the folder cannot be written, or holds results under other conditions.
     """
     begin = time.perf_counter()
     most = _most(task)
@@ -148,12 +165,19 @@ def robust_boxes(
     check_gains(task, chosen)
     draws = wanted_draws(risk, confidence)
     boxes, untried = [], {}
-    for name, controller in chosen.items():
-        try:
-            plants = _Plants(task, believing(task.problem, controller), draws, most, fails, seed, compiled)
-            boxes.append(_robust_box(name, plants, most, progress))
-        except FpirhcError as error:
-            untried[name] = str(error)
+    conditions = Conditions(seed, SEARCHING, 0.0, compiled)
+    path = None if folder is None else folder / LEDGER
+    with kept_in(path, lambda: {**fingerprint(task, conditions), "fails": fails, "draws": draws}, BoxFields) as (
+        records,
+        keep,
+    ):
+        for name, controller in chosen.items():
+            own = [one for one in records if one["controller"] == name]
+            try:
+                plants = _Plants(task, believing(task.problem, controller), draws, most, fails, seed, compiled)
+                boxes.append(_robust_box(name, plants, most, progress, own, keep))
+            except FpirhcError as error:
+                untried[name] = str(error)
     return RobustBoxes(
         risk=risk,
         confidence=confidence,
@@ -201,14 +225,30 @@ def _most(task: Task) -> int:
     raise InvalidValue(f"problem '{task.name}' has no parameters or dead times that can be drawn: {why}")
 
 
-def _robust_box(name: str, plants: _Plants, most: int, progress: Progress | None) -> RobustBox:
+def _robust_box(
+    name: str,
+    plants: _Plants,
+    most: int,
+    progress: Progress | None,
+    known: Sequence[Mapping[str, Any]],
+    keep: Callable[[Mapping[str, Any]], None],
+) -> RobustBox:
+    drawn_before = {one["percent"]: one for one in known if "errors" in one}
     asked: dict[int, Point] = {}
     steps = 2 + 2 * math.ceil(math.log2(most))
 
     def worst(percent: int) -> Point:
         """The first drawn plant that fails, or the one with the largest error."""
         if percent not in asked:
-            asked[percent] = plants.worst_drawn(percent)
+            if percent in drawn_before:
+                one = drawn_before[percent]
+                plants.errors, asked[percent] = (
+                    _read(one["errors"]),
+                    Point(percent, float(_read([one["error"]])[0]), one["why"]),
+                )
+            else:
+                asked[percent] = plants.worst_drawn(percent)
+                keep(_record(name, percent, asked[percent].error, asked[percent].why, errors=plants.errors.tolist()))
             if progress:
                 progress(name, len(asked), steps)
         return asked[percent]
@@ -217,10 +257,26 @@ def _robust_box(name: str, plants: _Plants, most: int, progress: Progress | None
         return RobustBox(name, math.nan, 0.0, asked[0].why, asked[0].error, asked[0].error, None)
     low, fails = bracket(lambda percent: bool(worst(int(percent)).why), 0, _FIRST, most, step=1, near=1.0)
     holds, why = int(low), asked[int(fails)].why if math.isfinite(fails) else ""
-    largest, example = plants.search(holds)
+    searched = next((one for one in known if "found" in one), None)
+    if searched is None:
+        largest, example = plants.search(holds)
+        keep(_record(name, holds, largest, "", found=None if example is None else asdict(example)))
+    else:
+        found = searched["found"]
+        largest, example = float(_read([searched["error"]])[0]), None if found is None else Counterexample(**found)
     if progress:
         progress(name, steps, steps)
     return RobustBox(name, float(holds), float(fails), why, asked[holds].error, largest, example)
+
+
+def _record(name: str, percent: int, error: float, why: str, **more: object) -> dict[str, Any]:
+    told: dict[str, Any] = finite_alone({"controller": name, "percent": percent, "error": error, "why": why, **more})
+    return told
+
+
+def _read(errors: Sequence[float | None]) -> np.ndarray:
+    """Errors of a record, where one of a run that ended early is null."""
+    return np.array([math.inf if one is None else one for one in errors])
 
 
 class _Plants:
@@ -243,7 +299,7 @@ class _Plants:
             )
             self._noise.append(int(noise.generate_state(1)[0]))
         self._shares = np.array(shares)
-        self._errors, self._metrics = np.zeros(draws), [m for m in task.metrics if m.name == "rms_error"]
+        self.errors, self._metrics = np.zeros(draws), [m for m in task.metrics if m.name == "rms_error"]
         self._loop = self._built()
 
     def worst_drawn(self, percent: int) -> Point:
@@ -255,7 +311,7 @@ class _Plants:
         worst = Point(percent, 0.0, "")
         for k, (shares, noise) in enumerate(zip(self._shares, self._noise, strict=True)):
             one = self._point(percent, shares, noise)
-            self._errors[k] = one.error
+            self.errors[k] = one.error
             worst = max(worst, one, key=lambda point: point.error)
             if one.why:
                 return one
@@ -279,13 +335,13 @@ class _Plants:
             errors = self._errors_of_lanes(lanes, percent, self._shares[some], self._noise[some])
             if errors is None:
                 return None
-            self._errors[some] = errors
+            self.errors[some] = errors
             failing = np.flatnonzero(~(errors <= self._judge.fails))
             if failing.size:
                 k = begin + int(failing[0])
                 first = self._point(percent, self._shares[k], self._noise[k])
                 return first if first.why else None
-        worst = int(np.argmax(self._errors))
+        worst = int(np.argmax(self.errors))
         largest = self._point(percent, self._shares[worst], self._noise[worst])
         return None if largest.why else largest
 
@@ -316,7 +372,7 @@ class _Plants:
         from scipy.optimize import differential_evolution
 
         size = min(_GENERATION, max(5, 4 * self._shares.shape[1]), max(5, len(self._shares) // 4))
-        order = np.argsort(self._errors)[::-1]
+        order = np.argsort(self.errors)[::-1]
         worst = self._shares[order[: max(size // 3, 2)]]
         start = np.vstack([worst, np.round(worst), 1 - np.round(worst)])  # their corners, and the corners across
         largest, noise = 0.0, self._noise[int(order[0])]

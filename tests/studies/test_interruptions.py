@@ -22,6 +22,7 @@ from fpirhc.cli.verb import ExitCode
 from fpirhc.contraction import spectrum
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import NotSupported
+from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.symbolic.evaluate import Evaluator, attempted
 
 COMMAND = (
@@ -204,6 +205,36 @@ def test_ctrl_c_in_scenarios_keeps_what_is_finished(folder, capfd):
     assert all(json.loads(line)["controller"] in ("CTC", "RHC") for line in finished[1:])
     assert main([*words[:3], "1", *words[4:], "--controllers", "CTC"]) == ExitCode.FINISHED
     assert Path("out/scenarios.jsonl").read_text().splitlines()[: len(finished)] == finished
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("limits", "line.py", "--over", "mismatch", "lost"),
+        ("robust", "line.py", "--risk", "0.5", "--confidence", "0.9"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_ctrl_c_in_a_search_keeps_what_is_finished(words, folder, capsys, monkeypatch):
+    """What was kept is not computed again, and the result is that of a search that was not interrupted."""
+    command, told, most = [*words, "--no-compile", "--controllers", "CTC", "CTC+FPI", "--out"], [], [1000]
+    append = Ledger.append
+
+    def appended(ledger: Ledger, record: dict[str, object]) -> None:
+        append(ledger, record)
+        told.append(record)
+        if len(told) == most[0]:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Ledger, "append", appended)
+    assert main([*command, "whole"]) == ExitCode.FINISHED
+    whole, most[0] = list(told), len(told) - 3
+    told.clear()
+    assert main([*command, "out"]) == ExitCode.INTERRUPTED
+    assert f"finished results are kept in out/{words[0]}.jsonl" in capsys.readouterr().err
+    assert main([*command, "out"]) == ExitCode.FINISHED
+    assert told == whole
+    assert (folder / "out/results.json").read_text() == (folder / "whole/results.json").read_text()
 
 
 class _Raising(ca.Callback):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study
-from fpirhc.cli.output import publish, results_folder, study_settings
+from fpirhc.cli.output import publish, results_folder, resumable, study_settings
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -25,14 +25,17 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.figures import limits_figure, save_figure
     from fpirhc.report.html import render_limits
     from fpirhc.report.terminal import progress_bars
-    from fpirhc.studies.operating_limits import operating_limits
+    from fpirhc.studies.operating_limits import LEDGER, operating_limits
 
     folder = results_folder(options.out, task.name, "limits")
-    with progress_bars(as_json=options.json) as progress:
-        result = operating_limits(task, **study_settings(VERB, options, "over", "fails"), progress=progress)
+    with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
+        result = operating_limits(
+            task, folder=folder, **study_settings(VERB, options, "over", "fails"), progress=progress
+        )
     if result.limits:
         save_figure(limits_figure(result), folder / "limits.png")
     publish(result.view, render_limits(result), folder, as_json=options.json)
+    (folder / LEDGER).unlink()  # an interrupted study goes on with it, and another one begins
     return ExitCode.FINISHED if result.limits else ExitCode.BAD_INPUT
 
 
@@ -45,7 +48,7 @@ VERB = Verb(
     codes={
         ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or nothing could be tried",
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
-        ExitCode.INTERRUPTED: "interrupted from the keyboard; nothing is kept",
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; the same command continues",
     },
     examples=(
         ("fpirhc limits two_mass", "all five, for every controller"),
@@ -64,5 +67,6 @@ one cycle of latency.
   noise     deviation on every measured quantity, as a share of its range along the reference
   lost      probability that a measured quantity has no sample in a cycle
   period    of the control cycle; settings stay, and stages of the horizon keep their length where whole cycles allow
+Finished runs of an interrupted command are kept, and the same command goes on with them.
 """,
 )

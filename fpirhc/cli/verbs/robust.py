@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study, share
-from fpirhc.cli.output import publish, results_folder, study_settings
+from fpirhc.cli.output import publish, results_folder, resumable, study_settings
 from fpirhc.cli.verb import ExitCode, Verb
 
 _SHARES = {
@@ -29,12 +29,15 @@ def _run(options: argparse.Namespace) -> ExitCode:
     task = load_problem(options.problem)  # what is wrong with it is said before the rest is imported
     from fpirhc.report.html import render_charted
     from fpirhc.report.terminal import progress_bars
-    from fpirhc.studies.robust import robust_boxes
+    from fpirhc.studies.robust import LEDGER, robust_boxes
 
     folder = results_folder(options.out, task.name, "robust")
-    with progress_bars(as_json=options.json) as progress:
-        result = robust_boxes(task, **study_settings(VERB, options, *_SHARES, "fails"), progress=progress)
+    with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
+        result = robust_boxes(
+            task, folder=folder, **study_settings(VERB, options, *_SHARES, "fails"), progress=progress
+        )
     publish(result.view, render_charted(result.view), folder, as_json=options.json)
+    (folder / LEDGER).unlink()  # an interrupted study goes on with it, and another one begins
     return ExitCode.FINISHED if result.boxes else ExitCode.BAD_INPUT
 
 
@@ -47,7 +50,7 @@ VERB = Verb(
     codes={
         ExitCode.BAD_INPUT: f"{ExitCode.BAD_INPUT.meaning}; or no controller could be tried",
         ExitCode.NOT_WRITABLE: ExitCode.NOT_WRITABLE.meaning,
-        ExitCode.INTERRUPTED: "interrupted from the keyboard; nothing is kept",
+        ExitCode.INTERRUPTED: "interrupted from the keyboard; the same command continues",
     },
     examples=(
         ("fpirhc robust two_mass --controllers CTC 'CTC+FPI (eq 6)'", "225 plants per box, at most 5 % of which fail"),
@@ -60,5 +63,6 @@ is multiplied by a factor between 1 - P/100 and 1 + P/100, or lies in P percent 
 the problem, or P percent shorter or longer, in whole cycles. Controllers know none of this.
 Where none of the drawn plants fails, the share that does is at most --risk, with --confidence for all boxes of whole percents
 at once. Drawn plants seldom are the worst ones: from the worst of them a search looks for a plant of the box that fails.
+Finished boxes of an interrupted command are kept, and the same command goes on with them.
 """,
 )

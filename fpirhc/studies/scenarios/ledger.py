@@ -14,7 +14,7 @@ import sys
 import time
 import zlib
 from array import array
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self, overload
 
@@ -225,6 +225,18 @@ class Ledger:
             raise OutputError(
                 f"'{self._path}', line {number} is damaged: {error.text}; remove the line, and its result is computed again"
             ) from None
+
+
+@contextlib.contextmanager
+def kept_in(
+    path: Path | None, header: Callable[[], Mapping[str, Any]], record: type[Checked]
+) -> Iterator[tuple[Sequence[Mapping[str, Any]], Callable[[Mapping[str, Any]], None]]]:
+    """Open a ledger, and yield its records and its `append`; without a path there are none, and nothing is kept."""
+    if path is None:
+        yield (), lambda _: None
+        return
+    with Ledger(path, header(), record) as ledger:
+        yield ledger.records, ledger.append
 
 
 def header_of(path: Path) -> dict[str, Any]:
