@@ -1,8 +1,9 @@
 """What a record of a scenario costs, and how much faster scenarios run in two processes: whole commands, from start to report.
 
-    python benchmarks/scenarios.py [--write] [--records] [--memory]     --write puts the tables into docs/performance.md
+    python benchmarks/scenarios.py [--write] [--records] [--memory] [--tables]     --write puts the tables into docs/performance.md
                                                                         --records measures records alone, in seconds
                                                                         --memory measures large studies alone, in minutes
+                                                                        --tables measures the files of a large study alone
 
 A record is one run of one controller in one scenario, with its metrics: processor time, the smallest of many, of single runs and of
 runs side by side, in rounds in which all rows take turns, so that other work falls on all of them. Bytes of memory are those of a
@@ -30,8 +31,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import fpirhc as fp
+from fpirhc.cli.output import table_writer
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
@@ -132,6 +135,29 @@ def memory(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ..
     )
 
 
+def tables(name: str, controllers: tuple[str, ...], counts: tuple[int, ...]) -> list[tuple[str, ...]]:
+    """What the records of a study take in every kind of file."""
+    with tempfile.TemporaryDirectory() as base:
+        folder = Path(base)
+        task, count = fp.load_problem(name), counts[-1] // len(controllers)
+        begin = time.process_time()
+        found = fp.compare_scenarios(task, controllers=controllers, count=count, percent=10.0, seed=0, folder=folder)
+        rows, seconds = count * len(controllers), {"jsonl": time.process_time() - begin}
+        for form in ("csv", "parquet"):
+            begin = time.process_time()
+            table_writer(form)(found.frames(), folder / "scenarios")
+            seconds[form] = time.process_time() - begin
+        begin = time.process_time()
+        pd.read_parquet(folder / "scenarios.parquet")
+        read = time.process_time() - begin
+        words = {"jsonl": "the ledger, with its runs", "csv": "`--format csv`", "parquet": "`--format parquet`"}
+        sizes = {form: (folder / f"scenarios.{form}").stat().st_size / rows for form in words}
+    return [
+        (words[f], f"{rows}", f"{sizes[f]:.0f}", f"{seconds[f]:.1f}", f"{read:.2f}" if f == "parquet" else "")
+        for f in words
+    ]
+
+
 class Records:
     """One row: what a record costs, in rounds."""
 
@@ -202,6 +228,10 @@ def main() -> None:
         )
         name, controllers, counts = LARGE
         write_table("study memory", heads_of_studies, [memory(name, controllers, count) for count in counts])
+        return
+    if "--tables" in sys.argv:
+        heads_of_files = ("file", "records", "bytes a record", "s to write", "s to read")
+        write_table("study files", heads_of_files, tables(*LARGE))
         return
     heads = ("a record", "ms", "ms side by side", "times faster", "bytes of memory", "bytes in the file")
     write_table("records", heads, records())
