@@ -1,4 +1,4 @@
-"""A quadrotor of RotorPy - motors, aerodynamics, attitude loop - as the reality of a problem.
+"""A quadrotor of RotorPy - motors, aerodynamics, attitude loop - as the reality of a problem, and RotorPy's own law of position.
 
     problem = fp.Problem(plant=model, reality=rotorpy_body(model, period=1e-2, wind=(3.0, 0.0, 0.0)), ...)
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from fpirhc.errors import Mistakes, package
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.linear_law import LinearLaw
 
 _SEEN = [name + dash for dash in ("", "'", "''") for name in ("x", "y", "z")]
 _State = dict[str, np.ndarray]
@@ -71,6 +74,38 @@ def rotorpy_body(
     order = [list(model.inputs).index(name) for name in _SENT]
     body = _Quadrotor(flown, first, period, order, parameters["mass"] / loaded["mass"])
     return ExternalPlant(body, measures={name: quantities(model)[name] for name in _SEEN}, period=period)
+
+
+@adapter
+def se3_law(vehicle: Mapping[str, Any] | None = None) -> Tracking:
+    """Return the outer loop of the package's SE3Control: q'' desired = q'' nominal + kp_pos e + kd_pos e', for each of x, y, z.
+
+    With `ComputedTorque` it is that controller at the level of the thrust; the inner loop is the vehicle's own.
+
+    Args:
+        vehicle: parameters as of the package; None: its Hummingbird.
+
+    Raises:
+        NotSupported: RotorPy is not installed.
+    """
+    parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
+    se3 = package("rotorpy.controllers.quadrotor_control", "outside").SE3Control(parameters)
+    return _OuterLoop({name: (float(p), float(d)) for name, p, d in zip(_SEEN, se3.kp_pos, se3.kd_pos, strict=False)})
+
+
+@dataclass(frozen=True)
+class _OuterLoop(LinearLaw):
+    """A law with gains of its own for every coordinate: (of e, of e')."""
+
+    own: Mapping[str, tuple[float, float]]
+    integral, bumpless, largest = False, False, ()
+
+    def gains(self, order: int) -> tuple[float, ...]:
+        """Those of the fastest coordinate."""
+        return max(self.own.values())[:order]
+
+    def gains_of(self, plant: Plant) -> list[tuple[float, ...]]:
+        return [self.own[name] for name in plant.controlled_names]
 
 
 def _hovering(parameters: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -58,17 +58,21 @@ class LinearLaw(IntegralLaw):
     def gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first."""
 
+    def gains_of(self, plant: Plant) -> list[tuple[float, ...]]:
+        """Gains of every controlled coordinate; by default those of its order."""
+        return [self.gains(order) for order in plant.response_orders.values()]
+
     def check_cycle(self, plant: Plant, period: float) -> None:
         """Raise if the law cannot act on the plant in this cycle; by default, if its modes do not decay in the steps of a map."""
         del period
-        for order in plant.response_orders.values():
-            check_modes(self, plant, self.gains(order))
+        for gains in self.gains_of(plant):
+            check_modes(self, plant, gains)
 
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         self.check_cycle(plant, period)
         reads, writes = law_signals(plant)
-        gains = [self.gains(order) for order in plant.response_orders.values()]
+        gains = self.gains_of(plant)
         first_gains = [own[0] for own in gains] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -90,7 +94,7 @@ class LinearLaw(IntegralLaw):
     def _useful(self, plant: Plant) -> list[Useful]:
         if not (self.integral and self.largest):
             return []
-        gains = [(*self.gains(order), 1.0)[:2] for order in plant.response_orders.values()]
+        gains = [(*own, 1.0)[:2] for own in self.gains_of(plant)]
         return [Useful(integral, error, most) for (integral, error), most in zip(gains, self.largest, strict=True)]
 
     def _feedback(self, gains: Sequence[float], integral: Expression, chain: list[Expression]) -> Expression:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -55,3 +56,19 @@ def test_it_hovers_sinks_with_a_payload_and_goes_with_the_wind():
 def test_wrong_uses(settings, words):
     with pytest.raises(FpirhcError, match=words):
         body(**settings)
+
+
+def test_the_law_of_the_position_is_that_of_the_package():
+    """The thrust is what SE3Control asks for in the same state, on the same circle."""
+    control = pytest.importorskip("rotorpy.controllers.quadrotor_control")
+    circle = pytest.importorskip("rotorpy.trajectories.circular_traj").ThreeDCircularTraj
+    vehicle = pytest.importorskip("rotorpy.vehicles.hummingbird_params").quad_params
+    task = fp.load_problem("quadrotor")
+    run = fp.simulate(
+        replace(task.problem, duration=0.5, measure_from=0.0), task.controllers["SE3 of RotorPy"], seed=0, compiled=None
+    )
+    x, v = np.split(run["state"][40], 2)
+    state = {"x": x, "v": v, "q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3)}
+    flat = circle(radius=np.array([2, 2, 0]), freq=np.full(3, 0.2)).update(0.4)
+    expected = control.SE3Control(vehicle).update(0.4, state, flat)["cmd_acc"]
+    assert run["command"][40] == pytest.approx(expected, rel=1e-9)

@@ -256,7 +256,10 @@ def whose_loop(case: Case) -> str:
 def _asked(case: Case) -> Answer:
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
     answer = margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
-    answer = replace(answer, evidence=f"{answer.evidence}{whose_loop(case)}")
+    alone = whose_loop(case)
+    if alone and math.isfinite(answer.numbers.get("delay_margin", math.inf)):
+        alone += ", whose lags and latencies together have to stay below the delay margin"
+    answer = replace(answer, evidence=f"{answer.evidence}{alone}")
     late = adapts and case.controller.deformation.iteration.slows_desired
     return replace(answer, change=answer.change.replace(_LOWER, _PASSING, 1)) if late else answer
 
