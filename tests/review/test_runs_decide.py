@@ -9,9 +9,10 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.review.question import Answer
-from fpirhc.review.questions.convergence import CONVERGES
+from fpirhc.review.questions.convergence import CONVERGES, RATES, ZERO_DYNAMICS
 from fpirhc.review.questions.dead_time import UNSTATED
 from fpirhc.review.questions.gain import GAIN
+from fpirhc.review.questions.margins import MARGINS
 
 
 def answers(problem: str, controller: str) -> dict[str, Answer]:
@@ -58,3 +59,18 @@ def test_a_map_that_tunes_itself_is_judged_by_runs():
     assert one.numbers["with"] < 0.3 * one.numbers["without"]
     assert one.numbers["radius"] < 1
     assert "Tuned changes its map on line" in one.evidence
+
+
+def test_a_loop_with_doubts_is_judged_by_runs():
+    """It converges, but the first doses are at their limit; in the run five sixths of the error are gone."""
+    one = answers("tumour_portions", "RHC+FPI, model-referenced")[CONVERGES]
+    assert (one.verdict, one.change) == ("yes", "")
+    assert one.numbers["with"] < 0.3 * one.numbers["without"]
+    assert "is answered no" in one.evidence
+
+
+def test_what_feeds_nothing_back_is_asked_neither_for_rate_nor_for_margins():
+    """A queue behind a static map is a caution: it neither grows nor decays by itself."""
+    static = answers("freeway", "static map")
+    assert not {RATES, MARGINS} & set(static)
+    assert static[ZERO_DYNAMICS].verdict == "caution"

@@ -106,7 +106,7 @@ def zero_dynamics(problem: Problem, rate: float | None, planned: bool, loops: Lo
     change = "Run it and look at the coordinates that are not controlled."
     if planned and rate > 0 and not neutral:
         change = f"A plan holds them only if its cost weighs those states. {change}"
-    return Answer(ZERO_DYNAMICS, Verdict.UNKNOWN, text, change, numbers)
+    return Answer(ZERO_DYNAMICS, Verdict.CAUTION if neutral else Verdict.UNKNOWN, text, change, numbers)
 
 
 def _text(problem: Problem, rate: float) -> str:
@@ -163,8 +163,8 @@ def _rate(controller: Controller) -> float | None:
     return None if law is None else law.speed
 
 
-def _rates(case: Case) -> Answer:
-    return rates_inside(case.grid, case.controller, case.loops)
+def _rates(case: Case) -> Answer | None:
+    return rates_inside(case.grid, case.controller, case.loops) if case.controller.feedback else None
 
 
 def _zero_dynamics(case: Case) -> Answer:
@@ -210,15 +210,18 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
 
 
 def _converges(case: Case) -> Answer:
-    """The verdict; where there is no linear loop, or only that of the first cycle, runs decide."""
+    """The verdict; runs decide where the linear loop is not known, is that of the first cycle, or neither converges nor grows."""
     if not case.loops.loops:
         return by_run(case, CONVERGES, f"no linear loop: {case.loops.reason}")
     answer = converges(case.grid, case.controller, case.loops, case.doubts)
     changing = _changing_on_line(case.controller, case.loops)
-    if not changing:
+    if answer.verdict != Verdict.UNKNOWN or (not changing and answer.numbers["smallest_radius"] >= 1):
         return answer
-    ran = by_run(case, CONVERGES, f"{answer.evidence} in the first cycle; {changing} on line")
-    return replace(ran, numbers={**answer.numbers, **ran.numbers})
+    ran = by_run(
+        case, CONVERGES, f"{answer.evidence} in the first cycle; {changing} on line" if changing else answer.evidence
+    )
+    change = ran.change if changing or not answer.change else answer.change
+    return replace(ran, change=change, numbers={**answer.numbers, **ran.numbers})
 
 
 def _changing_on_line(controller: Controller, loops: Loops) -> str:

@@ -253,7 +253,9 @@ def whose_loop(case: Case) -> str:
     return "" if case.grid.real is None else "; of the model by itself, without the reality"
 
 
-def _asked(case: Case) -> Answer:
+def _asked(case: Case) -> Answer | None:
+    if not case.controller.feedback:
+        return None
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
     answer = margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
     alone = whose_loop(case)
