@@ -69,7 +69,7 @@ const moving = DATA.motion && play(document.getElementById("motion"), DATA.motio
 const charts = DATA.charts.map((spec) => {
   const box = document.createElement("div"), title = document.createElement("h3");
   box.className = "chart";
-  title.textContent = spec.title + " [" + spec.unit + "]";
+  title.textContent = spec.title + (spec.unit && spec.unit !== "1" ? ` [${spec.unit}]` : "");
   box.append(title);
   document.getElementById("charts").append(box);
   const lines = DATA.loops.map((loop, k) => ({ label: loop.name, stroke: colors[k], width: 1.3 }));
