@@ -21,6 +21,7 @@ _REASONS = {
     "2.5": "macros of sizes for the caller",
     "5.5": "a macro has the name of the symbol that it stands for",
     "5.6": "the same type is named in several files",
+    "5.7": "the same struct is declared in several files",
     "5.9": "names of functions that are static in several files",
     "8.4": "the function of another file is declared where it is called",
     "8.7": "the same function has external linkage in files of its own",
@@ -47,7 +48,11 @@ _REASONS = {
     "18.4": "places in the array of numbers are reached by addition",
     "19.2": "the first byte of a number is read on an AVR",
     "20.1": "what the search includes stands before it, behind generated code",
+    "20.5": "own functions compute in double, whatever the type of the controller",
     "20.7": "a macro of a type",
+    "20.9": "the type of the controller is asked by its name",
+    "20.10": "names are joined to ask for the type of the controller",
+    "21.1": "own functions take the place of exp, sin and the like",
 }
 
 
