@@ -11,10 +11,11 @@ import numpy as np
 from fpirhc.contraction.spectrum import response_jacobian
 from fpirhc.errors import FpirhcError
 from fpirhc.export.binaries import web_module
-from fpirhc.export.device import c_of
+from fpirhc.export.device import c_of, literal
 from fpirhc.export.targets.c import template, with_own_math
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.pictures.planar import Planar
+from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.tables import run_tables
@@ -76,6 +77,7 @@ class LabLoop:
         own, sizes = c_of(loop.function, "lab")
         places = {name: k for k, name in enumerate(loop.trace.columns)}
         errors = loop.trace[self.error].columns
+        ranges = ranges_of(problem, loop.trace)
         count = [table.shape[1] for table in self.tables]
         words = {
             **{key: str(size + 4) for key, size in sizes.items()},
@@ -90,6 +92,9 @@ class LabLoop:
             "errors": str(len(errors)),
             "first": str(int(np.ceil(problem.measure_from / problem.period - 1e-9))),
             "places": ", ".join(str(places[name]) for name in self.shown),
+            "bounded": ", ".join(map(str, ranges.columns)),
+            "lower": ", ".join(map(literal, ranges.lower)),
+            "upper": ", ".join(map(literal, ranges.upper)),
             "error_places": ", ".join(str(places[name]) for name in errors),
             "tables": "\n".join(
                 f'static double table_{k}[CYCLES * {size}];\nEXPORT("table_{k}") void* at_{k}(void) {{ return table_{k}; }}'
