@@ -1,4 +1,4 @@
-"""A library for the Arduino IDE on an ATmega328P of 16 MHz in simavr: its commands, and how long its longest step takes."""
+"""A library for the Arduino IDE on a board of 16 MHz in simavr: its commands, and how long its longest step takes."""
 
 from __future__ import annotations
 
@@ -56,19 +56,20 @@ int main(void) {
 """
 
 
-def answered(folder: Path, name: str, rows: np.ndarray) -> tuple[np.ndarray, float]:
+def answered(folder: Path, name: str, rows: np.ndarray, processor: str = "atmega328p") -> tuple[np.ndarray, float]:
     """Return the commands of a library for recorded samples, a row per cycle, and the longest step in s.
 
     Args:
         folder: that the target arduino has written.
         name: prefix of the controller.
         rows: samples, a row per cycle.
+        processor: of the board; that of an Uno by default.
     """
     table = ",\n".join("{" + ", ".join(repr(float(np.float32(v))) for v in row) + "}" for row in rows)
     words = {"name": name, "inputs": str(rows.shape[1]), "rows": table}
     (folder / "main.c").write_text(re.sub(r"@(\w+)@", lambda m: words[m[1]], _MAIN))
     flags = [
-        "-mmcu=atmega328p",
+        f"-mmcu={processor}",
         "-std=gnu99",
         "-Os",
         "-ffunction-sections",
@@ -79,7 +80,7 @@ def answered(folder: Path, name: str, rows: np.ndarray) -> tuple[np.ndarray, flo
     sources = [*map(str, sorted((folder / "src").glob("*.c"))), str(folder / "main.c")]
     program = str(folder / "program.elf")
     subprocess.run(["avr-gcc", *flags, *sources, "-lm", "-o", program], check=True)
-    command = ["simavr", "-m", "atmega328p", "-f", f"{CLOCK:.0f}", program]
+    command = ["simavr", "-m", processor, "-f", f"{CLOCK:.0f}", program]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     text = re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr).replace(".\n", "\n")
     said = [line.split()[1:] for line in text.splitlines() if line.startswith("=")]
