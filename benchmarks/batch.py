@@ -1,10 +1,11 @@
 """Microseconds per cycle and plant of a closed loop: plants side by side in vector registers beside the ordinary compiled loop, and
 beside what somebody writes by hand in C, numpy, numba and JAX.
 
-    python benchmarks/batch.py [--write] [--many] [--device NAME]
+    python benchmarks/batch.py [--write] [--many] [--four] [--device NAME]
 
---write puts the tables into docs/performance.md; --many runs a million plants for 500 cycles, and 100 000 for 100 plans; --device
-runs thousands of plants on an OpenCL device, and nothing else.
+--write puts the tables into docs/performance.md; --many runs a million plants for 500 cycles, and 100 000 for 100 plans; --four
+measures the loops with four lanes, for AVX2, and nothing else; --device runs thousands of plants on an OpenCL device, and nothing
+else.
 
 Processor time in one process, in turn, the smallest of five; the ordinary runs keep their log and are measured by the same errors,
 the loops written by hand keep nothing but sums of squares. numba and JAX are left out where they are not installed.
@@ -257,6 +258,10 @@ def main() -> None:
     ]
     loops.append(("two_mass", "RHC+FPI, a plan in every cycle", a_plan_a_cycle()))
     head = ["loop", "lanes", "us in lanes", "us alone", "ratio", "apart"]
+    if "--four" in sys.argv:
+        lanes._registers = lambda: (4, ("-mavx2",))  # type: ignore[attr-defined,assignment]
+        write_table("four lanes", head, [row(*one) for one in loops])
+        return
     write_table("lanes", head, [row(*one) for one in loops])
     write_table(
         "batch", ["two_mass, CTC+FPI (eq 6)", "us per cycle and plant", "times the lanes", "apart"], by_others()

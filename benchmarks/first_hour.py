@@ -1,16 +1,19 @@
 """Processor time of what a newcomer does first: imports, lists, messages, reviews and reports, with a warm and an empty cache.
 
-    python benchmarks/first_hour.py [--write] [--of FOLDER]      --write puts the table into docs/performance.md
-                                                                 --of measures another checkout of the repository
+    python benchmarks/first_hour.py [--write] [--parts] [--of FOLDER]     --write puts the tables into docs/performance.md
+                                                                      --of measures another checkout of the repository
 
 Every command runs in a process of its own. Its time is that of the process and of the compilers that it starts, user and system,
 the smallest of several runs: other work on the machine lengthens a time and never shortens it. With an empty cache of compiled
 libraries (cold) each run begins with an empty folder; warm is the run after it. Python's own cache of bytecode is warm.
+
+A second table is the profile of one comparison: every second of it belongs to the innermost part that is at work.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import subprocess
@@ -33,12 +36,66 @@ task = fp.load_problem("chain_of_masses")
 loop = close_loop(runpy.run_path(str(task.path))["chain"](5), task.controllers["RHC+FPI"])
 assert native(loop.function, calls=500).compiled
 """
+COMPARE = "compare", "two_mass", "--out", "two"
+PROFILE = """
+import json, resource, sys
+
+PARTS = {
+    "parsing": ["problem_files.problem_file.load_problem"],
+    "composing loops": ["simulation.loop.close_loop"],
+    "compiling": ["symbolic.native.native"],
+    "running": ["simulation.simulate.run_cycles"],
+    "timing cycles": ["studies.comparison.timing.measure_cycles"],
+    "causes and null tests": [
+        "studies.comparison.pairwise.with_reviewed_causes",
+        "studies.comparison.pairwise.null_tests",
+        "studies.comparison.pairwise.partners",
+    ],
+    "pictures and page": ["report.html.render"],
+}
+parts, stack = {}, ["the rest"]
+
+def spent():
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+def switch(to=None):
+    global last
+    now = spent()
+    parts[stack[-1]] = parts.get(stack[-1], 0.0) + now - last
+    last = now
+    stack.append(to) if to else stack.pop()
+
+def timed(part, function):
+    def call(*given, **named):
+        switch(part)
+        try:
+            return function(*given, **named)
+        finally:
+            switch()
+    return call
+
+last = 0.0
+stack.append("imports")
+from fpirhc.cli.main import main
+for part, places in PARTS.items():
+    for place in places:
+        home, _, name = ("fpirhc." + place).rpartition(".")
+        function = getattr(__import__(home, fromlist=[name]), name)
+        wrapped = timed(part, function)
+        for module in list(sys.modules.values()):
+            if vars(module).get(name) is function:
+                setattr(module, name, wrapped)
+switch()
+main(sys.argv[1:])
+switch()
+open("parts.json", "w").write(json.dumps(parts))
+"""
 ROWS: dict[str, Sequence[str]] = {
     "`import fpirhc`, then `fp.Problem`": ("-c", "import fpirhc as fp; fp.Problem"),
     "`fpirhc list`": ("-m", "fpirhc", "list"),
     "the message of a wrong problem file": ("-m", "fpirhc", "compare", "wrong.py"),
     "`fpirhc review two_mass`": ("-m", "fpirhc", "review", "two_mass"),
-    "`fpirhc compare two_mass` (eleven controllers)": ("-m", "fpirhc", "compare", "two_mass", "--out", "two"),
+    "`fpirhc compare two_mass` (eleven controllers)": ("-m", "fpirhc", *COMPARE),
     "`fpirhc compare pendulum.py`, the problem of the README": (
         "-m",
         "fpirhc",
@@ -56,15 +113,31 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", action="store_true", help="put the table into docs/performance.md")
     parser.add_argument("--of", type=Path, default=ROOT, metavar="FOLDER", help="checkout that is measured")
-    code = parser.parse_args().of.resolve()
+    parser.add_argument("--parts", action="store_true", help="the profile of a comparison alone")
+    options = parser.parse_args()
+    code = options.of.resolve()
     [pendulum] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "pendulum.py").write_text(pendulum, encoding="utf-8")
         (folder / "wrong.py").write_text("plant = 3\n", encoding="utf-8")
         taken("-c", "import fpirhc as fp; dir(fp)", code=code, folder=folder, cache=folder / "any")
+        cold, warm = profiles(code, folder)
+        parts = [(part, f"{seconds:.2f}", f"{warm.get(part, 0.0):.2f}") for part, seconds in cold.items()]
+        write_table("first hour in parts", ["`fpirhc compare two_mass`, processor time, s", "cold", "warm"], parts)
+        if options.parts:
+            return
         rows = [(what, *(f"{seconds:.2f}" for seconds in both(words, code, folder))) for what, words in ROWS.items()]
     write_table("first hour", ["processor time, s", "cold", "warm"], rows)
+
+
+def profiles(code: Path, folder: Path) -> list[dict[str, float]]:
+    """Seconds of the parts of a comparison, with an empty cache of libraries and with the full one behind it."""
+    found, cache = [], Path(tempfile.mkdtemp(dir=folder))
+    for _ in range(2):
+        taken("-c", PROFILE, *COMPARE, code=code, folder=folder, cache=cache)
+        found.append(json.loads((folder / "parts.json").read_text(encoding="utf-8")))
+    return found
 
 
 def both(words: Sequence[str], code: Path, folder: Path) -> tuple[float, float]:

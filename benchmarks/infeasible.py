@@ -1,6 +1,6 @@
 """How long it takes to say that a horizon is infeasible: two_mass with limits of states that no inputs keep, from nothing.
 
-    python benchmarks/infeasible.py
+    python benchmarks/infeasible.py [--write]      --write puts the table into docs/performance.md
 
 Milliseconds of one call, the smallest of ten; iterations, the status, and the violation of the plan that comes back.
 """
