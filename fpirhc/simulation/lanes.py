@@ -46,7 +46,7 @@ Columns: TypeAlias = float | Sequence[float] | np.ndarray
 _ROOM = 2**27  # bytes of tables and of what is kept, beyond which runs take turns
 
 
-class Ready(Protocol):
+class _Ready(Protocol):
     """What lanes ask a `Simulator`, which has them."""
 
     @property
@@ -58,7 +58,7 @@ class Ready(Protocol):
     def first_memory(
         self, variant: Problem | None = None, settings: Mapping[str, float] | None = None
     ) -> tuple[Problem, np.ndarray]: ...
-    def starting_at(self, start: Mapping[str, float]) -> Ready: ...
+    def starting_at(self, start: Mapping[str, float]) -> _Ready: ...
     def run(self, *, seed: int, variant: Problem | None = None, settings: Mapping[str, float] | None = None) -> Run: ...
 
 
@@ -85,7 +85,7 @@ class ManyRuns:
 
 
 def run_many(
-    ready: Ready,
+    ready: _Ready,
     exact: np.ndarray | None = None,
     *,
     settings: Mapping[str, Columns] | None = None,
@@ -176,14 +176,14 @@ class _Rows:
 class _Scenarios:
     """The loop, the problem, the seed and the live settings of every scenario, by number."""
 
-    def __init__(self, ready: Ready, rows: _Rows) -> None:
+    def __init__(self, ready: _Ready, rows: _Rows) -> None:
         self._ready, self._rows = ready, rows
-        self._begun: dict[tuple[float, ...], Ready] = {}
+        self._begun: dict[tuple[float, ...], _Ready] = {}
 
     def __len__(self) -> int:
         return len(self._rows.exact)
 
-    def __getitem__(self, number: int) -> tuple[Ready, Problem, int, dict[str, float] | None]:
+    def __getitem__(self, number: int) -> tuple[_Ready, Problem, int, dict[str, float] | None]:
         exact, settings, starts = self._rows.exact, self._rows.settings, self._rows.starts
         begin = {name: float(values[number]) for name, values in starts.items()}
         key = tuple(begin.values())
@@ -250,7 +250,7 @@ class Lanes:
         InvalidName, NotInstalled: no such device.
     """
 
-    def __init__(self, ready: Ready, metrics: Sequence[Metric], device: str | None = None, *, why: str = "") -> None:
+    def __init__(self, ready: _Ready, metrics: Sequence[Metric], device: str | None = None, *, why: str = "") -> None:
         self._ready, self.why = ready, why or _why_no_lanes(ready, device)
         self._first: list[OneRun] = []
         self._alike = False
@@ -268,7 +268,7 @@ class Lanes:
 
     def one_run(
         self,
-        ready: Ready,
+        ready: _Ready,
         problem: Problem,
         seed: int,
         settings: Mapping[str, float] | None = None,
@@ -359,7 +359,7 @@ def _tables(problem: Problem, seed: int) -> np.ndarray:
     return np.hstack([*run_tables(problem, seed, problem.cycles), np.empty((problem.cycles, 0))])
 
 
-def _why_no_lanes(ready: Ready, device: str | None) -> str:
+def _why_no_lanes(ready: _Ready, device: str | None) -> str:
     if not ready.problem.equations_known:
         return "a plant outside is run one after the other"
     if ready.problem.cycles <= first_measured(ready.problem):
@@ -416,7 +416,7 @@ class _Library:
         return np.ascontiguousarray(np.moveaxis(padded.reshape(groups, self.lanes, *rows.shape[1:]), 1, -1))
 
 
-def _starts(ready: Ready, exact: np.ndarray) -> np.ndarray:
+def _starts(ready: _Ready, exact: np.ndarray) -> np.ndarray:
     """First memories (plants, memory): one and the same but for the parameters, unless the start depends on these."""
     place = ready.loop.memory.slice("_exact")
     # The first plant, and for every parameter the one that differs most in it.
@@ -430,7 +430,7 @@ def _starts(ready: Ready, exact: np.ndarray) -> np.ndarray:
     return np.array([ready.first_memory(ready.problem.with_exact(one))[1] for one in exact])
 
 
-def _built(ready: Ready, sums: Sums, device: str | None) -> _Library:
+def _built(ready: _Ready, sums: Sums, device: str | None) -> _Library:
     """Compile the loop."""
     functions = ready.loop.function, sums.function()
     if device is not None:
@@ -449,7 +449,7 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _around(ready: Ready, sums: Sums, step: Callee, summing: Callee) -> str:
+def _around(ready: _Ready, sums: Sums, step: Callee, summing: Callee) -> str:
     """The text of a run, behind that of a cycle."""
     loop = ready.loop
     before = np.cumsum([0, *(loop.function.numel_in(k) for k in range(1, loop.function.n_in()))])
