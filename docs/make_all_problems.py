@@ -8,6 +8,7 @@ from typing import Any
 
 import fpirhc as fp
 from fpirhc.controllers import rivals as named
+from fpirhc.controllers.contract import resolved
 from fpirhc.problem_files.shipped import missing, stated
 
 RIVALS = {*named.__all__, "Estimating"}
@@ -95,7 +96,7 @@ def _of_table(path: Path) -> tuple[str, dict[str, float], dict[str, str]]:
     table = task.description.partition("    rms error, seed 0 ")[2]
     head, *lines = table.split("\n\n")[0].splitlines()
     rows = [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in lines]
-    kinds = {n: type(task.controllers[n]).__name__ for n, *_ in rows}
+    kinds = {n: type(resolved(task.problem, task.controllers[n])).__name__ for n, *_ in rows}
     return head.split("[")[0].strip(), {n: float(number) for n, number, *_ in rows}, kinds
 
 

@@ -99,7 +99,7 @@ rate.set_xlabel("time [h]")
 
 def kept(task, name):
     """A run that is kept beside this page."""
-    path = Path(__file__).parent / "kept" / f"{task.name}, {name}.npz"
+    path = Path("kept") / f"{task.name}, {name}.npz"
     if "--renew" in sys.argv:
         fp.simulate(task.problem, task.controllers[name], seed=0, compiled=False).save(
             path

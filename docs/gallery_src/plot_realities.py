@@ -158,7 +158,7 @@ def answers(reality):
     }
 
 
-file = Path(__file__).parent / "kept" / "realities.json"
+file = Path("kept") / "realities.json"
 if "--renew" in sys.argv:
     found = {
         "errors": {name: row(reality) for name, reality in realities.items()},

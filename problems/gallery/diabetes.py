@@ -19,7 +19,7 @@ Task: a dose beside the basal one, every 5 min, holds 120 mg/dl. 220 g of carboh
 this file, over two days:
 
     rms error, seed 0      glucose [mg/dl]
-    PID                                112
+    PID                                 93
     RHC                                 47
     RHC+FPI on the target               46
 
@@ -27,12 +27,16 @@ Nobody may be below 70 mg/dl for more than 4 % of the time; the time from 70 to 
 (`fpirhc compare diabetes --cases all`), seed 0:
 
     shares of the time [%]    from 70 to 180    worst person    below 70    worst person
-    PID                                   31              16           0               0
+    PID                                   35              28           0               2
     RHC                                   59              32           0               0
     RHC+FPI on the target                 60              32           0               0
 
+The PID law has the largest gain with which child#004 is safe. It grows with the basal dose, because who needs more insulin needs
+more for the same glucose. With 0.003 that child was below 70 mg/dl for 4.2 % of the time, with an integral for more than 18 %. A
+gain that is the same for everybody had 31 % in the range, and 16 % for the worst person.
+
 The sensor's noise decides about those who are sensitive. With seeds 0 to 9 nobody of child#001, #003, #004, #006, #008 and
-adult#007 is below 70 for more than 2.8 % of the time, which child#004 is with RHC and seed 7
+adult#007 is below 70 for more than 3 % of the time; child#004 is for 2.8 % with RHC and seed 7, and for 2.95 % with PID and seed 8
 (`fpirhc run diabetes RHC --case 'child#004' --seed 7`). A target of 115 mg/dl, with 62 and 63 % in the range, broke the rule: with
 seed 6 child#001 was below for 5.7 and 6.9 %.
 
@@ -254,6 +258,14 @@ def held(target):
     return fp.Trajectory(lambda t: {"glucose": target + 0 * t, "sensor": target + 0 * t})
 
 
+class PerBasal(fp.PID):
+    """A PID law with gains for a basal dose of 1 U/h, because who needs more insulin needs more for the same glucose."""
+
+    def with_defaults(self, problem):
+        basal = -problem.limits.inputs["extra"][0]
+        return fp.PID({name: basal * gain for name, gain in self.proportional.items()}, bumpless=False)
+
+
 problem = fp.Problem(
     plant=plant(BODY, clinic, step=CYCLE, without=OF_STOMACH),
     reality=fp.Reality(
@@ -276,7 +288,7 @@ problem = fp.Problem(
 )
 optimiser = fp.FixedPoint(iterations=5, tolerance=1e-2)
 controllers = {
-    "PID": fp.PID({"sensor": -0.001}, bumpless=False),
+    "PID": PerBasal({"sensor": -0.00275}),  # basal doses per mg/dl
     "RHC": fp.RecedingHorizon(optimiser),
     "RHC+FPI on the target": fp.Cascade(
         fp.RecedingHorizon(optimiser), fp.Affine(gain=-0.0005), fp.ThroughModel(lag=60.0)
