@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +30,18 @@ of the rate of the cycles is the best there is; with noise or a dead time (`nois
 An exact model that does not know a disturbance, or has one iteration per plan, is no bound. Within a tenth it is a draw, and where
 no correction lowers the error by a tenth nobody wins.
 
-The last column is the sentence `why` of the problem's own file. With people, the error is that of the one person of the file, and
-it is not what counts: the tables of `anaesthesia_people`, `anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`,
+Below the table a sentence says why; it is `why` of the problem's own file. With people, the error is that of the one person of the
+file, and it is not what counts: the tables of `anaesthesia_people`, `anaesthesia_drawn`, `anaesthesia_monitor`, `diabetes`,
 `diabetes_announced` and `diabetes_order_five` lead with the worst person, and no row of the last two is safe.
 
-| problem | quantity | plain | with FPI | best rival | exact model | winner | why |
-|---|---|---|---|---|---|---|---|
+| problem | quantity | plain | with FPI | best rival | exact model | winner |
+|---|---|---|---|---|---|---|
+"""
+WHY = """
+## Why
+
+| problem | why the winner wins |
+|---|---|
 """
 DRAW, LOST = 1.1, 10.0  # ratios of errors
 FIGURE = 20  # size from which two digits hide a difference
@@ -44,8 +51,12 @@ PREFIX = "rms_error."
 def page() -> str:
     """The page's text."""
     tried = json.loads(TRIED.read_text(encoding="utf-8"))
-    rows = (row_of(path, tried.get(path.stem, {})) for path in files())
-    return ABOUT + "".join(f"| {' | '.join(row)} |\n" for row in rows if row)
+    rows = [row for path in files() if (row := row_of(path, tried.get(path.stem, {})))]
+    return ABOUT + _lines(row[:-1] for row in rows) + WHY + _lines((row[0], row[-1]) for row in rows)
+
+
+def _lines(rows: Iterable[tuple[str, ...]]) -> str:
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def files() -> list[Path]:
