@@ -48,8 +48,6 @@ _SEEN = "_seen_status"
 class FeedforwardOnly(Undeformed):
     """The model's inverse at the reference's state and response; no error is fed back."""
 
-    feedback = False
-
     def check(self, problem: Problem) -> None:
         """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.
 

@@ -199,11 +199,6 @@ class Controller(Checked, ABC):
         return "response" if self.inner is None else self.inner.deforms
 
     @property
-    def feedback(self) -> bool:
-        """Whether an error that is measured changes the command."""
-        return True if self.inner is None else self.inner.feedback
-
-    @property
     def planner(self) -> Planner | None:
         """How the controller plans; None for a controller that does not plan over a horizon."""
         return None if self.inner is None else self.inner.planner

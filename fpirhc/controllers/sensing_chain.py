@@ -245,6 +245,14 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
 
 
+def told_to_command(step: Composite) -> frozenset[str]:
+    """Return the names of what the command of a composed controller depends on, in its cycle or by the memory in a later one."""
+    function = step.function
+    results = [function.index_out(name) for name in ("command", "memory_next")]
+    reads = enumerate(function.name_in())
+    return frozenset(name for k, name in reads if any(function.jac_sparsity(one, k).nnz() for one in results))
+
+
 def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
     given: object = controller.blocks(problem)
     pair = given if isinstance(given, tuple) and len(given) == 2 else None

@@ -18,12 +18,15 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import given_response
+from fpirhc.controllers.sensing_chain import compose_controller, told_to_command
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import FoundByName
 from fpirhc.members import within
+from fpirhc.plant.chain import measured_signals
 from fpirhc.review.grid import ReviewGrid
-from fpirhc.review.loops import Loops, LoopsByGain, loops_along, loops_by_gain, spectrum_near
+from fpirhc.review.loops import Loops, LoopsByGain, is_planned, loops_along, loops_by_gain, spectrum_near
 from fpirhc.review.prediction import TRIED, NominalRun, NominalRuns
 from fpirhc.simulation.trials import ErrorPair, harm_in
 from fpirhc.summary import line, numbers_written_out, table
@@ -176,6 +179,16 @@ class Case:
     def believed(self) -> np.ndarray:
         """Parameters of the model, shape (np,)."""
         return self.controller.plant_model(self.problem).parameters(self.problem.plant)
+
+    @cached_property
+    def feeds_back(self) -> bool:
+        """Whether what is measured changes the command; a plan restarts from it, and is not composed for this question."""
+        if is_planned(self.controller):
+            return True
+        response = given_response(self.problem, self.controller)
+        measured = {one.name for one in measured_signals(self.problem.plant)}
+        measured.add(response.signal.name if response else "realised")
+        return bool(measured & told_to_command(compose_controller(self.problem, self.controller)))
 
     def spectrum(self, draws: np.ndarray) -> Spectrum:
         """Return the eigenvalues of the weighted response Jacobian along the reference, for draws of the grid.

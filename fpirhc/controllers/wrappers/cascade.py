@@ -310,7 +310,6 @@ class Cascade(Controller):
         return replace(problem, reference=Shifted(problem.reference))
 
     deforms = "target"
-    feedback = True
 
     planner = None  # plans of the inner controller follow the target, and not the reference of the problem
 

@@ -16,13 +16,13 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, command_before, like
 from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
 from fpirhc.controllers.model_inputs import ResponsePairs
-from fpirhc.controllers.sensing_chain import compose_controller, embedded
+from fpirhc.controllers.sensing_chain import compose_controller, embedded, told_to_command
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import GAP, Block, Composite, Delay
+from fpirhc.symbolic.block import GAP, Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
@@ -103,7 +103,7 @@ class Estimating(ControllerWrapper):
         following = with_setting(self.controller, "follows_model", True) if self.at_once else None
         controller = following or self.controller
         inner = compose_controller(modelled, controller)
-        if not _uses_parameters(inner):
+        if "parameters" not in told_to_command(inner):
             raise NotSupported(
                 f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
                 "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon"
@@ -118,16 +118,6 @@ class Estimating(ControllerWrapper):
             embedded("controller", inner, {"parameters": believed}),
         ]
         return blocks, [Delay(acted, problem.plant.input.name)]
-
-
-def _uses_parameters(step: Composite) -> bool:
-    """Whether a command, of this cycle or of a later one, depends on the parameters of the model."""
-    names = step.function.name_in()
-    place = names.index("parameters") if "parameters" in names else None
-    used = ("command", "memory_next")
-    return place is not None and any(
-        step.function.jac_sparsity(o, place).nnz() for o in map(step.function.index_out, used)
-    )
 
 
 def _estimate_block(

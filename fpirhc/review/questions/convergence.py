@@ -164,7 +164,7 @@ def _rate(controller: Controller) -> float | None:
 
 
 def _rates(case: Case) -> Answer | None:
-    return rates_inside(case.grid, case.controller, case.loops) if case.controller.feedback else None
+    return rates_inside(case.grid, case.controller, case.loops) if case.feeds_back else None
 
 
 def _zero_dynamics(case: Case) -> Answer:

@@ -254,7 +254,7 @@ def whose_loop(case: Case) -> str:
 
 
 def _asked(case: Case) -> Answer | None:
-    if not case.controller.feedback:
+    if not case.feeds_back:
         return None
     adapts, planned = case.controller.deformation.adapts, is_planned(case.controller)
     answer = margins_enough(case.problem, case.loops, adapts=adapts, planned=planned, learner=case.controller.learns)
