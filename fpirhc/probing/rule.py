@@ -144,10 +144,11 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     return plant, signals
 
 
-DARING = ("daring", "prompt")
+DARING = ("daring", "prompt", "lagging")
 """Candidates that keep their margins at the estimate alone, or begin with the least share: trials have to show them.
 
-The second believes no lateness. With the least share it is offered whatever the estimate says of it, and trials go on from there.
+The second believes no lateness, the third a lag and no dead time. With the least share the second is offered whatever the estimate
+says of it, and trials go on from there.
 """
 
 SHARES = (0.05, 0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
@@ -307,6 +308,7 @@ class Rule:
             "long lag": self._long(),
             "bold": min(safe, key=lambda one: one.steps, default=None),
             DARING[0]: next(filter(self._daring, _few_filters(calm)), None),
+            DARING[2]: next(filter(self._daring, _few_filters(filter(self._lags, calm))), None),
             DARING[1]: next(filter(self._daring, _few_filters(one for one in calm if one.setting.prompt)), self._least),
         }
         different: dict[str, Predicted] = {}
@@ -359,6 +361,11 @@ class Rule:
     def _mirrors(self, one: Predicted) -> bool:
         """Whether the model is late and lags as the plant at most does."""
         return one.setting.referenced and one.setting.lags == tuple(self.estimates.lag[2])
+
+    def _lags(self, one: Predicted) -> bool:
+        """Whether the model lags as the plant does, and believes no dead time."""
+        setting = one.setting
+        return setting.referenced and not any(setting.cycles) and setting.lags == tuple(self.estimates.lag[1])
 
     def _forms(self) -> Iterator[Setting]:
         """Forms, dead times and lags, with the share in which they are compared."""

@@ -6,6 +6,8 @@ import csv
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -18,7 +20,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.probing.identification import Channel, Estimates, delayed, identify
 from fpirhc.probing.probe import OnPlant, Trial, best
 from fpirhc.probing.recording import excited, sequence
-from fpirhc.probing.rule import Predicted, Rule, _between
+from fpirhc.probing.rule import Predicted, Rule, Setting, _between
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),
@@ -228,6 +230,15 @@ def test_shares_between_two_that_are_tried_are_finer_towards_the_larger_one():
     assert set(_between(0.25, {0.16, 0.25, 0.32, 0.4})) == {0.28}
     assert set(_between(0.25, {0.16, 0.25, 0.262})) == set()
     assert set(_between(1.0, {0.65, 1.0})) == set()
+
+
+def test_a_candidate_lags_as_estimated_without_a_dead_time():
+    """A mirror that knows the dead time too leaves it as it is."""
+    rule = Rule.__new__(Rule)
+    rule.estimates = cast(Estimates, SimpleNamespace(lag=np.array([[0.01], [0.02], [0.03]])))
+    ways = [((c,), (tau,)) for c in (0.0, 3.0) for tau in (0.0, 0.02, 0.03)]
+    every = [Setting(True, 0.25, 0.0, cycles, lags, 0.0) for cycles, lags in ways]
+    assert [rule._lags(Predicted(one, fp.Identity(), 1.0, 0.5)) for one in every] == [False, True, *[False] * 4]
 
 
 def test_a_lucky_trial_counts_with_its_worst_seed(monkeypatch):
