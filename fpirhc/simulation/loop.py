@@ -31,7 +31,7 @@ from fpirhc.task.problem import Problem
 def close_loop(problem: Problem, controller: Controller, live: LiveSettings | None = None) -> Composite:
     """Return the closed loop as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
 
-    With a foreign reality the step also reads its measurements, and returns the inputs that it is sent.
+    With an `ExternalPlant` the step also reads its measurements, and returns the inputs that it is sent.
 
     Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,

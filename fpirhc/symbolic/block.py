@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, groupby
+from operator import attrgetter
 from typing import cast
 
 import casadi as ca
@@ -229,7 +230,7 @@ class Composite:
     @cached_property
     def opaque(self) -> bool:
         """Whether some block holds operations that scalar expressions cannot."""
-        return any(b.opaque for b in self.blocks)
+        return any(map(attrgetter("opaque"), self.blocks))
 
     @property
     def bridged_if_any(self) -> Callable[[], Composite] | None:
