@@ -18,6 +18,7 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.sensing_chain import compose_controller, told_to_command
 from fpirhc.deformation.base import Deformation
@@ -188,7 +189,9 @@ class Case:
         response = given_response(self.problem, self.controller)
         measured = {one.name for one in measured_signals(self.problem.plant)}
         measured.add(response.signal.name if response else "realised")
-        return bool(measured & told_to_command(compose_controller(self.problem, self.controller)))
+        with any_gain():
+            step = compose_controller(self.problem, self.controller)
+        return bool(measured & told_to_command(step))
 
     def spectrum(self, draws: np.ndarray) -> Spectrum:
         """Return the eigenvalues of the weighted response Jacobian along the reference, for draws of the grid.
