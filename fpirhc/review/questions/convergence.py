@@ -199,8 +199,9 @@ def converges(grid: ReviewGrid, controller: Controller, loops: Loops, doubts: li
     if growth.max() > -_SURE:
         ends = [f"{end:.6g}" for end in (radii.min(), worst)]
         text += f" (between {' and '.join(ends)} along the reference)" if ends[0] != ends[1] else ""
-        change = _slow(grid, controller, loops, worst) or _mend(grid, controller, loops)
-        return Answer(CONVERGES, Verdict.UNKNOWN, text, change, numbers)
+        slow = _slow(grid, controller, loops, worst)
+        verdict = Verdict.CAUTION if slow else Verdict.UNKNOWN
+        return Answer(CONVERGES, verdict, text, slow or _mend(grid, controller, loops), numbers)
     against = [*([] if controller.deforms == "target" else _steep(grid, controller)), *doubts]
     if against:
         return Answer(
