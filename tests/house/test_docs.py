@@ -231,6 +231,7 @@ def test_runs_that_pages_of_the_gallery_keep_are_those_of_the_baselines():
     for file in (DOCS / "gallery_src" / "kept").glob("*, *.npz"):
         name, controller = file.stem.split(", ")
         task, run = fp.load_problem(name), fp.load_run(file)
+        assert task.headline_metric is not None
         stored = json.loads((task.path.parent / "baselines" / f"{name}.json").read_text(encoding="utf-8"))
         value = stored["controllers"][controller]["metrics"][task.headline_metric]["value"]
         assert fp.measure(task.problem, run, task.metrics)[task.headline_metric][""] == pytest.approx(value, rel=1e-4)
