@@ -245,7 +245,7 @@ def compose_controller(problem: Problem, controller: Controller, *, ahead: bool 
     return compose_informed(problem, ready, reads, blocks, delays, ahead=ahead)
 
 
-def told_to_command(step: Composite) -> frozenset[str]:
+def dependencies_of_command(step: Composite) -> frozenset[str]:
     """Return the names of what the command of a composed controller depends on, in its cycle or by the memory in a later one."""
     function = step.function
     results = [function.index_out(name) for name in ("command", "memory_next")]

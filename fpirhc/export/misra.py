@@ -62,10 +62,10 @@ def checker() -> str:
     Raises:
         NotInstalled: there is none.
     """
-    found = shutil.which("cppcheck")
-    if found is None:
+    command = shutil.which("cppcheck")
+    if command is None:
         raise NotInstalled("--misra needs cppcheck, which is not installed: package cppcheck")
-    return found
+    return command
 
 
 def deviations(files: Mapping[str, str]) -> Counter[str]:

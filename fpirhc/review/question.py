@@ -20,7 +20,7 @@ from fpirhc.contraction.spectrum import Spectrum
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import given_response
-from fpirhc.controllers.sensing_chain import compose_controller, told_to_command
+from fpirhc.controllers.sensing_chain import compose_controller, dependencies_of_command
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.fields.checked import FoundByName
@@ -191,7 +191,7 @@ class Case:
         measured.add(response.signal.name if response else "realised")
         with any_gain():
             step = compose_controller(self.problem, self.controller)
-        return bool(measured & told_to_command(step))
+        return bool(measured & dependencies_of_command(step))
 
     def spectrum(self, draws: np.ndarray) -> Spectrum:
         """Return the eigenvalues of the weighted response Jacobian along the reference, for draws of the grid.

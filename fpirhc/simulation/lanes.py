@@ -157,9 +157,9 @@ class _Rows:
         }
         several = {name: size for name, size in sizes.items() if size != 1}
         if len({*several.values()}) > 1 or any(v.ndim != 1 for some in named for v in some.values()):
-            told = ", ".join(f"{size} for {name}" for name, size in several.items())
+            lengths = ", ".join(f"{size} for {name}" for name, size in several.items())
             raise InvalidShape(
-                f"run_many({told}): expected a number for every scenario, as many everywhere, or one for all"
+                f"run_many({lengths}): expected a number for every scenario, as many everywhere, or one for all"
             )
         count = next(iter(several.values()), 1)
         for some in named:
@@ -343,8 +343,8 @@ class Lanes:
             for number, (own, problem, noise, numbers) in several
             if own.evaluator is self._ready.evaluator
         }
-        found = zip(runs, self.values(list(runs.values())) if runs else (), strict=True)
-        return {number: values for number, values in found if values is not None}
+        measured = zip(runs, self.values(list(runs.values())) if runs else (), strict=True)
+        return {number: values for number, values in measured if values is not None}
 
     @cached_property
     def _begun(self) -> np.ndarray:

@@ -83,8 +83,7 @@ class Stepper(NumbersNow, Checked):
     `function` is the step itself, a CasADi Function (memory, each of `reads`) -> (memory, trace, command), for code generation of
     one's own. `reads`, `memory`, `signals`, `settings` and `parameters` are the layouts of what it takes and gives: names, units,
     and start values, which are the numbers of the build for parameters, settings and set-points. It has gate and monitor
-    inside; not inside
-    are missed cycles, a solver that raises, and the check of settings (`bounds`).
+    inside; not inside are missed cycles, a solver that raises, and the check of settings (`bounds`).
 
     A controller that does better without its adaptation is warned of once, `HarmfulAdaptation`, after four runs of 300 cycles on
     the problem's plant and on its own model. `warnings.simplefilter("ignore", fpirhc.HarmfulAdaptation)` spares these runs.

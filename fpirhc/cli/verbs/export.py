@@ -73,8 +73,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
     sizes = {"memory": device.stepper.memory.size, "trace": device.stepper.signals.size, "work": device.sizes["w"]}
     print(f"numbers of one controller: {', '.join(f'{size} of {what}' for what, size in sizes.items())}")
     print(f"worst case: {worst_case(device)}")
-    told = Path(options.out) / target.told
-    print(told.read_text(encoding="utf-8") if target.told else bytes_here(device), end="")
+    sizes_of_target = Path(options.out) / target.told
+    print(sizes_of_target.read_text(encoding="utf-8") if target.told else bytes_here(device), end="")
     if options.bare:
         print(
             "bare: no sample is checked; one that is no number stays in the memory until the next reset. Missed cycles are not "

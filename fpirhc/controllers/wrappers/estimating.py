@@ -16,7 +16,7 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, command_before, like
 from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
 from fpirhc.controllers.model_inputs import ResponsePairs
-from fpirhc.controllers.sensing_chain import compose_controller, embedded, told_to_command
+from fpirhc.controllers.sensing_chain import compose_controller, dependencies_of_command, embedded
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
@@ -103,7 +103,7 @@ class Estimating(ControllerWrapper):
         following = with_setting(self.controller, "follows_model", True) if self.at_once else None
         controller = following or self.controller
         inner = compose_controller(modelled, controller)
-        if "parameters" not in told_to_command(inner):
+        if "parameters" not in dependencies_of_command(inner):
             raise NotSupported(
                 f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
                 "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon"
