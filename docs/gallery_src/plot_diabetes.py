@@ -34,7 +34,7 @@ print(table(about, "    shares of the time"))
 
 # %%
 # The glucose of fifteen of them, the first five of each group, takes long to compute, so it
-# is kept in a file in tenths of mg/dl; ``python plot_diabetes.py --renew`` writes it anew.
+# is kept in a file in tenths of mg/dl; ``python plot_diabetes.py --renew`` in its folder writes it anew.
 
 file = Path("kept") / "diabetes.npz"
 FIRST = ("#001", "#002", "#003", "#004", "#005")

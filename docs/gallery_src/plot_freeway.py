@@ -93,7 +93,7 @@ rate.set_xlabel("time [h]")
 # A third task is economic: the least time that all cars spend, on the road and in
 # queues. A plan of seven minutes meters the ramp, and at most 100 cars may wait. The rates
 # of the exact model are those of the published run. These runs take minutes, so they are
-# kept in files, which ``python plot_freeway.py --renew`` writes anew. The offset-free plan
+# kept in files, which ``python plot_freeway.py --renew`` in their folder writes anew. The offset-free plan
 # finds nothing to estimate, and its rates are those of RHC.
 
 

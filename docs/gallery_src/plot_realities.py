@@ -5,7 +5,7 @@ A rigid model and realities that are not
 The model is a mass of 1.5 kg, u = m x''. What moves is a mass of 1 kg behind an actuator with a lag,
 behind a spring, on bristles, or seen by a slow sensor. Where does each form of the iteration help,
 and what did the review say before? Runs and reviews take some minutes, so their numbers are kept in a file,
-which ``python plot_realities.py --renew`` writes anew. How a reality is written, also one with other states
+which ``python plot_realities.py --renew`` in its folder writes anew. How a reality is written, also one with other states
 than the model, is in `docs/extending/reality.md`.
 """
 
