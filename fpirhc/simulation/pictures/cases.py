@@ -179,7 +179,7 @@ class Grid(Picture):
         what = str(next(iter(kept.values()))[0]["label"])
         axis.set_xlabel(f"lowest {what}")
         axis.set_ylabel(f"highest {what}")
-        axis.legend(fontsize=8, loc="upper left", framealpha=0.9)
+        axis.legend(fontsize=8, loc="lower left", bbox_to_anchor=(0, 1.01), frameon=False)  # no corner is free of cases
 
     def _draw_zones(self, axis: Axes) -> None:
         for row, (right, left) in enumerate(zip(self.low, self.low[1:], strict=False)):
