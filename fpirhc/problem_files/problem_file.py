@@ -111,7 +111,8 @@ def load_problem(name_or_path: str | Path) -> Task:
     - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
     - `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
     - `pictures`, a sequence of pictures for the report, in addition to the usual ones,
-    - `why`, a sentence about why the best controller is the best, for the page of all shipped problems.
+    - `why`, a sentence about why the best controller is the best, for the page of all shipped problems,
+    - `keeps_rule`, a tuple of the names of the controllers that keep the problem's own rule, where not all do, for the same page.
 
     Args:
         name_or_path: name of a shipped problem, or path of a file.

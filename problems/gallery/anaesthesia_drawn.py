@@ -133,4 +133,5 @@ controllers = {
 }
 headline, headline_metric = people.headline, people.headline_metric
 why = "The drug reaches the effect site in twice the time that the pump believes, which bounds the gain of PID and cascade alike."
+keeps_rule = ()
 metrics, pictures = people.metrics, people.pictures

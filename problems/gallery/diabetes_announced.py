@@ -48,4 +48,5 @@ why = (
     "Between dose and sensor are six lags: what the iteration takes for a response is "
     "noise and meals, and its doses are never negative."
 )
+keeps_rule = ()
 cases, metrics, headline_metric, pictures = silent.cases, silent.metrics, silent.headline_metric, silent.pictures

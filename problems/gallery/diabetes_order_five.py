@@ -83,6 +83,7 @@ why = (
     "No row is safe: a meal is in the fifth derivative at once, so the law asks for doses "
     "that act hours later and cannot be taken out."
 )
+keeps_rule = ()
 GLUCOSE = "output.glucose"
 metrics = (
     fp.figures.InBand(GLUCOSE, 70.0, 180.0, name="in_range"),

@@ -208,7 +208,7 @@ def test_modules_that_pages_of_theory_name_are_there():
 
 
 def test_page_of_all_problems_is_that_of_baselines_and_tables():
-    """Written anew it is the same; offset-free control wins where it does, and the iteration where it does."""
+    """Written anew it is the same; offset-free control wins where it does, the iteration where it does, nobody who is not safe."""
     maker = script("make_all_problems")
     page = maker.page()
     assert page == (DOCS / "all-problems.md").read_text(encoding="utf-8")
@@ -222,6 +222,7 @@ def test_page_of_all_problems_is_that_of_baselines_and_tables():
     )
     assert (rows["hodgkin_huxley"][6], rows["order_four"][6], rows["tumour"][6]) == ("rival", "FPI", "rival")
     assert (rows["three_link_arm"][6], rows["turbojet_slow"][6], rows["freeway"][6]) == ("rival", "FPI", "draw")
+    assert (rows["diabetes_order_five"][6], rows["diabetes"][6]) == ("none keeps the rule", "nobody")
     named = {path.stem: reasons[path.stem][1] for path in maker.files()}
     assert [name for name, why in named.items() if not re.fullmatch(r"[A-Z]([^.]|\.\d){60,160}\.", why)] == []
 

@@ -16,6 +16,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.shipped import stated
 
 TWO_DAYS = Path(__file__).parents[1] / "data" / "diabetes" / "two_days.csv"
 # Minutes of a row of 3 min in which a meal begins: the recording has the mean of the row.
@@ -141,6 +142,7 @@ def test_order_five_is_at_its_limits_and_unsafe():
     assert of.problem.plant.response_orders == {"glucose": 5}
     table = described(of, "shares of the time")
     assert set(table) == set(of.controllers)
+    assert stated(of.path, "keeps_rule", None) == ()
     for name, controller in of.controllers.items():
         run = fp.simulate(of.problem, controller, seed=0, compiled=False)
         glucose = run["output.glucose"]
@@ -161,6 +163,7 @@ def test_nobody_of_thirty_breaks_the_rule(tmp_path):
 @pytest.mark.slow
 def test_announced_meals_break_the_rule(tmp_path):
     """With every controller, for most children."""
+    assert stated(task("diabetes_announced").path, "keeps_rule", None) == ()
     for controller, one in shares_as_described(task("diabetes_announced"), ["child*"], tmp_path).items():
         assert len(one["below"]) == 10
         assert sum(share > 0.04 for share in one["below"]) > 5, controller
