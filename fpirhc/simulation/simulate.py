@@ -10,7 +10,7 @@ import contextlib
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -258,28 +258,61 @@ def built(
 
     Loops of one code differ in their first memory alone, as those of most starts do.
     """
-    settings = live_settings(problem, controller, live)
-    ready = settings.controller
-    loop = close_loop(problem, ready, settings if live else None)
-    long = problem.cycles * (problem.horizon.stages if problem.horizon is not None else 1) > _SHORT_RUN
-    worth = compiled or (compiled is None and long)
+    return ComposedLoop.of(problem, controller, live).simulator(compiled, flags, known)
 
-    def made() -> Compiled:
-        backend = Native(loop.function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
-        if worth:
-            backend = native(loop.function, flags, required=bool(live), calls=moving(problem).cycles_of_call)
-        interpreted = moving(problem).cycles_interpreted
-        function = backend.function if backend.compiled else chained(loop.function, interpreted, _CHAIN)
-        return Evaluator(function), backend.compiled, backend.reason
 
-    if known is None:
-        return Simulator(problem, ready, loop, *made(), settings)
-    key = worth, hashlib.sha256(loop.function.serialize().encode()).digest()
-    code = known.get(key) or made()
-    result = Simulator(problem, ready, loop, *code, settings)
-    if not result.remembers:  # one that does is built anew for every run
-        known[key] = code
-    return result
+@dataclass(frozen=True, eq=False)
+class ComposedLoop:
+    """A closed loop that is composed, and not compiled."""
+
+    problem: Problem
+    live: LiveSettings
+    loop: Composite
+
+    @classmethod
+    def of(cls, problem: Problem, controller: Controller, live: Sequence[str] = ()) -> Self:
+        """Return the loop of problem and controller; arguments and errors as in `simulator`."""
+        settings = live_settings(problem, controller, live)
+        return cls(problem, settings, close_loop(problem, settings.controller, settings if live else None))
+
+    @property
+    def function(self) -> ca.Function:
+        """One cycle of the loop."""
+        return self.loop.function
+
+    def worth_compiling(self, compiled: bool | None) -> bool:
+        """Return whether a compiler is asked; `compiled` as in `simulator`."""
+        horizon = self.problem.horizon
+        long = self.problem.cycles * (horizon.stages if horizon is not None else 1) > _SHORT_RUN
+        return bool(compiled or (compiled is None and long))
+
+    @property
+    def calls(self) -> int:
+        """Cycles of a call of the compiled loop."""
+        return moving(self.problem).cycles_of_call
+
+    def simulator(
+        self, compiled: bool | None, flags: Sequence[str] = (), known: dict[object, Compiled] | None = None
+    ) -> Simulator:
+        """Return the loop ready to run; arguments as in `built`."""
+        ready, worth = self.live.controller, self.worth_compiling(compiled)
+        if known is None:
+            return Simulator(self.problem, ready, self.loop, *self._code(compiled, flags), self.live)
+        key = worth, hashlib.sha256(self.function.serialize().encode()).digest()
+        code = known.get(key) or self._code(compiled, flags)
+        result = Simulator(self.problem, ready, self.loop, *code, self.live)
+        if not result.remembers:  # one that does is built anew for every run
+            known[key] = code
+        return result
+
+    def _code(self, compiled: bool | None, flags: Sequence[str]) -> Compiled:
+        function = self.function
+        backend = Native(function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
+        if self.worth_compiling(compiled):
+            backend = native(function, flags, required=bool(self.live.paths), calls=self.calls)
+        interpreted = moving(self.problem).cycles_interpreted
+        called = backend.function if backend.compiled else chained(function, interpreted, _CHAIN)
+        return Evaluator(called), backend.compiled, backend.reason
 
 
 @checked_call

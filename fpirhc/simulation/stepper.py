@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import isnan, nan
 from time import perf_counter
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, Self
 
 import casadi as ca
 import numpy as np
@@ -14,7 +15,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import BRIDGED, HELD
-from fpirhc.controllers.live_settings import Numbers, live_settings
+from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import ByName, Checked, missing
@@ -31,6 +32,7 @@ from fpirhc.simulation.step_arguments import (
     one_number,
 )
 from fpirhc.simulation.trials import warn_of_harm, with_recommended_gain
+from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
@@ -40,6 +42,48 @@ from fpirhc.task.problem import Problem
 _TRUTHS = (bool, np.bool_)
 
 _NOT_SOLVED = "the compiled solver failed"
+
+
+@dataclass(frozen=True, eq=False)
+class ComposedStep:
+    """The step of a controller that is composed, and not compiled."""
+
+    problem: Problem
+    controller: Controller
+    settings: LiveSettings
+    ready: Controller
+    composite: Composite
+    memory: Layout
+    ages: bool  # whether it reads time stamps
+    bridged: int
+
+    @property
+    def function(self) -> ca.Function:
+        """The step itself."""
+        return self.composite.function
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        controller: Controller,
+        *,
+        plausible: Mapping[str, Interval] | None = None,
+        max_age: float | None = None,
+        monitor: RunMonitor | None = None,
+        bounded: bool = True,
+        live: Sequence[str] = (),
+        bridged: int = BRIDGED,
+    ) -> Self:
+        """Return the step of a controller; arguments as of `Stepper`."""
+        settings = live_settings(problem, controller, live)
+        with with_recommended_gain(problem, settings.controller):
+            ready = checked(problem, settings.controller)
+        if bounded:
+            refuse_unbounded(ready)
+        ranges = plausible_range(problem, plausible)
+        composite, memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
+        return cls(problem, controller, settings, ready, composite, memory, max_age is not None, bridged)
 
 
 class Stepper(NumbersNow, Checked):
@@ -120,26 +164,44 @@ class Stepper(NumbersNow, Checked):
         self.deadline = None if deadline is None else Deadline(deadline, clock)
         if self.deadline is not None:
             vars(self)["step"] = self.deadline.timed(self.step)  # a stepper without a deadline pays nothing
-        settings = live_settings(problem, controller, live)
-        with with_recommended_gain(problem, settings.controller):
-            ready = checked(problem, settings.controller)
-        if bounded:
-            refuse_unbounded(ready)
-        ranges = plausible_range(problem, plausible)
-        composite, self.memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
+        step = ComposedStep.of(
+            problem,
+            controller,
+            plausible=plausible,
+            max_age=max_age,
+            monitor=monitor,
+            bounded=bounded,
+            live=live,
+            bridged=bridged,
+        )
+        self._bind(step, compiled=compiled)
+        warn_of_harm(problem, controller)
+
+    @classmethod
+    def of(cls, step: ComposedStep, *, compiled: bool) -> Self:
+        """Return the stepper of a step that is composed already; its user is not warned of harm."""
+        own = cls.__new__(cls)
+        own.deadline = None
+        own._bind(step, compiled=compiled)
+        return own
+
+    def _bind(self, step: ComposedStep, *, compiled: bool) -> None:
+        """Compile the step, and bind its arguments."""
+        problem, controller, composite = step.problem, step.controller, step.composite
+        self.memory = step.memory
         self.function: ca.Function = composite.function
-        backend = native(self.function, required=bool(live)) if compiled else None
+        backend = native(self.function, required=bool(step.settings.paths)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = composite.trace
-        self.measures = measures(problem, ready)  # names of the raw measurements
+        self.measures = measures(problem, step.ready)  # names of the raw measurements
         self.why_failed = ""
         self._title = f"{problem.name or 'problem'}, {name_in_task(controller)}"
         self._may_fail = composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self.function
-        model = ready.plant_model(problem)
+        model = step.ready.plant_model(problem)
         parameters = model.parameters(model.plant)
-        arguments = StepArguments(function, composite, problem, parameters, ages=max_age is not None)
-        self._begin(settings, composite, arguments)
+        arguments = StepArguments(function, composite, problem, parameters, ages=step.ages)
+        self._begin(step.settings, composite, arguments)
         self.reads: Layout = composite.reads.starting_at(np.concatenate(arguments.evaluator.arguments[1:]))
         self.estimates, self.beside = arguments.estimates, arguments.beside
         self._tokens = [True]
@@ -153,8 +215,7 @@ class Stepper(NumbersNow, Checked):
         self._before, self._period = self.memory.slice(CLOCK.name).start, float(problem.period)
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._counted = self.signals.slice(SKIPPED).start
-        self._late, self._most = 1.5 * self._period, most_missed(problem, bridged)
-        warn_of_harm(problem, controller)
+        self._late, self._most = 1.5 * self._period, most_missed(problem, step.bridged)
 
     if not TYPE_CHECKING:
 

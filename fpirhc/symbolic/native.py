@@ -15,10 +15,11 @@ import stat
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -36,6 +37,8 @@ _ALIGNED = ("-falign-functions=64", "-falign-loops=64")
 _FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _loaded: dict[str, ca.Function] = {}
+_begun: dict[Path, tuple[Sequence[str], Future[None]]] = {}  # by note: the C, and the compiler that is at work on it
+_places: dict[Path, threading.Lock] = {}  # of objects that are being made
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,20 +97,62 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
     """
     if function.is_a("External"):
         return Native(function, True, "")
-    compiler, flags = find_compiler(), (*flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", "")))
+    compiler, flags = find_compiler(), _with_own(flags)
     if compiler is None:
         return Native(function, False, why_no_compiler())
     try:
         note = _note(function, compiler, flags, calls)
         known = _noted(note) if note else None
         if known is None:
-            key, known = _library(generate(function, calls), compiler, flags)
+            key, known = _library(_written(note, function, calls), compiler, flags)
             _remember(note, key)
         return Native(known, True, "")
     except (NoCode, CompileError) as error:
         if required and isinstance(error, CompileError):
             raise
         return Native(function, False, str(error))
+
+
+@contextlib.contextmanager
+def compiling_ahead() -> Iterator[Callable[..., None]]:
+    """Yield a function that starts the compiler for what `native` will be asked later with the same arguments, and does not wait.
+
+    `native` waits for a compiler that has been started, so several are at work side by side while Python goes on. What fails here
+    fails again there, with its message.
+    """
+    pool, notes = ThreadPoolExecutor(os.cpu_count()), list[Path]()
+
+    def begin(function: ca.Function, flags: Sequence[str] = (), *, calls: int = 0) -> None:
+        compiler, flags = find_compiler(), _with_own(flags)
+        note = _note(function, compiler, flags, calls) if compiler else None
+        if compiler is None or note is None or note in _begun or _noted(note) is not None:
+            return
+        with contextlib.suppress(NoCode):
+            sources = generate(function, calls)
+            _begun[note] = sources, pool.submit(_make, sources, compiler, flags)
+            notes.append(note)
+
+    try:
+        yield begin
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for note in notes:
+            _begun.pop(note, None)
+
+
+def _with_own(flags: Sequence[str]) -> Sequence[str]:
+    """The flags, and behind them those of the user."""
+    return (*flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", "")))
+
+
+def _written(note: Path | None, function: ca.Function, calls: int) -> Sequence[str]:
+    """The C of a Function; where its compiler has been started, what was written then, after the compiler has ended."""
+    begun = _begun.pop(note, None) if note else None
+    if begun is None:
+        return generate(function, calls)
+    sources, compiler = begun
+    wait([compiler])
+    return sources
 
 
 def cache_folder() -> Path:
@@ -258,17 +303,44 @@ def _check_of(note: Path, key: str) -> str:
     return hashlib.sha256(f"{note.stem} {key}".encode()).hexdigest()
 
 
-def _library(sources: Sequence[str], compiler: str, more: Sequence[str] = ()) -> tuple[str, ca.Function]:
-    """Return key and external Function of the library for these files, compiling it when needed."""
+@dataclass(frozen=True)
+class _Plan:
+    """How the library of some C files is made."""
+
+    key: str  # hash of all that it depends on
+    units: tuple[_Unit, ...]
+    link: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        return f"fpirhc_{self.key}"
+
+    @property
+    def path(self) -> Path:
+        return cache_folder() / f"{self.key}{_suffix()}"
+
+
+def _planned(sources: Sequence[str], compiler: str, more: Sequence[str]) -> _Plan:
     own, *drivers = (_unit(source, compiler, more) for source in sources)
     link = (compiler, *more, *_LINK)
     key = hashlib.sha256("\0".join((own.key, *(d.key for d in drivers), *link)).encode()).hexdigest()[:32]
-    if key not in _loaded:
-        path = cache_folder() / f"{key}{_suffix()}"
-        name = f"fpirhc_{key}"
-        named = _Unit(own.source.replace(NAME, name), own.command)
-        _loaded[key] = _load(path, name, [named, *drivers], link)
-    return key, _loaded[key]
+    plan = _Plan(key, (), link)
+    return replace(plan, units=(replace(own, source=own.source.replace(NAME, plan.name)), *drivers))
+
+
+def _make(sources: Sequence[str], compiler: str, more: Sequence[str]) -> None:
+    """Compile these files into a library of the cache, where there is none."""
+    plan = _planned(sources, compiler, more)
+    if not _is_intact(plan.path):
+        _compile(plan.units, plan.link, plan.path)
+
+
+def _library(sources: Sequence[str], compiler: str, more: Sequence[str]) -> tuple[str, ca.Function]:
+    """Return key and external Function of the library for these files, compiling it when needed."""
+    plan = _planned(sources, compiler, more)
+    if plan.key not in _loaded:
+        _loaded[plan.key] = _load(plan)
+    return plan.key, _loaded[plan.key]
 
 
 def shared_library(sources: Sequence[str], flags: Sequence[str] = (), libraries: Sequence[str] = ()) -> Path:
@@ -291,14 +363,15 @@ def _suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def _load(path: Path, name: str, units: Sequence[_Unit], link: Sequence[str]) -> ca.Function:
+def _load(plan: _Plan) -> ca.Function:
+    path = plan.path
     if _is_intact(path):
         # An intact library that does not load was made on another system: it is compiled again here.
         with contextlib.suppress(RuntimeError):
-            return ca.external(name, str(path))
+            return ca.external(plan.name, str(path))
     try:
-        _compile(units, link, path)
-        return ca.external(name, str(path))
+        _compile(plan.units, plan.link, path)
+        return ca.external(plan.name, str(path))
     except (OSError, RuntimeError) as error:
         if isinstance(error, CompileError):
             raise
@@ -324,19 +397,22 @@ def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path, libraries:
     """
     _remove_abandoned(path.parent)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=BUILDING, ignore_cleanup_errors=True) as work:
-        own = Path(work) / "model.o"
-        objects = [own, *(path.parent / f"{unit.key}.o" for unit in units[1:])]
-        missing = [(u, o) for u, o in zip(units, objects, strict=True) if o is own or not _is_intact(o)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            built = list(pool.map(partial(_object, Path(work)), range(len(missing)), (unit for unit, _ in missing)))
-        for result, (_, place) in zip(built, missing, strict=True):
-            if place is own:
-                result.replace(own)
-            else:
-                _publish(result, place)
+            own = pool.submit(_object, Path(work), 0, units[0])
+            shared = pool.map(partial(_driver, path.parent, Path(work)), range(1, len(units)), units[1:])
+            objects = [own.result(), *shared]
         library = Path(work) / f"model{_suffix()}"
         _succeed([*link, "-o", str(library), *map(str, objects), *libraries, "-lm"], library, work)
         _publish(library, path)
+
+
+def _driver(folder: Path, work: Path, number: int, unit: _Unit) -> Path:
+    """The object of a driver: one of two threads that need the same one compiles it, and the other one waits."""
+    place = folder / f"{unit.key}.o"
+    with _places.setdefault(place, threading.Lock()):
+        if not _is_intact(place):
+            _publish(_object(work, number, unit), place)
+    return place
 
 
 def _object(work: Path, number: int, unit: _Unit) -> Path:

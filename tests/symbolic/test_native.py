@@ -9,6 +9,7 @@ import pickle
 import re
 import stat
 import subprocess
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from fpirhc.symbolic import native as module
 from fpirhc.symbolic.driver import SIGNATURE, Driver, finite, with_driver
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import expression, graph
-from fpirhc.symbolic.native import find_compiler, native
+from fpirhc.symbolic.native import compiling_ahead, find_compiler, native
 from fpirhc.symbolic.program import chained, generate
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
@@ -110,6 +111,40 @@ def test_libraries_share_the_object_of_a_driver(cache, monkeypatch, damage):
         kept.write_bytes(kept.read_bytes()[:-1])
     np.testing.assert_array_equal(native(second).function(at).full(), second(at).full())
     assert len(compiled) == (4 if damage else 3)
+
+
+@needs_compiler
+@pytest.mark.parametrize("fails", [False, True])
+def test_compilers_at_work_side_by_side_do_nothing_twice(cache, monkeypatch, fails):
+    """Two begun libraries are found by `native`; they share a driver that is compiled once. What fails, fails for who asks."""
+    compiled: list[str] = []
+    run, barrier = module._run, threading.Barrier(2, timeout=60)
+
+    def counted(command):
+        files = [word for word in command if word.endswith(".c")]
+        compiled.extend(files)
+        if files and "part0" in files[0] and len(compiled) < 5:
+            barrier.wait()  # both are at work
+        return run([*command, "-fno-such-flag"] if fails else command)
+
+    text = f"int ENTRY{SIGNATURE} {{ return leaf(arg, res, iw, w, mem); }}"
+    inner = with_driver("fpirhc_shared", Driver(text, {"leaf": model(6.0)}, {}), lambda name: renamed(model(6.0), name))
+    x = ca.MX.sym("x", 3)
+    pair = [ca.Function("fpirhc_outer", [x], [factor * inner(x)]) for factor in (4, 5)]
+    monkeypatch.setattr(module, "_run", counted)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    with compiling_ahead() as begin:
+        for function in pair:
+            begin(function)
+        monkeypatch.setattr(module, "generate", lambda *_: pytest.fail("C is written again"))
+        ready = [native(function) for function in pair]
+    at = np.array([0.3, 0.7, -2.0])
+    for function, one in zip(pair, ready, strict=True):
+        np.testing.assert_array_equal(one.function(at).full(), function(at).full())
+        assert one.compiled != fails
+        assert ("no-such-flag" in one.reason) == fails
+    assert fails or len(compiled) == 3
+    assert not module._begun
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:
@@ -201,7 +236,7 @@ def test_damaged_library_is_built_again(cache, damage):
     sources = generate(model(4.0))
     compiler = find_compiler()
     assert compiler is not None
-    module._library(sources, compiler)
+    module._library(sources, compiler, ())
     (path,) = _libraries(cache)
     checksum = path.with_suffix(".sha256")
     if damage is None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
@@ -30,7 +31,8 @@ from fpirhc.simulation.lyapunov_view import lyapunov_view
 from fpirhc.simulation.metrics import Metrics, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import judged_run, simulator
+from fpirhc.simulation.simulate import ComposedLoop, judged_run
+from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import weighed
 from fpirhc.studies.comparison.causes import yardstick_of
 from fpirhc.studies.comparison.changes import Finding, Outcome, scales
@@ -45,11 +47,12 @@ from fpirhc.studies.comparison.pairwise import (
     partners,
     with_reviewed_causes,
 )
-from fpirhc.studies.comparison.timing import measure_cycles, stepper_to_time
+from fpirhc.studies.comparison.timing import measure_cycles, step_to_time
 from fpirhc.studies.comparison.verdict import findings
 from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.view import Progress, circumstances
 from fpirhc.symbolic.evaluate import attempted
+from fpirhc.symbolic.native import compiling_ahead
 from fpirhc.task.problem import Problem
 
 
@@ -180,6 +183,9 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
     mistakes.raise_if_any()
 
 
+_CYCLE = "the time of a cycle"
+
+
 def _entries(
     task: Task,
     controllers: Mapping[str, Controller],
@@ -189,52 +195,91 @@ def _entries(
     built: dict[str, Built],
     changes: Mapping[str, Changes],
 ) -> tuple[list[Entry], dict[str, str]]:
-    """Entries of the controllers that ran, and reasons why the others were skipped; what ran is added to `built`."""
+    """Entries of the controllers that ran, and reasons why the others were skipped; what ran is added to `built`.
+
+    All are composed before the first one runs, so that their compilers are at work side by side.
+    """
     entries: list[Entry] = []
     skipped: dict[str, str] = {}
-    for name, controller in controllers.items():
-        try:
-            entries.append(
-                _entry(task, controllers, name, controller, seed, compiled, progress, built, changes.get(name, {}))
-            )
-        except FpirhcError as error:
-            skipped[name] = str(error)
-        except KeyboardInterrupt:
-            waiting = list(controllers)[len(entries) + len(skipped) :]
-            skipped |= dict.fromkeys(waiting, "interrupted before it finished")
-            break
-    return entries, skipped
+    composed: dict[str, _Composed] = {}
+    try:
+        with compiling_ahead() as begin:
+            for name, controller in controllers.items():
+                with _skipping(name, skipped):
+                    composed[name] = _composed(task.problem, name, controller, changes.get(name, {}), progress)
+                    composed[name].begin(begin, compiled)
+            for name, one in composed.items():
+                with _skipping(name, skipped):
+                    entries.append(_entry(task, controllers, name, one, seed, compiled, progress, built))
+    except KeyboardInterrupt:
+        done = {*skipped, *(e.name for e in entries)}
+        skipped |= {name: "interrupted before it finished" for name in controllers if name not in done}
+    return entries, {name: skipped[name] for name in controllers if name in skipped}
+
+
+@contextmanager
+def _skipping(name: str, skipped: dict[str, str]) -> Iterator[None]:
+    """Note why a controller is skipped, and go on."""
+    try:
+        yield
+    except FpirhcError as error:
+        skipped[name] = str(error)
+
+
+@dataclass(frozen=True, eq=False)
+class _Composed:
+    """A controller before its compilers have ended: its loop, and its step by hand, None where that is broken."""
+
+    ready: Controller
+    loop: ComposedLoop
+    step: ComposedStep | None
+    changes: Changes
+    broken: tuple[str, ...]
+
+    def begin(self, begin: Callable[..., None], compiled: bool | None) -> None:
+        """Start the compilers of both."""
+        if self.loop.worth_compiling(compiled):
+            begin(self.loop.function, calls=self.loop.calls)
+            if self.step is not None:
+                begin(self.step.function)
+
+
+def _composed(
+    problem: Problem, name: str, controller: Controller, changes: Changes, progress: Progress | None
+) -> _Composed:
+    if progress:
+        progress(name, 0, problem.cycles)
+    broken: list[str] = []
+    ready = resolved(problem, controller)
+    live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
+    loop = ComposedLoop.of(problem, ready, live)
+    step = attempted(_CYCLE, step_to_time, problem, ready, broken=broken)
+    return _Composed(ready, loop, step, changes, tuple(broken))
 
 
 def _entry(
     task: Task,
     controllers: Mapping[str, Controller],
     name: str,
-    controller: Controller,
+    composed: _Composed,
     seed: int,
     compiled: bool | None,
     progress: Progress | None,
     built: dict[str, Built],
-    changes: Changes,
 ) -> Entry:
-    problem = task.problem
-    ready = resolved(problem, controller)
-
-    def report(done: int, total: int) -> None:
-        if progress:
-            progress(name, done, total)
-
-    report(0, problem.cycles)
-    live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
-    loop = simulator(problem, ready, compiled=compiled, live=live)
+    problem, controller, ready = task.problem, controllers[name], composed.ready
+    report = progress and partial(progress, name)
+    if report:
+        report(0, problem.cycles)
+    loop = composed.loop.simulator(compiled)
     compiled = loop.compiled if compiled is None else compiled
-    run = judged_run(loop, seed=seed, name=name, progress=report, changes=changes)
+    run = judged_run(loop, seed=seed, name=name, progress=report, changes=composed.changes)
     adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
-    broken = list(cast(Sequence[str], run.settings.get("broken", ())))
+    broken = [*cast(Sequence[str], run.settings.get("broken", ())), *composed.broken]
     part = partial(attempted, broken=broken)
     metrics = measure(problem, run, task.metrics)
     view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
-    stepper = part("the time of a cycle", stepper_to_time, problem, ready, compiled=compiled)
+    stepper = part(_CYCLE, Stepper.of, composed.step, compiled=compiled) if composed.step else None
     built[name], told = Built(loop, stepper), [view.text] if view else []
     contraction = part("the contraction", _contraction, problem, ready, run, metrics)
     optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
@@ -274,7 +319,7 @@ def _entry(
 def _timed(problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], broken: list[str]) -> list[Entry]:
     """The entries with the times of their cycles, which are measured in turn."""
     ran = {e.name: (stepper, e.run) for e in entries if (stepper := built[e.name].stepper) is not None}
-    times = attempted("the time of a cycle", measure_cycles, problem, [*ran.values()], broken=broken)
+    times = attempted(_CYCLE, measure_cycles, problem, [*ran.values()], broken=broken)
     of = dict(zip(ran, times or (), strict=False))
     return [replace(e, cycle=of.get(e.name)) for e in entries]
 

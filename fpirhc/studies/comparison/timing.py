@@ -11,8 +11,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.step_arguments import raw_measurements
-from fpirhc.simulation.stepper import Stepper
-from fpirhc.simulation.trials import without_warning
+from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.task.problem import Problem, cycles_per_plan
 
 REPLAYED = 2000  # cycles of the run that are stepped again, one by one
@@ -127,8 +126,12 @@ def _step_of(stepper: Stepper) -> Callable[[float, np.ndarray, np.ndarray, np.nd
 
 def stepper_to_time(problem: Problem, controller: Controller, *, compiled: bool) -> Stepper:
     """Return the controller stepped by hand: not warned of, because a comparison judges it, and with any optimiser."""
-    with without_warning():
-        return Stepper(problem, controller, compiled=compiled, bounded=False)
+    return Stepper.of(step_to_time(problem, controller), compiled=compiled)
+
+
+def step_to_time(problem: Problem, controller: Controller) -> ComposedStep:
+    """Return the step of that stepper, before it is compiled."""
+    return ComposedStep.of(problem, controller, bounded=False)
 
 
 def measure_cycle(problem: Problem, stepper: Stepper, run: Run) -> CycleTime | None:
