@@ -463,10 +463,12 @@ def test_the_house_loses_what_it_is_given():
 
 @pytest.mark.slow
 def test_a_review_of_whole_portions_is_what_runs_show():
-    """A rounded dose has no slope, and its linear loop is that of the mouse alone, which grows: runs of both forms decide."""
+    """A rounded dose has no slope, and its linear loop is that of the mouse alone: runs decide, nothing is unknown."""
     one = task("tumour_portions")
     both = {name: one.controllers[name] for name in (SAFE, "RHC+FPI")}
-    for name, answers in fp.review(one.problem, both, mismatch=0.0, seed=0).controllers.items():
+    review = fp.review(one.problem, both, mismatch=0.0, seed=0)
+    assert "unknown" not in {a.verdict for a in review.problem}
+    for name, answers in review.controllers.items():
         [answer] = [a for a in answers if a.question == LOOP]
         assert answer.verdict.value == ("yes" if name == SAFE else "no")
         assert "rounds or switches dose" in answer.evidence

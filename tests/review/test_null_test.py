@@ -143,15 +143,19 @@ def test_targets_that_cure_more_than_they_spoil_do_no_harm():
     assert found.change == "Change the gain, or leave the deformation out."
 
 
-def test_a_null_test_of_commands_at_a_limit_shows_nothing():
-    """Speed limits that always stand at the largest leave the same error with any adaptation: no yes for that."""
+def test_a_null_test_of_commands_at_a_limit_has_the_exact_values():
+    """A wrong map asks for more than the light lets in, the exact one does not; where both do, equal errors are no yes."""
     task = fp.load_problem("problems/gallery/freeway.py")
     one = answer(task.problem, task.controllers["static map+FPI"], "right model alone")
-    assert one.verdict == "unknown"
+    assert one.verdict == "yes"
     assert one.evidence == (
-        "run on its own model, rms error of emission 128 kg/h without adaptation and with it; not informative: the command "
-        "stands at a limit in 100 % of the cycles, where no adaptation can act"
+        "the model has the exact values here, because with its own the command stands at a limit; "
+        "run on its own model, rms error of emission 0 to rounding without adaptation and with it"
     )
+    low = replace(task.problem, limits=fp.Limits(inputs={"r": (0.0, 0.15)}), input_before={"r": 0.1})
+    one = answer(low, task.controllers["static map+FPI"], "right model alone")
+    assert one.verdict == "unknown"
+    assert "stands at a limit in 100 % of the cycles, where no adaptation can act" in one.evidence
     assert one.change == "Run it where the commands are free."
 
 

@@ -755,10 +755,18 @@ def test_a_form_is_not_changed_for_errors_of_the_start():
     assert "in at most 1000 cycles in which errors count" in one.evidence
 
 
-def test_a_command_at_a_limit_has_no_margins_behind_a_dead_time():
-    """A PID law whose integral is empty asks for less than the pump's least target; commands on their way hide nothing of it."""
+def test_an_integral_finds_its_place_before_its_margins_are_asked():
+    """A PID law behind 7.8 cycles: its loop as it is written by hand; none where the pump's least target is more than is needed."""
     task = fp.load_problem("anaesthesia_people")
     one = asked(task.problem, task.controllers["PID"], "enough margin")
+    decay, slope = math.exp(-1 / 18), 50 * (1 - 50 / 92) * 1.57 / (4.53 * (92 / 50 - 1) ** (1 / 1.57))
+    z = np.exp(1j * np.geomspace(1e-3, 1.0, 100_000))
+    loop = slope * (0.04 + 0.0235 / 12 / (z - 1)) * (1 - decay) / (z - decay) * (0.2 * z**-7 + 0.8 * z**-8)
+    turned, unity = np.argmax(np.unwrap(np.angle(loop)) < -np.pi), np.argmax(np.abs(loop) < 1)
+    assert one.numbers["gain_margin"] == pytest.approx(1 / abs(loop[turned]), rel=2e-3)
+    assert one.numbers["phase_margin"] == pytest.approx(180 + np.angle(loop[unity], deg=True), rel=1e-3)
+    high = replace(task.problem, limits=fp.Limits(inputs={"target": (4.5, 12.0)}), input_before={"target": 4.5})
+    one = asked(high, task.controllers["PID"], "enough margin")
     assert one.verdict == "unknown"
     assert "the command stands at a limit all along the reference" in one.evidence
 

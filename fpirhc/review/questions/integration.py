@@ -17,9 +17,9 @@ from fpirhc.plant.integrators import Integrator, poles, stiffness
 from fpirhc.plant.maps import poles_over
 from fpirhc.plant.plant import Plant
 from fpirhc.review.grid import ReviewGrid, state_slopes
-from fpirhc.review.loops import is_planned
+from fpirhc.review.loops import is_planned, thinned
 from fpirhc.review.question import Answer, Case, ControllerQuestion, ProblemQuestion, Verdict
-from fpirhc.review.questions.reality import real_points
+from fpirhc.review.questions.reality import RealPoint, real_points
 
 CLOSE = 0.05  # distance of a pole of the step from exp(pole of the plant x step)
 _FINER = (2, 4, 8, 16, 32, 64)  # times the sub-steps in use
@@ -197,9 +197,7 @@ def reality_followed(grid: ReviewGrid) -> Answer | None:
     problem = grid.real
     if problem is None:
         return None
-    points = real_points(grid)
-    if not points:
-        return Answer(REALITY, Verdict.UNKNOWN, "the reality nowhere settles on the reference")
+    points = real_points(grid) or _placed(grid)
     plant, integrator = problem.real_plant, problem.real_integrator
     fastest_first = sorted(points, key=lambda one: -np.abs(poles(plant, one.real, one.command, plant.exact)).max())
     for point in fastest_first:
@@ -209,6 +207,17 @@ def reality_followed(grid: ReviewGrid) -> Answer | None:
             where = f"at t = {grid.times[point.place]:g} {problem.time_unit} "
             return Answer(REALITY, Verdict.NO, where + what, f"Use Reality({remedy}).")
     return Answer(REALITY, Verdict.YES, f"no decaying mode grows at {len(points)} points of the reference")
+
+
+def _placed(grid: ReviewGrid) -> tuple[RealPoint, ...]:
+    """Some points of the reference, for a reality that nowhere settles: the states of its own are those of its start."""
+    assert grid.real is not None
+    known, points = grid.real.truth.shared(grid.problem.plant), []
+    for k in thinned(range(len(grid.times)), _POINTS):
+        state = grid.real.real_start.copy()
+        state[list(known.values())] = grid.states[k, list(known)]
+        points.append(RealPoint(k, state, grid.real.inputs_before))
+    return tuple(points)
 
 
 QUESTIONS = (

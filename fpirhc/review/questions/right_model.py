@@ -22,10 +22,11 @@ from fpirhc.deformation.wrappers.delayed import Increment
 from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import controlled_unit
-from fpirhc.plant.motion import with_space
+from fpirhc.plant.motion import known_exactly, with_space
 from fpirhc.review.prediction import (
     TRIED,
     NominalRun,
+    NominalRuns,
     ResponseErrors,
     errors_without_adaptation,
     null_errors,
@@ -246,6 +247,11 @@ def leaves_right_model_alone(case: Case) -> Answer:
         return Answer(NULL_TEST, Verdict.UNKNOWN, text, "See the rates.", numbers)
     try:
         runs = case.runs.null(case.controller)
+        if runs.stuck and not (exact := _with_exact_values(case).null(case.controller)).stuck:
+            runs, text = (
+                exact,
+                f"{text}the model has the exact values here, because with its own the command stands at a limit; ",
+            )
     except FpirhcError as error:
         return Answer(NULL_TEST, Verdict.UNKNOWN, f"{text}no run of the model: {error}", "", numbers)
     worst = runs.worst
@@ -264,6 +270,12 @@ def leaves_right_model_alone(case: Case) -> Answer:
         text += ", less than what the wrong model costs without it"
     change, more = _remedy(case, runs, predicted)
     return Answer(NULL_TEST, verdict, text, change, numbers | more)
+
+
+def _with_exact_values(case: Case) -> NominalRuns:
+    """Runs of the model with the exact parameters, which can follow a reference that the wrong ones cannot."""
+    own = case.problem.of_model
+    return NominalRuns(replace(own, plant=known_exactly(own.plant)))
 
 
 def _left_out(problem: Problem) -> str:

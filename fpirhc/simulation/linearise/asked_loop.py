@@ -175,7 +175,7 @@ class AskedLoop:
         commands, n = passage.trace[:, self.command], self.repeats
         if len(commands) <= n + 1:
             raise NoAnswer("the loop's run does not stay finite in its first cycles")
-        inside = self._inside(commands)
+        inside = self.has_room(commands)
         sizes = np.maximum(np.abs(commands).max(axis=0), 1e-300)
         change = (np.abs(commands[n:] - commands[:-n]) / sizes).max(axis=1)
         quiet = np.logical_and(inside[n:], inside[:-n])
@@ -187,7 +187,7 @@ class AskedLoop:
 
     def inside(self, memory: np.ndarray) -> bool:
         """Return whether no command of the next cycle stands at a limit."""
-        return bool(self._inside(self.step(memory)[1][self.command]))
+        return bool(self.has_room(self.step(memory)[1][self.command]))
 
     def feasible(self, memory: np.ndarray) -> bool:
         """Return whether the next cycle has a plan that keeps its limits of states; a loop without such a plan breaks none."""
@@ -201,8 +201,8 @@ class AskedLoop:
         """Return whether the next cycle is skipped, with the last command and every memory as it was."""
         return any(Status(int(one)).skips for one in self.step(memory)[1][self._statuses])
 
-    def _inside(self, commands: np.ndarray) -> np.ndarray:
-        """Which commands (..., nu) have room to all limits, shape (...)."""
+    def has_room(self, commands: np.ndarray) -> np.ndarray:
+        """Return which commands (..., nu) have room to all limits, shape (...)."""
         lower, upper = self.problem.limits.input_bounds(self.problem.plant)
         room = _ROOM * np.where(np.isfinite(upper - lower), upper - lower, 0.0)
         return np.asarray(np.all((commands > lower + room) & (commands < upper - room), axis=-1))
