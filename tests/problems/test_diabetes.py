@@ -161,6 +161,20 @@ def test_nobody_of_thirty_breaks_the_rule(tmp_path):
 
 
 @pytest.mark.slow
+def test_the_glucose_that_a_page_keeps_is_that_of_a_run():
+    """A row of the gallery's page, in tenths of mg/dl: the child who is below 70 mg/dl for longest."""
+    with np.load(Path(__file__).parents[2] / "docs" / "gallery_src" / "kept" / "diabetes.npz") as kept:
+        rows = kept["PID"]
+    place = int(np.argmax((rows < 700).mean(axis=1)))
+    cases = task().cases
+    assert cases is not None
+    problem = cases.problem(list(cases.names)[place], task().problem)
+    run = fp.simulate(problem, task().controllers["PID"], seed=0, compiled=False)
+    np.testing.assert_allclose(rows[place], 10 * run["plant_output.glucose"], atol=1.5)
+    assert len(rows) == len(cases.names)
+
+
+@pytest.mark.slow
 def test_announced_meals_break_the_rule(tmp_path):
     """With every controller, for most children."""
     assert stated(task("diabetes_announced").path, "keeps_rule", None) == ()
