@@ -121,6 +121,7 @@ class Simulator:
         progress: Progress | None = None,
         settings: Numbers | None = None,
         changes: Changes | None = None,
+        deployed: bool = False,
         setpoints: Setpoints | None = None,
     ) -> Run:
         """Run the loop once and return its signals.
@@ -133,12 +134,14 @@ class Simulator:
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build. None: those that are held.
             changes: numbers of live settings from a time on, by time in s.
+            deployed: whether a change is that of a device without Python: what follows from the settings stays that of the build.
             setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
         Raises:
             InvalidName: a setting that is not live; a coordinate without set-point.
             InvalidValue: a number that a setting does not accept; a change outside the run; a set-point that cannot be reached.
             NotContractive: a gain with which the deformation cannot converge.
+            NotSupported: a change of a device where something that follows from the setting must not stay.
         """
         problem = variant or self.problem
         force = in_force(
@@ -147,6 +150,7 @@ class Simulator:
             problem,
             self.held if settings is None else settings,
             {} if changes is None else changes,
+            deployed,
         )
         problem, controller = force.problem, force.controller
         start = start_memory(self.loop, problem, controller, force.numbers)

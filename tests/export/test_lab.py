@@ -108,8 +108,8 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
             variant = changed_at(variant, f"plant.parameters.{key}.{side}", moved[path])
         for path in noise:
             variant = changed_at(variant, path, moved[path])
-        settings = {gain: moved[gain]} if gain in loop.ready.live.paths else {}
-        run = loop.ready.run(seed=0, variant=variant, settings=settings)
+        changes = {0.0: {gain: moved[gain]}} if gain in loop.ready.live.paths else {}
+        run = loop.ready.run(seed=0, variant=variant, changes=changes, deployed=True)
         assert one["cycles"] == problem.cycles
         for column, values in zip(loop.shown, one["columns"], strict=True):
             wanted = np.ravel(run[column])[:: loop.every]
@@ -168,17 +168,38 @@ def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_stat
 
 
 def test_a_slider_that_needs_python_is_left_out_and_says_why(monkeypatch):
-    """The first plan follows from the upper limit of the motor's voltage; a zero and a motion that rests have no scale."""
+    """The step of a reference model follows from its rate and must not be old; a zero and a motion that rests have no scale."""
     monkeypatch.setattr(module, "package", lambda *_: None)
     lab = made("noisy_motor", duration=0.5, controllers=["RHC"])
     paths = {s.path for s in lab.sliders}
     assert {"exact.k", "approximate.k"} & paths or len(paths) > 5
-    assert "only Python does that" in lab.without["limits.inputs.voltage.1"]
+    law = made("mrac_pendulum", duration=0.5, controllers=["Lyapunov MRAC"])
+    assert "follows from it and must not be outdated" in law.without["rate"]
     assert lab.without["reference.scale"] == "the reference stays where it begins whatever it is"
     assert lab.without["approximate.coulomb"] == "it is zero: nothing says how far a slider would go"
     assert not paths & set(lab.without)
     people = {s.path: s for s in made("anaesthesia_people", controllers=["pump alone"]).sliders}
     assert people["approximate.E0"].high == 100  # the parameter's own bound
+
+
+def test_a_slider_writes_what_a_device_does(monkeypatch):
+    """Scales and the first plan stay those of the build: a cycle after the other, the run of a device has the same bits."""
+    monkeypatch.setattr(module, "package", lambda *_: None)
+    lab, path, number = made("fishery", controllers=["RHC"]), "reference.scale", 3.88
+    assert {"limits.inputs.effort.0", "limits.inputs.effort.1"} <= {
+        s.path for s in lab.sliders
+    }  # first plans follow from them
+    [loop], [places] = lab.loops, [s.places[0] for s in lab.sliders if s.path == path]
+    memory, trace = loop.start.copy(), loop.ready.loop.trace
+    memory[places] = number
+    device, python = (
+        loop.ready.run(seed=0, changes={0.0: {path: number}}, deployed=d)["command"] for d in (True, False)
+    )
+    for k in range(20):
+        said = loop.ready.loop.function(memory, *(table[k] for table in loop.tables))
+        memory, row = (one.full().ravel() for one in said)
+        assert row[trace.slice("command")] == device[k], k
+    assert not np.array_equal(device, python)
 
 
 @pytest.fixture(scope="module")

@@ -154,17 +154,17 @@ function remember() {
   const settings = among((p) => ![sides, points].some((one) => one.test(p)) && !scaled(p));
   const aimed = changed.size ? `, setpoints={${[...changed].map((name) => `"${name}": ${JSON.stringify(aims[name])}`).join(", ")}}` : "";
   // Each loop as it was built for this page, and a run of it with other numbers; a controller that is built with them has another first
-  // plan. A change at time 0 leaves the plan, and a setting does not.
+  // plan. A change of a device leaves the plan.
   const texts = DATA.loops.map((loop) => {
     const own = settings.filter(([p]) => loop.live.includes(p)), late = own.some(([p]) => p.startsWith("dead_time.inputs."));
     const times = ["inputs", "longest"].map((key) => `${key}=${listed(Object.entries(loop.late[key]))}`).join(", ");
     const problem = late ? `problem = replace(task.problem, dead_time=replace(task.problem.dead_time, ${times}))` : "problem = task.problem";
-    const built = `problem, task.controllers[${JSON.stringify(loop.name)}]`, of = (which) => own.filter(([p]) => p.startsWith("reference.") === which);
-    const given = (of(false).length ? `, settings=${listed(of(false))}` : "") + (of(true).length ? `, changes={0.0: ${listed(of(true))}}` : "") + aimed;
+    const built = `problem, task.controllers[${JSON.stringify(loop.name)}]`;
+    if (!numbers.length && !own.length) return [problem, `print(fp.simulate(${built}, seed=0${aimed}))`];
     const live = own.length ? `, live=${JSON.stringify(own.map(([p]) => p))}` : "";
-    return numbers.length
-      ? [problem, `loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0, variant=fp.with_settings(problem, ${listed(numbers)})${given}))`]
-      : [problem, `print(fp.simulate(${built}, seed=0${given}))`];
+    const variant = numbers.length ? `, variant=fp.with_settings(problem, ${listed(numbers)})` : "";
+    const given = own.length ? `, changes={0.0: ${listed(own)}}, deployed=True` : "";
+    return [problem, `loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}${aimed}))`];
   });
   const all = texts.flatMap((own, k) => (k && own[0] === texts[k - 1][0] ? own.slice(1) : own));
   const lines = ["import fpirhc as fp", ...(all.some((one) => one.includes("replace(")) ? ["from dataclasses import replace"] : []), "",

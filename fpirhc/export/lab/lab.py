@@ -2,8 +2,8 @@
 
 Sliders write numbers into the loop's first memory, where parameters and live settings are, or into what it reads in every cycle:
 set-points, and random series in proportion. One whose number changes anything else there, which Python would have to compute, is
-left out, and the page says why. With other parameters and another reference automatic settings, scales of plans and the first plan
-stay those of the build, as in a deployed controller.
+left out, and the page says why. Automatic settings, scales of plans and the first plan stay those of the build, as in a deployed
+controller.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, s
             if not value:
                 without[path] = "it is zero: nothing says how far a slider would go"
                 continue
-            places = _places(loops, lambda loop, other=other: loop.started(other, {}), path, without)  # type: ignore[misc]
+            places = _places(loops, lambda loop, other=other: loop.started(other), path, without)  # type: ignore[misc]
             if places:
                 low, high = np.clip(sorted((value / _SPAN, value * _SPAN)), *parameter.bounds).tolist()
                 sliders.append(Slider(path, parameter.unit, float(value), low, high, places))
@@ -303,7 +303,7 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
             continue
 
         def started(loop: LabLoop, path: str = path, step: float = step) -> np.ndarray:
-            return loop.started(loop.ready.problem, {path: step} if path in loop.ready.live.paths else {})
+            return loop.written({path: step}) if path in loop.ready.live.paths else loop.start
 
         places = _places(loops, started, path, without)
         if places:
@@ -331,16 +331,14 @@ def _places(
             without[path] = str(error)
             return {}
         columns = [loop.ready.loop.memory.columns[k] for k in moved]
-        spared = loop.computed_once if path.startswith("reference.") else ()
-        also = [name for name in columns if not _is_the_number(name, path) and name not in spared]
+        also = [name for name in columns if not _is_the_number(name, path)]
         if also:
             without[path] = (
                 f"the start of {loop.name} is computed from it, and only Python does that: use fpirhc run --set"
             )
             return {}
-        own = [int(k) for k, name in zip(moved, columns, strict=True) if name not in spared]
-        if own:
-            places[number] = own
+        if moved.size:
+            places[number] = moved.tolist()
     return places
 
 

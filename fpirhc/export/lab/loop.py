@@ -13,6 +13,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of, literal
 from fpirhc.export.targets.c import template, with_own_math
+from fpirhc.simulation.changes import patch
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.ranges import ranges_of
@@ -38,21 +39,21 @@ class LabLoop:
     @cached_property
     def start(self) -> np.ndarray:
         """The first memory."""
-        return self.started(self.ready.problem, {})
+        return self.started(self.ready.problem)
 
-    def started(self, problem: Problem, numbers: dict[str, float]) -> np.ndarray:
-        """Return the first memory with other parameters and settings."""
+    def started(self, problem: Problem) -> np.ndarray:
+        """Return the first memory with other parameters."""
         if not self.ready.live.paths:
             return start_memory(self.ready.loop, problem, self.ready.controller)
-        changed, controller, values = self.ready.live.changed(numbers)
-        return start_memory(self.ready.loop, replace(changed, plant=problem.plant), controller, values)
+        own, controller, values = self.ready.live.changed({})
+        return start_memory(self.ready.loop, replace(own, plant=problem.plant), controller, values)
 
-    @cached_property
-    def computed_once(self) -> set[str]:
-        """Columns of the memory that Python computes before a run: scales of plans that may be outdated, and the first plan."""
-        made, memory = self.ready.loop.derived(self.ready.live.start), self.ready.loop.memory
-        names = {*(name for name, effect in made.stale.items() if effect), *made.memory()}
-        return {column for name in names & {*memory.names} for column in memory[name].columns}
+    def written(self, numbers: dict[str, float]) -> np.ndarray:
+        """Return the first memory into which a device writes these settings."""
+        memory, live = self.start.copy(), self.ready.live
+        places, values = patch(live, self.ready.loop, live.changed(numbers)[2], deployed=True)
+        memory[places] = values
+        return memory
 
     def opens(self, path: str) -> bool:
         """Whether a slider moves this setting, or one end of it."""
