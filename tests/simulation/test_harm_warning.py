@@ -14,6 +14,7 @@ from plants import linear
 
 import fpirhc as fp
 from fpirhc.controllers.contract import without_deformation
+from fpirhc.export.lab import lab
 from fpirhc.simulation import trials as harm_warning
 from fpirhc.simulation.trials import ErrorPair
 from fpirhc.studies.comparison.timing import stepper_to_time
@@ -79,12 +80,16 @@ def test_without_adaptation_nothing_runs(monkeypatch):
         stepper_to_time(PROBLEM, GENTLE, compiled=False)
 
 
-def test_as_an_error_it_stops_the_build():
-    """Who wants no such controller on a machine turns the warning into an error."""
+@pytest.mark.parametrize(
+    "build", [lambda *pair: fp.Stepper(*pair, compiled=False), lambda p, c: lab.make_lab("", "", "", p, {"CTC": c})]
+)
+def test_as_an_error_it_stops_the_build(build, monkeypatch):
+    """Who wants no such controller on a machine, or in a lab, turns the warning into an error."""
+    monkeypatch.setattr(lab, "package", lambda *_: None)
     with warnings.catch_warnings():
         warnings.simplefilter("error", fp.HarmfulAdaptation)
         with pytest.raises(fp.HarmfulAdaptation, match="adaptation does harm"):
-            fp.Stepper(PROBLEM, GENTLE, compiled=False)
+            build(PROBLEM, GENTLE)
 
 
 @pytest.mark.parametrize(

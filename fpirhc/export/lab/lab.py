@@ -34,6 +34,7 @@ from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables
+from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.studies.comparison.compare import select
 from fpirhc.symbolic.live import PREFIX
 from fpirhc.symbolic.paths import changed_at, content_at, paths_to
@@ -129,6 +130,7 @@ def make_lab(
     package("ziglang", "compiler", "a lab")
     loops, without = [], dict[str, str]()
     for name, controller in controllers.items():
+        warn_of_harm(problem, controller)
         roomy = _with_room(problem, controller)
         wanted = list(live) or _usual(roomy, controller)
         ready = _with_live(roomy, controller, wanted, without)
