@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import pkgutil
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
@@ -132,6 +133,12 @@ def public_member(name: str) -> Any:
         if member is not None:
             return member
     return None
+
+
+def adapter_module(name: str) -> str:
+    """The module of the adapter that defines the name, such as `as_env`; empty where none does."""
+    homes = (one.__name__ for one in within("fpirhc.adapters"))
+    return next((home for home in homes if getattr(vars(sys.modules[home]).get(name), "__module__", "") == home), "")
 
 
 def _in_package(root: ModuleType, name: str) -> Any:

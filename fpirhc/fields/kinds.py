@@ -10,6 +10,7 @@ import difflib
 import inspect
 import math
 import numbers
+import re
 import reprlib
 import types
 import typing
@@ -349,7 +350,10 @@ class Items(Expected):
             yield f"[{k}]", self.items[k] if self.fixed else self.items[0], part
 
     def completed(self, part: object) -> str:
-        return "" if self.fixed or not accepts(self.items[0], part) else f"write ({shortened(part)},)"
+        if self.fixed or not accepts(self.items[0], part):
+            return ""
+        several = tuple(re.split(r"\s*,\s*", part)) if isinstance(part, str) else (part,)
+        return f"write {shortened(several)}"
 
 
 @dataclass(frozen=True)
@@ -393,7 +397,7 @@ class Choice(Expected):
         return tuple(one for option in self.options for one in option.contracts() if one not in _WORDS)
 
     def completed(self, part: object) -> str:
-        return next((text for option in self.options if (text := option.completed(part))), "")
+        return ", or ".join(text for option in self.options if (text := option.completed(part)))
 
 
 def takes(function: Callable[..., object], arguments: int | None) -> bool:

@@ -18,7 +18,7 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidProblem, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, nearest
 from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import Expression, expression
 
@@ -106,7 +106,14 @@ def _missing_name(error: BaseException) -> str:
     found = re.match(r"cannot import name '(\w+)' from '([\w.]+)'", f"{error}")
     if not isinstance(error, ImportError) or found is None or found[2] not in sys.modules:
         return ""
-    names = [one for one in dir(sys.modules[found[2]]) if not one.startswith("_")]
+    module = sys.modules[found[2]]
+    try:
+        getattr(module, found[1])
+    except InvalidName as missing:  # a module that says itself what is meant
+        return str(missing)
+    except AttributeError:
+        pass
+    names = [one for one in dir(module) if not one.startswith("_")]
     return f"{found[2]} has no name '{found[1]}'.{nearest(found[1], names)}"
 
 

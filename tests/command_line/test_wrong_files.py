@@ -348,6 +348,11 @@ OTHERS = {
         ("mine.py, line 5", "helper has no name 'LENGTH'. Did you mean 'LENGHT'?"),
         beside={"helper.py": "LENGHT = 1.0\n"},
     ),
+    "adapter that is no name of the top level": Wrong(
+        PENDULUM,
+        (("import fpirhc as fp", "import fpirhc as fp\nfrom fpirhc import as_env"),),
+        ("mine.py, line 5", "write: from fpirhc.adapters.environment import as_env"),
+    ),
     "equations of MATLAB": Wrong("function dx = f(t, x)\n", (), ("mine.py, line 1: invalid syntax",)),
     "nothing": Wrong("", (), ("it must define problem = fpirhc.Problem(...)", "it must define controllers = {")),
 }
