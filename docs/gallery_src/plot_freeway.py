@@ -85,7 +85,7 @@ for name, run in runs.items():
     target.plot(run.time, run[shown], label=name)
     rate.plot(run.time, run["command.r"])
 target.set_ylabel("target [kg/h]")
-target.legend()
+target.legend(ncols=3, loc="center", bbox_to_anchor=(0.5, 0.62))
 rate.set_ylabel("metering rate")
 rate.set_xlabel("time [h]")
 

@@ -13,7 +13,7 @@ Everything but the cycle is that of `turbojet`.
     RHC+FPI, gentle, model-referenced     0.34
     RHC+FPI, gentle                         26
 
-The plain form and offset-free control are nearly equal here, and model-referenced is ten times better than both. With
+Offset-free control is better than the plain form here, and the model-referenced form is ten times better than both. With
 the plain form a small gain is no safe choice: with -0.3 every change of the desired response takes a second to act,
 the plan reacts to the errors of this second with all or no throttle, and the thrust swings. The same gain in the
 model-referenced form passes what the model expects at once.
