@@ -185,7 +185,7 @@ def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
         if name not in known:
             known[name] = bars.add_task(printable(name), total=total, rate="")
         speed = bars.tasks[bars.task_ids.index(known[name])].speed
-        bars.update(known[name], completed=done, rate=f"{speed:.3g}/s" if speed else "")
+        bars.update(known[name], completed=done, total=total, rate=f"{speed:.3g}/s" if speed else "")
 
     try:
         yield report

@@ -106,10 +106,12 @@ def test_what_does_not_finish():
     good = fp.ComputedTorque(PLAIN.tracking, SIGMOID)
     task = problem(duration=2.0, measure_from=0.1)
     loops = [simulator(task, c, compiled=False) for c in (good, wild)]
-    model = ModelAsPlant(task, seed=0)
+    told: list[tuple[int, int]] = []
+    model = ModelAsPlant(task, seed=0, progress=lambda done, total: told.append((done, total)))
     lost = null_test(model, (loops[0], loops[1]), ("CTC", "CTC+FPI"), ONE, cured=ONE)
     assert np.isnan(lost.after["y"])
     assert lost.harmful
+    assert (2000, 4000) in told  # half is done after the first of both runs
     assert "failed, CTC+FPI does not finish where CTC does" in lost.text
     back = null_test(model, (loops[1], loops[0]), ("CTC", "CTC+FPI"), ONE, cured=ONE)
     assert back.outcome is Outcome.NOT_COMPARABLE

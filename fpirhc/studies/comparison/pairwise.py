@@ -41,6 +41,7 @@ from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 _LARGER = (Outcome.WORSE, Outcome.MIXED)
+_NULL_TEST = "null test"
 
 
 @dataclass(frozen=True)
@@ -289,7 +290,8 @@ def _harm(
     metrics: Sequence[Metric] | None,
     progress: Progress | None,
 ) -> tuple[str, ...]:
-    sizes, model, counted = scales(problem), ModelAsPlant(problem, seed=seed), weighed(problem, loops[1].controller)
+    sizes, counted = scales(problem), weighed(problem, loops[1].controller)
+    model = ModelAsPlant(problem, seed=seed, progress=progress and partial(progress, _NULL_TEST))
     losses: list[str] = []
     cured: Mapping[str, float] = dict.fromkeys(problem.judged_names, 0.0)
     if problem.equations_known:
@@ -300,7 +302,7 @@ def _harm(
             finding = judge(plain, with_causes(problem, adaptive, loops[1].controller), yardstick)
         losses, cured = [finding.text] * (finding.outcome is Outcome.WORSE), plain.metrics.rms_error
     if progress:
-        progress("null test", 0, 2)
+        progress(_NULL_TEST, 0, 2 * problem.cycles)
     test = null_test(model, loops, pair, sizes, counted, cured=cured)
     return (*losses, *([test.text] if test.harmful else []))
 
