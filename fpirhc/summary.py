@@ -7,8 +7,12 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _LEAST_SHARE = 1e-5
 _WITH_POWER = re.compile(r"(?P<before>= ?|(?<![\w.]))(?P<number>[-+]?\d+(?:\.\d+)?e[+-]\d+)(?!\w)")
@@ -93,6 +97,12 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[str]], notes:
     )
     below = "".join(f"<p>{_escaped(n)}</p>" for n in notes if n)
     return f"<div><table><caption>{_escaped(title)}</caption><tr>{top}</tr>{body}</table>{below}</div>"
+
+
+def in_units(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
+    """Return the frame; its `attrs["units"]` have the units of columns, by name, of those that have one."""
+    frame.attrs["units"] = {name: unit for name, unit in units.items() if unit not in ("", "1")}
+    return frame
 
 
 def printable(text: str) -> str:

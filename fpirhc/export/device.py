@@ -19,6 +19,7 @@ from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.export.straight import condensed
+from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.driver import works_alone
@@ -118,15 +119,6 @@ class Device:
 
     def _read(self, wanted: Callable[[str], bool]) -> Layout:
         return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
-
-
-def unit_of_setting(path: str, problem: Problem) -> str:
-    """Return the unit of a live setting, '' where its kind does not say it."""
-    kind, _, name = path.rpartition("inputs.")
-    if kind == "limits.":
-        units = dict(zip(problem.plant.inputs, problem.plant.input.entry_units, strict=True))
-        return units[name.rpartition(".")[0] or name]
-    return problem.plant.time_unit if path.startswith("dead_time.") else ""
 
 
 class BareStep:

@@ -11,6 +11,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import finite_number
+from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
 from fpirhc.task.cases import PARAMETERS, START, Cases
 from fpirhc.task.problem import Problem
@@ -82,6 +83,27 @@ def as_declared(controller: Controller, values: Mapping[str, Any]) -> dict[str, 
     """Return numbers of settings, as whole numbers where the controller has such."""
     plain = {p for p, v in values.items() if isinstance(v, tuple) or v % 1 or not is_whole(controller, p)}
     return {p: v if p in plain else int(v) for p, v in values.items()}
+
+
+def unit_of_setting(path: str, problem: Problem) -> str:
+    """Return the unit of a setting of a controller or of the problem, '' where its kind does not say it."""
+    word, _, name = path.partition(".")
+    if word in PARAMETERS:
+        return (problem.moved if word == "exact" else problem.plant).parameters[name].unit
+    if word == START:
+        return _units(problem.plant.state)[name]
+    if word == "limits":
+        kind, _, name = name.partition(".")
+        units = _units(problem.plant.input if kind == "inputs" else problem.plant.state)
+        return units.get(name) or units.get(name.rpartition(".")[0], "")
+    return problem.time_unit if word in _TIMES else ""
+
+
+_TIMES = ("dead_time", "duration", "measure_from", "period")  # fields of a problem
+
+
+def _units(signal: Signal) -> dict[str, str]:
+    return dict(zip(signal.elements, signal.entry_units, strict=True))
 
 
 def current_setting(owner: Controller | Problem, path: str) -> float:

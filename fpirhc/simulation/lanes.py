@@ -21,6 +21,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import CompileError, InvalidShape, InvalidValue, NoCode
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.parameter import Parameter
 from fpirhc.simulation.metrics import known_metrics
 from fpirhc.simulation.metrics.base import Metric, first_measured, measured_errors
@@ -29,6 +30,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.sums import Sums, Values
 from fpirhc.simulation.tables import run_tables
 from fpirhc.status import Status
+from fpirhc.summary import in_units
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.dataflow import DEVICE, SIDE_BY_SIDE, Callee, Words
 from fpirhc.symbolic.driver import SIGNATURE, driver_of, entry_of, is_driver
@@ -74,14 +76,19 @@ class ManyRuns:
     # scenarios that ran side by side in one register, or work item of a device; 0: one after the other by the ordinary loop
     lanes: int
     why: str  # no lanes; empty where there are some
+    units: Mapping[str, str]  # of the coordinates
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return a row per scenario: `rms_error.q1`, `max_error.q1`, `status.OK` and so on, and `stop`, why a run ended early."""
+        """Return a row per scenario: `rms_error.q1`, `max_error.q1`, `status.OK` and so on, and `stop`, why a run ended early.
+
+        `attrs["units"]` has units by column.
+        """
         import pandas as pd
 
         groups = {"rms_error": self.rms_error, "max_error": self.max_error, "status": self.statuses}
         frame = pd.DataFrame({f"{name}.{one}": column for name, some in groups.items() for one, column in some.items()})
-        return frame.assign(stop=frame.index.map(self.stops.get))
+        frame = frame.assign(stop=frame.index.map(self.stops.get))
+        return in_units(frame, {f"{name}.{one}": unit for name in groups for one, unit in self.units.items()})
 
 
 def run_many(
@@ -120,7 +127,10 @@ def run_many(
             stops[number] = run.stop
     by_name = (dict(zip(judged, columns.T.copy(), strict=True)) for columns in (rms, largest))
     statuses = {one.name: counts[:, one].copy() for one in Status if counts[:, one].any()}
-    return ManyRuns(next(by_name), next(by_name), statuses, stops, lanes.width, lanes.why)
+    units = followed_units(ready.problem.plant)
+    return ManyRuns(
+        next(by_name), next(by_name), statuses, stops, lanes.width, lanes.why, {name: units[name] for name in judged}
+    )
 
 
 @dataclass(frozen=True, eq=False)

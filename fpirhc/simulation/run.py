@@ -18,7 +18,7 @@ from fpirhc.errors import FpirhcError, InvalidName, OutputError, nearest
 from fpirhc.fields.checked import ByName, Checked, FoundByName, checked_call
 from fpirhc.fields.kinds import Positive
 from fpirhc.status import Status
-from fpirhc.summary import in_percent, line, number, table
+from fpirhc.summary import in_percent, in_units, line, number, table
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.whole_file import write_whole
 
@@ -171,11 +171,12 @@ class Run(FoundByName):
         return replace(self, log=self.log[:cycles], stop=None) if cycles <= self.cycles else self
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return all signals as a pandas DataFrame with one column per entry, indexed by time."""
+        """Return all signals as a pandas DataFrame by column and time; `attrs["units"]` has units by column."""
         import pandas as pd
 
-        return pd.DataFrame(
-            self.log, columns=list(self.layout.columns), index=pd.Index(self.time, name=f"time [{self.time_unit}]")
+        columns, index = list(self.layout.columns), pd.Index(self.time, name=f"time [{self.time_unit}]")
+        return in_units(
+            pd.DataFrame(self.log, columns=columns, index=index), dict(zip(columns, self.layout.units, strict=True))
         )
 
     def plot(self) -> Figure:

@@ -32,7 +32,7 @@ from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import kept_in
 from fpirhc.studies.view import Progress, Study, View, circumstances, finite_alone
-from fpirhc.summary import Column, Table, in_percent, line, number
+from fpirhc.summary import Column, Table, in_percent, in_units, line, number
 from fpirhc.task.dead_time import MOST
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
@@ -147,11 +147,12 @@ class OperatingLimits(Study):
         """Return a row per controller and quantity: `controller`, `quantity`, `unit`, `holds`, `fails`, `why`."""
         import pandas as pd
 
-        return pd.DataFrame(
+        frame = pd.DataFrame(
             {"controller": one.controller, "quantity": one.quantity.name, "unit": one.quantity.unit}
             | {"holds": one.holds, "fails": one.fails, "why": one.why}
             for one in self.limits
         )
+        return in_units(frame, {})  # every row has a unit of its own
 
     @property
     def view(self) -> View:

@@ -35,7 +35,7 @@ from fpirhc.studies.scenarios.draws import SEARCHING, draws_differ
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import kept_in
 from fpirhc.studies.view import Progress, Study, View, circumstances, finite_alone
-from fpirhc.summary import Column, Table, behind_equals, in_percent, line
+from fpirhc.summary import Column, Table, behind_equals, in_percent, in_units, line
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
@@ -102,12 +102,23 @@ class RobustBoxes(Study):
         return line(self, self.problem, *(f"{one.controller}: {_percent(one.percent)}" for one in self.boxes))
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return a row per controller: boxes in percent, relative errors, and the smallest box with a counterexample."""
+        """Return a row per controller: boxes in percent, relative errors, and the smallest box with a counterexample.
+
+        Numbers of the counterexample stand in columns such as `counterexample.m1`; `attrs["units"]` has units by column.
+        """
         import pandas as pd
 
-        from_percent = (math.nan if b.counterexample is None else b.counterexample.from_percent for b in self.boxes)
-        frame = pd.DataFrame([asdict(box) for box in self.boxes])
-        return frame.assign(counterexample_from=list(from_percent)).drop(columns="counterexample", errors="ignore")
+        units = dict.fromkeys(("percent", "fails_at", "counterexample_from"), "%")
+        rows = []
+        for box in self.boxes:
+            row, found = asdict(box), box.counterexample
+            del row["counterexample"]
+            row["counterexample_from"] = math.nan if found is None else found.from_percent
+            if found is not None:
+                row |= {f"counterexample.{n}": value for n, value in {**found.parameters, **found.dead_times}.items()}
+                units |= {f"counterexample.{n}": unit for n, unit in found.units.items()}
+            rows.append(row)
+        return in_units(pd.DataFrame(rows), units)
 
     @property
     def view(self) -> View:

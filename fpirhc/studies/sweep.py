@@ -24,7 +24,7 @@ from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import current_setting, is_whole, of_problem
+from fpirhc.problem_files.settings import current_setting, is_whole, of_problem, unit_of_setting
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.objective import Objective, figure
 from fpirhc.studies.scenarios.bench import SIDE_BY_SIDE, Conditions, Trials, is_of_judgements
@@ -32,7 +32,7 @@ from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.studies.view import Progress, Study, View, circumstances
-from fpirhc.summary import Column, Table, behind_equals, in_percent, line, number
+from fpirhc.summary import Column, Table, behind_equals, in_percent, in_units, line, number
 from fpirhc.symbolic.paths import names_in
 from fpirhc.task.cases import PARAMETERS, START, Cases
 from fpirhc.task.problem import Problem
@@ -44,7 +44,6 @@ LEDGER = "sweep.jsonl"
 _MOST, _CELLS = 2, 1_000_000  # settings of a map, and its cells
 _BLOCK = 64  # cells that run side by side, and are finished together
 _LOG = "log"
-_TIMES = ("dead_time", "duration", "measure_from", "period")  # fields of a problem
 _FORM = "PATH=LOW:HIGH:COUNT, or PATH=LOW:HIGH:COUNT:log"
 
 
@@ -206,9 +205,7 @@ class Sweep(Study):
         """Return the rows as a pandas DataFrame; `attrs["units"]` has the units of columns that have one, by name."""
         import pandas as pd
 
-        frame = pd.DataFrame(self.rows())
-        frame.attrs["units"] = dict(self.units)
-        return frame
+        return in_units(pd.DataFrame(self.rows()), self.units)
 
     @property
     def view(self) -> View:
@@ -261,7 +258,7 @@ def sweep(
     header = {**fingerprint(task, conditions), "axes": describe(axes), "metric": aim.name}
     with Ledger(folder / LEDGER, header, CellFields) as ledger:
         maps = tuple(_Runner(task, name, grid, conditions, aim, ledger).map(progress) for name in chosen)
-    units = {**{axis.path: _unit(task.problem, axis.path) for axis in axes}, aim.name: aim.unit}
+    units = {**{axis.path: unit_of_setting(axis.path, task.problem) for axis in axes}, aim.name: aim.unit}
     told = {name: unit for name, unit in units.items() if unit not in ("", "1")}
     return Sweep(axes=axes, maps=maps, aim=aim, seed=seed, units=told, **circumstances(task, chosen, command, begin))
 
@@ -334,16 +331,6 @@ def _of_problem(problem: Problem, path: str) -> float | None:
         return float(current_setting(problem, path))
     except FpirhcError:
         return None
-
-
-def _unit(problem: Problem, path: str) -> str:
-    """The unit of a setting of the problem, as far as it is known; '' for others."""
-    word, _, name = path.partition(".")
-    if word in PARAMETERS:
-        return (problem.moved if word == "exact" else problem.plant).parameters[name].unit
-    if word == START:
-        return problem.plant.state.units[problem.plant.state.elements.index(name)]
-    return problem.time_unit if word in _TIMES else ""
 
 
 class _Values(Cases):

@@ -20,7 +20,7 @@ from fpirhc.errors import InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import Checked, FoundByName, checked_call
 from fpirhc.fields.kinds import CountOrZero, Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, with_settings
+from fpirhc.problem_files.settings import TuningSpans, current_setting, is_whole, unit_of_setting, with_settings
 from fpirhc.review.grid import is_late
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.pairwise import harm_of_adaptation
@@ -31,6 +31,7 @@ from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger, begun_with
 from fpirhc.studies.tuned_file import as_python
 from fpirhc.studies.view import Progress
+from fpirhc.summary import in_units
 from fpirhc.symbolic.paths import content_at, paths_to
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ class Tuning:
         metric: name of the number that is the cost.
         entries: the tuned controllers.
         untouched: names of controllers without a search space.
+        units: units of the settings, by path, and of the number that is the cost, as far as they have one.
     """
 
     problem: str
@@ -77,6 +79,7 @@ class Tuning:
     metric: str
     entries: tuple[TunedController, ...]
     untouched: tuple[str, ...]
+    units: Mapping[str, str]
 
     def python(self) -> str:
         """Lines of a problem file that give its controllers the best settings."""
@@ -84,15 +87,19 @@ class Tuning:
         return as_python({e.name: e.settings for e in self.entries}, notes)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """Return a row per setting: `controller`, `setting`, `before`, `best`, and `cost_before` and `cost` of the controller."""
+        """Return a row per setting: `controller`, `setting`, `unit`, `before`, `best`, and `cost_before`, `cost` of the controller.
+
+        `attrs["units"]` has the unit of the costs.
+        """
         import pandas as pd
 
-        return pd.DataFrame(
-            {"controller": e.name, "setting": path, "before": e.before[path], "best": best}
-            | {"cost_before": e.cost_before, "cost": e.cost}
+        frame = pd.DataFrame(
+            {"controller": e.name, "setting": path, "unit": self.units.get(path, "")}
+            | {"before": e.before[path], "best": best, "cost_before": e.cost_before, "cost": e.cost}
             for e in self.entries
             for path, best in e.settings.items()
         )
+        return in_units(frame, dict.fromkeys(("cost_before", "cost"), self.units.get(self.metric, "")))
 
     def facts(self) -> dict[str, Any]:
         """Plain data for a file."""
@@ -196,7 +203,8 @@ def tune(
     if cases is not None and task.cases is not None:
         words = f"cases {', '.join(task.cases.names[k] for k in numbers)}: {len(numbers)} of {len(task.cases.names)}"
     untouched = tuple(n for n in task.controllers if n not in names)
-    return Tuning(task.name, trials, seed, words, aim.name, entries, untouched)
+    units = {path: unit_of_setting(path, task.problem) for entry in entries for path in entry.settings}
+    return Tuning(task.name, trials, seed, words, aim.name, entries, untouched, {**units, aim.name: aim.unit})
 
 
 @dataclass(frozen=True)

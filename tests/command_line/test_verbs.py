@@ -357,16 +357,16 @@ JOURNEYS: dict[str, Any] = {
     ],
     "tune": [
         (None, "line.py", 2),
-        (tunable, "line.py --trials 2 --out tuned", 0),
+        (tunable, "line.py --trials 2 --out tuned --format csv", 0),
         (stale, "line.py --trials 2 --out tuned", 3),
     ],
     "limits": [
-        (None, "line.py --over latency --controllers CTC --no-compile", 0),
+        (None, "line.py --over latency --controllers CTC --no-compile --format csv", 0),
         (None, "line.py --over latncy", 2),
         (taken, "line.py --out taken/results", 3),
     ],
     "robust": [
-        (None, "line.py --controllers CTC --risk 0.5 --confidence 0.5 --no-compile", 0),
+        (None, "line.py --controllers CTC --risk 0.5 --confidence 0.5 --no-compile --format csv", 0),
         (None, "line.py --risk 2", 2),
         (taken, "line.py --out taken/results", 3),
     ],

@@ -64,7 +64,10 @@ def test_a_search_of_a_box_without_draws_in_its_corner_finds_the_plant_that_fail
     assert box.percent > 100 * (EDGE - 1)
     assert box.counterexample is not None
     assert box.counterexample.from_percent == math.ceil(100 * (EDGE - 1))
-    assert found.to_dataframe()[["controller", "counterexample_from"]].to_numpy().tolist() == [["law", 67]]
+    frame, b = found.to_dataframe(), box.counterexample.parameters["b"]
+    named = frame[["controller", "counterexample_from", "counterexample.b"]]
+    assert named.to_numpy().tolist() == [["law", 67, b]]
+    assert frame.attrs["units"]["counterexample.b"] == "m/(s V)"
 
 
 @pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")

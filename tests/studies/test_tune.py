@@ -132,6 +132,7 @@ def test_every_controller_gets_the_same_budget_and_none_gets_worse(task, tmp_pat
     assert tuned.untouched == ("CTC exact",)
     rows = tuned.to_dataframe().set_index("setting")
     assert rows.loc["deformation.gain", "best"] == adaptive.settings["deformation.gain"]
+    assert rows.attrs["units"] == {}  # of the relative error
     # The cost is what a comparison would report, of the settings as they were written down.
     changed = with_tuned(task, {e.name: e.settings for e in tuned.entries})
     run = fp.simulate(task.problem, changed.controllers["CTC+FPI"], seed=0, compiled=False)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study
-from fpirhc.cli.output import publish, results_folder, resumable, study_settings
+from fpirhc.cli.options import add_controllers, add_fails, add_format, add_problem, add_study
+from fpirhc.cli.output import publish, results_folder, resumable, study_settings, table_writer
 from fpirhc.cli.verb import ExitCode, Verb
 
 
@@ -16,6 +16,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--over", nargs="+", metavar="NAME", help=text)
     add_fails(parser)
     add_study(parser, "limits", "noise and lost samples")
+    add_format(parser, "a row per controller and quantity", None)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -27,6 +28,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.operating_limits import LEDGER, operating_limits
 
+    write_table = table_writer(options.format)
     folder = results_folder(options.out, task.name, "limits")
     with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
         result = operating_limits(
@@ -34,6 +36,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
         )
     if result.limits:
         save_figure(limits_figure(result), folder / "limits.png")
+    if options.format:
+        write_table([result.to_dataframe()], folder / "limits")
     publish(result.view, render_limits(result), folder, as_json=options.json)
     (folder / LEDGER).unlink()  # an interrupted study goes on with it, and another one begins
     return ExitCode.FINISHED if result.limits else ExitCode.BAD_INPUT

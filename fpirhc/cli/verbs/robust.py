@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from fpirhc.cli.options import add_controllers, add_fails, add_problem, add_study, share
-from fpirhc.cli.output import publish, results_folder, resumable, study_settings
+from fpirhc.cli.options import add_controllers, add_fails, add_format, add_problem, add_study, share
+from fpirhc.cli.output import publish, results_folder, resumable, study_settings, table_writer
 from fpirhc.cli.verb import ExitCode, Verb
 
 _SHARES = {
@@ -21,6 +21,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=share, default=argparse.SUPPRESS, metavar="SHARE", help=text)
     add_fails(parser)
     add_study(parser, "robust", "the draws and the noise")
+    add_format(parser, "a row per controller", None)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -31,11 +32,14 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.robust import LEDGER, robust_boxes
 
+    write_table = table_writer(options.format)
     folder = results_folder(options.out, task.name, "robust")
     with resumable(folder / LEDGER), progress_bars(as_json=options.json) as progress:
         result = robust_boxes(
             task, folder=folder, **study_settings(VERB, options, *_SHARES, "fails"), progress=progress
         )
+    if options.format:
+        write_table([result.to_dataframe()], folder / "robust")
     publish(result.view, render_charted(result.view), folder, as_json=options.json)
     (folder / LEDGER).unlink()  # an interrupted study goes on with it, and another one begins
     return ExitCode.FINISHED if result.boxes else ExitCode.BAD_INPUT

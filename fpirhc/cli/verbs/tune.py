@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from fpirhc.cli.options import (
     add_cases,
     add_controllers,
+    add_format,
     add_json,
     add_mismatch,
     add_out,
@@ -17,7 +18,7 @@ from fpirhc.cli.options import (
     add_seed,
     whole,
 )
-from fpirhc.cli.output import results_folder, resumable
+from fpirhc.cli.output import results_folder, resumable, table_writer
 from fpirhc.cli.verb import ExitCode, Verb
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     text = "compile no loop"
     compiling.add_argument("--no-compile", action="store_const", const=False, dest="compiled", help=text)
     add_json(parser, "the table: what tuning.json holds")
+    add_format(parser, "a row per setting", None)
 
 
 def _run(options: argparse.Namespace) -> ExitCode:
@@ -54,6 +56,7 @@ def _run(options: argparse.Namespace) -> ExitCode:
     from fpirhc.studies.tune import LEDGER, tune
     from fpirhc.studies.tuned_file import write_tuned
 
+    write_table = table_writer(options.format)
     drawn = f"{options.scenarios}x{options.mismatch:g}percent"
     name = f"tuning_{'cases' if options.cases else drawn}_seed{options.seed}"
     name += f"_by_{options.metric}" if options.metric else ""
@@ -75,6 +78,8 @@ def _run(options: argparse.Namespace) -> ExitCode:
             progress=progress,
         )
     write_tuned(tuning.facts(), folder / "tuning.json")
+    if options.format:
+        write_table([tuning.to_dataframe()], folder / "tuning")
     if options.json:
         print((folder / "tuning.json").read_text(encoding="utf-8"), end="")
     else:

@@ -21,11 +21,11 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, package
-from fpirhc.export.device import unit_of_setting
 from fpirhc.export.lab.loop import LabLoop
 from fpirhc.export.targets.c import template
 from fpirhc.plant.motion import forcing_units
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.pictures import planar
