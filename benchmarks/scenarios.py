@@ -26,6 +26,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,11 @@ import pandas as pd
 
 import fpirhc as fp
 from fpirhc.cli.output import table_writer
+from fpirhc.studies.scenarios import scenario_study
 from fpirhc.studies.scenarios.bench import Bench, Conditions
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.ledger import Ledger
+from fpirhc.studies.scenarios.parquet import FOLDER, ParquetFolder
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from table import write_table
@@ -132,23 +135,45 @@ def memory(name: str, controllers: tuple[str, ...], count: int) -> tuple[str, ..
     )
 
 
+class TimedFolder(ParquetFolder):
+    """It knows the processor time of its rows."""
+
+    seconds = 0.0
+
+    def add(self, record: Mapping[str, Any]) -> None:
+        begin = time.process_time()
+        super().add(record)
+        TimedFolder.seconds += time.process_time() - begin
+
+    def __exit__(self, *error: object) -> None:
+        begin = time.process_time()
+        super().__exit__(*error)
+        TimedFolder.seconds += time.process_time() - begin
+
+
+def size(path: Path) -> int:
+    """Bytes of a file, or of those in a folder."""
+    return sum(one.stat().st_size for one in ([path] if path.is_file() else path.iterdir()))
+
+
 def tables(name: str, controllers: tuple[str, ...], counts: tuple[int, ...]) -> list[tuple[str, ...]]:
     """What the records of a study take in every kind of file."""
     with tempfile.TemporaryDirectory() as base:
         folder = Path(base)
         task, count = fp.load_problem(name), counts[-1] // len(controllers)
+        rows, begin, scenario_study.ParquetFolder = count * len(controllers), time.process_time(), TimedFolder
+        wanted: dict[str, Any] = {"controllers": controllers, "count": count, "percent": 10.0, "seed": 0}
+        found = fp.compare_scenarios(task, **wanted, folder=folder, parquet=True)
+        taken = TimedFolder.seconds
+        seconds = {"jsonl": time.process_time() - begin - taken, "parquet": taken}
         begin = time.process_time()
-        found = fp.compare_scenarios(task, controllers=controllers, count=count, percent=10.0, seed=0, folder=folder)
-        rows, seconds = count * len(controllers), {"jsonl": time.process_time() - begin}
-        for form in ("csv", "parquet"):
-            begin = time.process_time()
-            table_writer(form)(found.frames(), folder / "scenarios")
-            seconds[form] = time.process_time() - begin
+        table_writer("csv")(found.frames(), folder / "scenarios")
+        seconds["csv"] = time.process_time() - begin
         begin = time.process_time()
-        pd.read_parquet(folder / "scenarios.parquet")
+        pd.read_parquet(folder / FOLDER)
         read = time.process_time() - begin
         words = {"jsonl": "the ledger, with its runs", "csv": "`--format csv`", "parquet": "`--format parquet`"}
-        sizes = {form: (folder / f"scenarios.{form}").stat().st_size / rows for form in words}
+        sizes = {form: size(folder / f"scenarios.{form}") / rows for form in words}
     return [
         (words[f], f"{rows}", f"{sizes[f]:.0f}", f"{seconds[f]:.1f}", f"{read:.2f}" if f == "parquet" else "")
         for f in words

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import json
 import os
 import shlex
 import sys
@@ -72,8 +71,8 @@ def publish(view: View, page: str, folder: Path, *, as_json: bool) -> None:
 def table_writer(form: str | None) -> Callable[[Iterable[DataFrame], Path], None]:
     """Return a function that writes a table in parts to a path whose suffix becomes that of the form, or nothing without one.
 
-    Units, `attrs["units"]` by column, stand behind the names of a CSV file: 'rms_error.q1 [m]'. A Parquet file has attributes, and
-    every part is a row group of its own.
+    Units, `attrs["units"]` by column, stand behind the names of a CSV file: 'rms_error.q1 [m]'. A Parquet file, of one part, has
+    attributes.
     """
     from fpirhc.errors import NotInstalled
     from fpirhc.whole_file import whole_file
@@ -96,20 +95,8 @@ def _write_csv(parts: Iterable[DataFrame], file: IO[bytes]) -> None:
 
 
 def _write_parquet(parts: Iterable[DataFrame], file: IO[bytes]) -> None:
-    import pyarrow as pa
-    from pyarrow.parquet import ParquetWriter
-
-    begun = None
-    for part in parts:
-        table = pa.Table.from_pandas(part, schema=begun and begun.schema, preserve_index=False)
-        if begun is None:
-            # a column of words that has none so far; pandas keeps attributes under this name
-            words = [pa.field(f.name, pa.string()) if pa.types.is_null(f.type) else f for f in table.schema]
-            attributes = {b"PANDAS_ATTRS": json.dumps(part.attrs).encode()}
-            begun = ParquetWriter(file, pa.schema(words, {**table.schema.metadata, **attributes}))
-        begun.write_table(table.cast(begun.schema))
-    if begun:
-        begun.close()
+    (whole,) = parts  # a study of many scenarios has a folder of them
+    whole.to_parquet(file, index=False)
 
 
 _NO_NUMBERS = {

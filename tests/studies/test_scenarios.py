@@ -31,7 +31,7 @@ from fpirhc.plant.plant import exact_ranges
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.grid import is_late, scaled
 from fpirhc.studies.objective import Objective
-from fpirhc.studies.scenarios import paired
+from fpirhc.studies.scenarios import paired, parquet
 from fpirhc.studies.scenarios.bench import Bench, Conditions, outcome, ranges, relative_error, scenario_numbers
 from fpirhc.studies.scenarios.cluster import DEATHS, Workers
 from fpirhc.studies.scenarios.draws import COMPARING, TUNING, draw, mismatch_of
@@ -245,6 +245,25 @@ def test_a_table_in_parts_is_the_table(task, tmp_path):
     assert all((part.dtypes == whole.dtypes).all() and part.attrs == whole.attrs for part in parts)
     pd.testing.assert_frame_equal(pd.concat(parts, ignore_index=True), whole)
     assert whole["rms_error.y"].notna().all()
+
+
+def test_parquet_files_are_the_ledger_whatever_became_of_them(task, tmp_path, monkeypatch):
+    """Also where a file is torn, lost or of other records, and where a metric has its first number late."""
+    pytest.importorskip("pyarrow")
+    monkeypatch.setattr(parquet, "ROWS", 2)
+    numbers = iter([None] * 4 + [1.0] * 20)
+    late = fp.Metric("late", lambda problem, run: next(numbers), unit="m")
+    task, files = replace(task, metrics=[*task.metrics, late]), tmp_path / "scenarios.parquet"
+    for count in (1, 3, 6):
+        study = fp.compare_scenarios(task, count=count, folder=tmp_path, parquet=True, **SETTINGS)
+        kept, whole = (
+            frame.sort_values(["controller", "scenario"], ignore_index=True).fillna({"stop": ""})
+            for frame in (pd.read_parquet(files), study.to_dataframe())
+        )
+        pd.testing.assert_frame_equal(kept[whole.columns], whole, check_dtype=False)
+        assert kept.attrs == whole.attrs
+        for number, content in enumerate((b"torn", (files / "000000.parquet").read_bytes())):
+            (files / f"{number + 7 * (count == 1):06}.parquet").write_bytes(content)
 
 
 def test_other_flags_of_the_compiler_are_other_numbers(task, tmp_path, monkeypatch):

@@ -223,8 +223,8 @@ def test_parquet_without_pyarrow_is_refused_before_a_run(
 def test_a_table_in_parquet_is_the_table_in_csv(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     table = swept(tmp_path, "exact.b=0.5:2:3").to_dataframe()
-    for form in ("csv", "parquet"):
-        table_writer(form)([table.iloc[:1], table.iloc[1:]], tmp_path / "sweep")
+    for form, parts in (("csv", [table.iloc[:1], table.iloc[1:]]), ("parquet", [table])):
+        table_writer(form)(parts, tmp_path / "sweep")
     kept = pd.read_parquet(tmp_path / "sweep.parquet")
     pd.testing.assert_frame_equal(kept, table)
     assert kept.attrs == {"units": {"exact.b": "m/(s V)"}}

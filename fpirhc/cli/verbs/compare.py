@@ -55,8 +55,9 @@ Scenario k of a seed is the same for every controller, whatever the number of sc
 is multiplied by a factor of its own, log-uniform between 1 - PERCENT/100 and 1 + PERCENT/100; a parameter with a spread in the
 problem file is drawn from PERCENT/100 of it, 100 for all of it. Finished scenarios are kept in
 scenarios.jsonl in the output folder; after an interruption or a crash the same command continues from them. A folder that
-holds results of another problem, seed, mismatch or version is refused (exit code 3). A problem is its file, the modules beside
-it, and every formula.
+holds results of another problem, seed, mismatch or version is refused (exit code 3). With --format parquet all finished
+scenarios of the folder are also files of 10 000 rows in its scenarios.parquet, written while they come. A problem is its
+file, the modules beside it, and every formula.
 Cases are scenarios with names: cases = fp.Cases({"heavy": {"exact.mass": 2.0}}) in the problem file, or fp.Cases.from_csv(FILE).
 """
 
@@ -184,7 +185,7 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     from fpirhc.report.figures import mismatch_figure, save_figure
     from fpirhc.report.html import render_scenarios
 
-    task, write_table = load_problem(options.problem), table_writer(options.format)
+    task, write_csv = load_problem(options.problem), table_writer(options.format)
     drawn = f"scenarios_{options.mismatch or 0:g}percent"
     name = f"{'tuned_' if options.tuned else ''}{'cases' if options.cases else drawn}_seed{options.seed}"
     name += "_shard{}of{}".format(*options.shard) if options.shard else ""
@@ -192,8 +193,8 @@ def _run_scenarios(options: argparse.Namespace) -> ExitCode:
     comparison = _compared(options, task, folder)
     if comparison.summaries:
         save_figure(mismatch_figure(comparison), folder / "mismatch.png")
-    if options.format:
-        write_table(comparison.frames(), folder / "scenarios")
+    if options.format == "csv":
+        write_csv(comparison.frames(), folder / "scenarios")
     publish(comparison.view, render_scenarios(comparison), folder, as_json=options.json)
     return ExitCode.FINISHED if comparison.summaries else ExitCode.BAD_INPUT
 
@@ -221,6 +222,7 @@ def _compared(options: argparse.Namespace, task: Task, folder: Path) -> Scenario
             tuned=tuned.values if tuned else None,
             tuning=tuned.notes if tuned else None,
             compiled=not options.no_compile,
+            parquet=options.format == "parquet",
             command=reproducing(VERB, options),
             progress=progress,
         )

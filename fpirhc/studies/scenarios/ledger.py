@@ -50,6 +50,11 @@ class Records(Sequence[Mapping[str, Any]]):
             self._path, *(np.frombuffer(one, one.typecode)[chosen].tolist() for one in (self._places, self._sums))
         )
 
+    @property
+    def key(self) -> bytes:
+        """What these records, and no others, are known by."""
+        return f"{len(self)} {zlib.crc32(self._sums.tobytes()):08x}".encode()
+
     def __iter__(self) -> Iterator[Mapping[str, Any]]:
         try:
             file = self._path.open("rb")

@@ -19,7 +19,7 @@ from fpirhc.studies.objective import Objective
 from fpirhc.studies.scenarios.bench import RecordFields
 from fpirhc.studies.scenarios.paired import Record, Summary, counted, noun
 from fpirhc.studies.view import Study, View, status_shares
-from fpirhc.summary import Column, Table, in_percent, line, written_out
+from fpirhc.summary import Column, Table, in_percent, in_units, line, written_out
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,8 +31,13 @@ _MEANING = (
     "and where the reference is held that of the plant left alone, has diverged; a run that ended early counts as worse than every "
     "other run."
 )
-_FIELDS = tuple(one.name for one in fields(RecordFields) if one.name != "metrics")
+FIELDS = tuple(one.name for one in fields(RecordFields) if one.name != "metrics")
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
+
+
+def flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Return numbers by 'metric.element', and by 'metric' where there is one number."""
+    return {f"{name}.{e}" if e else name: value for name, some in metrics.items() for e, value in some.items()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,15 +104,12 @@ class ScenarioComparison(Study, FoundByName):
         """Return `to_dataframe` in parts of so many rows, for a study that is larger than the memory; one part may be empty."""
         import pandas as pd
 
-        names = dict.fromkeys(name for record in self._every() for name in _flat(record["metrics"]))
         left, first = self._every(), True
         while (part := list(islice(left, rows))) or first:
-            facts = {name: [one[name] for one in part] for name in _FIELDS}
-            numbers = [_flat(one["metrics"]) for one in part]
-            metrics = {name: np.array([some.get(name) for some in numbers], dtype=float) for name in names}
-            frame = pd.DataFrame({**facts, **metrics}).astype({"error": float})
-            frame.attrs["units"] = {name: unit for name, unit in self.units.items() if unit not in ("", "1")}
-            yield frame
+            facts = {name: [one[name] for one in part] for name in FIELDS}
+            numbers = [flat(one["metrics"]) for one in part]
+            metrics = {name: np.array([some.get(name) for some in numbers], dtype=float) for name in self.units}
+            yield in_units(pd.DataFrame({**facts, **metrics}).astype({"error": float}), self.units)
             first = False
 
     def _every(self) -> Iterator[Record]:
@@ -160,11 +162,6 @@ def _to_look_at(comparison: ScenarioComparison) -> Iterator[str]:
     for name, some in comparison.to_look_at.items():
         for what, options in some.items():
             yield f"{name}, {what}: {shlex.join(['fpirhc', 'run', task, name, *options])}"
-
-
-def _flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
-    """Numbers by 'metric.element', and by 'metric' where there is one number."""
-    return {f"{name}.{e}" if e else name: value for name, some in metrics.items() for e, value in some.items()}
 
 
 def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:

@@ -6,8 +6,8 @@ import heapq
 import itertools
 import time
 from array import array
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,8 @@ from fpirhc.studies.scenarios.cluster import Cluster, Workers
 from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.studies.scenarios.fingerprint import fingerprint
 from fpirhc.studies.scenarios.ledger import Ledger, Records, begun_with, header_of
-from fpirhc.studies.scenarios.paired import Summary, noun, summarise, verdict
+from fpirhc.studies.scenarios.paired import Record, Summary, noun, summarise, verdict
+from fpirhc.studies.scenarios.parquet import FOLDER, ParquetFolder
 from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
 from fpirhc.studies.scenarios.worker import Job, answered
 from fpirhc.studies.tuned_file import with_tuned
@@ -64,6 +65,7 @@ def compare_scenarios(
     tuned: Mapping[str, Values] | None = None,
     tuning: Mapping[str, str] | None = None,
     compiled: bool = True,
+    parquet: bool = False,
     command: str = "",
     progress: Progress | None = None,
 ) -> ScenarioComparison:
@@ -86,6 +88,7 @@ def compare_scenarios(
         tuned: settings to change, by controller and path.
         tuning: sentences about the origin of these settings, by controller.
         compiled: whether runs use compiled C.
+        parquet: whether all finished scenarios of `folder` are written to its `scenarios.parquet` too, while they come.
         command: the command line, for the report.
         progress: function of (controller, scenarios done, scenarios in all) that is called after every scenario.
 
@@ -94,7 +97,7 @@ def compare_scenarios(
         InvalidProblem: unknown controllers or settings, gains of the wrong sign, draws that could leave physical
             bounds.
         OutputError: the folder cannot be written, or holds results under other conditions.
-        NotSupported: Dask is not installed.
+        NotSupported: Dask, or pyarrow for Parquet, is not installed.
         WorkerDied: processes die again and again, or the scheduler of a cluster is gone.
     """
     begin = time.perf_counter()
@@ -118,10 +121,14 @@ def compare_scenarios(
     )
     bench, header = Bench(task, conditions), fingerprint(task, conditions)
     opening = {"path": str(task.path.resolve()), "tuned": tuned or {}, "conditions": asdict(conditions)}
-    with Ledger(folder / LEDGER, header, RecordFields) as ledger:
+    with Ledger(folder / LEDGER, header, RecordFields) as ledger, ExitStack() as closing_table:
         # a folder that is refused begins no cluster
         workers = _workers(opening, header, processes, cluster)
-        records, skipped = _completed(ledger, bench, workers, numbers, names, progress)
+        adds = [ledger.append]
+        if parquet:
+            table = ParquetFolder(folder / FOLDER, ledger.records, task.metrics, task.problem)
+            adds.append(closing_table.enter_context(table).add)
+        records, skipped = _completed(ledger.records, adds, bench, workers, numbers, names, progress)
     summaries = _summaries(records, seed, task.metrics, figure)
     return ScenarioComparison(
         count=len(numbers),
@@ -195,7 +202,8 @@ def _of_shard(numbers: Sequence[int], part: int, parts: int) -> Sequence[int]:
 
 
 def _completed(
-    ledger: Ledger,
+    records: Records,
+    adds: Sequence[Callable[[Record], None]],
     bench: Bench,
     workers: Workers | Cluster | None,
     numbers: Sequence[int],
@@ -203,7 +211,7 @@ def _completed(
     progress: Progress | None,
 ) -> tuple[dict[str, Records], dict[str, str]]:
     """Run the jobs that the ledger lacks; return all records by controller in order, and the skipped with reasons."""
-    records, places = ledger.records, {name: np.full(max(numbers) + 1, -1, dtype=np.int32) for name in names}
+    places = {name: np.full(max(numbers) + 1, -1, dtype=np.int32) for name in names}
     for place, record in enumerate(records):
         if record["controller"] in places and record["scenario"] <= max(numbers):
             places[record["controller"]][record["scenario"]] = place
@@ -220,7 +228,8 @@ def _completed(
             if "skipped" in record:
                 skipped[name] = record["skipped"]
             else:
-                ledger.append(record)
+                for add in adds:
+                    add(record)
                 places[name][record["scenario"]] = len(records) - 1
             done[name] += 1
             if progress:
