@@ -26,6 +26,7 @@ from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run, judged_motion
+from fpirhc.simulation.simulate import Simulator
 from fpirhc.summary import beside
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.problem import Problem
@@ -193,6 +194,7 @@ class Trials:
         self._later = replace(problem, duration=end) if later else None
         self._model = ModelAsPlant(self.problem, seed=0)
         self._bare = loop_of(self.problem, bare)
+        self._counted: Latest[ErrorPair] = Latest(4)
 
     @cached_property
     def _plain(self) -> Run:
@@ -215,7 +217,7 @@ class Trials:
             return None, null
         real = errors_of(self.problem, (self._plain, loop.run(seed=0, variant=self.problem)), names)
         if self._later is not None and not real.passes:
-            real = errors_of(self._later, (self._plain_later, loop.run(seed=0, variant=self._later)), names)
+            real = self._where_errors_count(self._later, loop)
         return real, null
 
     def counted(self, controller: Controller) -> ErrorPair | None:
@@ -226,9 +228,14 @@ class Trials:
         """
         if self._later is None or not self.problem.equations_known:
             return None
-        loop = loop_of(self.problem, controller)
-        runs = self._plain_later, loop.run(seed=0, variant=self._later)
-        return errors_of(self._later, runs, weighed(self.problem, loop.controller))
+        return self._where_errors_count(self._later, loop_of(self.problem, controller))
+
+    def _where_errors_count(self, later: Problem, loop: Simulator) -> ErrorPair:
+        def made() -> ErrorPair:
+            runs = self._plain_later, loop.run(seed=0, variant=later)
+            return errors_of(later, runs, weighed(self.problem, loop.controller))
+
+        return self._counted.of((loop,), (), made)
 
 
 CYCLES = 300  # of a run

@@ -9,6 +9,7 @@ from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linearisation import Linearisation
 from fpirhc.simulation.linearise.slopes import Step
 from fpirhc.simulation.model_as_plant import shortened
+from fpirhc.simulation.trials import Trials
 from fpirhc.symbolic import block
 
 
@@ -57,6 +58,13 @@ def test_what_differs_in_nothing_is_the_same_problem():
     models = NominalRuns(problem).model
     assert models.of(controller) is models.of(task.controllers["RHC"])
     assert models.of(fp.ExactModel(controller)) is not models.of(controller)
+
+
+def test_runs_where_errors_count_are_made_once():
+    task = fp.load_problem("two_mass")
+    trials = Trials(task.problem, task.controllers["CTC"], cycles=300, goes_on=True)
+    adapting = task.controllers["CTC+FPI (eq 6)"]
+    assert trials.counted(adapting) is trials.counted(adapting) is not None
 
 
 def test_plants_from_the_box_are_asked_of_controllers_that_adapt_alone(monkeypatch):
