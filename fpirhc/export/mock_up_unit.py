@@ -20,6 +20,7 @@ import numpy as np
 from fpirhc.errors import package
 from fpirhc.export.binaries import ENDINGS, shared_libraries
 from fpirhc.export.device import Device
+from fpirhc.export.footprint import bytes_here
 from fpirhc.export.targets.c import data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
@@ -106,14 +107,14 @@ def mock_up_unit(device: Device, interface: Interface) -> Mapping[str, str | byt
 
 
 def _sizes(device: Device, contents: Mapping[str, str | bytes]) -> str:
-    """Bytes of each library, and those of the struct of unit.c that every instance allocates, on a processor of 64 bits."""
+    """Bytes of each library, those of the struct of unit.c that every instance allocates on 64 bits, and code and stack here."""
     work, stepper = device.sizes, device.stepper
     data = sum(layout.size for layout in data_of(device).values())
     numbers = 3 * stepper.memory.size + stepper.signals.size + data + work["w"] + device.inputs.size
     words = numbers + stepper.signals["command"].size + work["arg"] + work["res"] + work["iw"] + 3
     libraries = {name: len(data) for name, data in contents.items() if name.startswith("binaries/")}
     lines = [f"{name}: {size} bytes\n" for name, size in libraries.items()]
-    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n"])
+    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n", bytes_here(device)])
 
 
 # Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest

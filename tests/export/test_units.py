@@ -83,7 +83,9 @@ def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_
     symbols = subprocess.run(["nm", "-S", "size.o"], cwd=tmp_path / "in", capture_output=True, text=True, check=True)
     size = re.search(r"\w+ (\w+) \w size_of_it", symbols.stdout)
     assert size is not None
-    assert f"an instance: {int(size[1], 16)} bytes of RAM" in (tmp_path / "sizes.txt").read_text()
+    said = (tmp_path / "sizes.txt").read_text()
+    assert f"an instance: {int(size[1], 16)} bytes of RAM\nhere with -Os: " in said
+    assert said.endswith(" of stack\n")
 
 
 @needs_compiler
