@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
-from operator import itemgetter
+from operator import itemgetter, methodcaller
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,20 +27,22 @@ class _Rows:
     """Rows as tuples, by the metrics and elements that their numbers have: numbers go into columns without being named."""
 
     def __init__(self, records: Iterable[Mapping[str, Any]] = ()) -> None:
-        self.alike: dict[tuple[tuple[str, ...], ...], list[tuple[Any, ...]]] = {}
+        self.alike: dict[
+            tuple[tuple[str, ...], ...], list[tuple[Any, ...]]
+        ] = {}  # metrics first, then elements of each
         self.count = 0
         for record in records:
             self.add(record)
 
     def add(self, record: Mapping[str, Any]) -> None:
         metrics = record["metrics"]
-        layout = tuple([(name, *numbers) for name, numbers in metrics.items()])
-        row = (*_fields(record), *chain.from_iterable([numbers.values() for numbers in metrics.values()]))
-        self.alike.setdefault(layout, []).append(row)
+        numbers = metrics.values()
+        row = (*_fields(record), *chain.from_iterable(map(_values, numbers)))
+        self.alike.setdefault((tuple(metrics), *map(tuple, numbers)), []).append(row)
         self.count += 1
 
 
-_fields = itemgetter(*FIELDS)
+_fields, _values = itemgetter(*FIELDS), methodcaller("values")
 
 
 class ParquetFolder:
@@ -112,9 +114,9 @@ class ParquetFolder:
 
     def _write(self, number: int, rows: _Rows) -> None:
         tables = []
-        for layout, some in rows.alike.items():
+        for (metrics, *every), some in rows.alike.items():
             names = list(FIELDS)
-            for metric, elements in ((self._metrics[name], elements) for name, *elements in layout):
+            for metric, elements in zip(map(self._metrics.__getitem__, metrics), every, strict=True):
                 for element in elements:
                     names.append(metric.key(element))
                     self._units.setdefault(names[-1], metric.unit_of(self._problem, element))
