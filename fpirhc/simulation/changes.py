@@ -83,7 +83,8 @@ def patch(
     """Return places in a loop's memory, and the values that these settings and what follows from them have there.
 
     Args:
-        deployed: whether what follows from them stays that of the build, as on a device without Python.
+        deployed: whether what is computed from them stays that of the build, as on a device without Python; automatic
+            settings do not.
 
     Raises:
         NotSupported: something that follows from them must not stay.

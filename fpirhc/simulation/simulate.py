@@ -134,7 +134,8 @@ class Simulator:
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build. None: those that are held.
             changes: numbers of live settings from a time on, by time in s.
-            deployed: whether a change is that of a device without Python: what follows from the settings stays that of the build.
+            deployed: whether a change is that of a device without Python: what is computed from the settings stays that of the
+                build, but for automatic settings.
             setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
         Raises:
