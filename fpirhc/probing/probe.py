@@ -312,6 +312,7 @@ _LONGEST = 2000  # cycles
 _WORSE = 1.03  # largest ratio of any coordinate's error to that of the controller alone
 _WORTH = 0.95
 _LARGER = 1.5  # ratio of its errors with that gain and with its own
+_CLEARLY = 0.97  # ratio of errors, from which a larger share counts
 _SHARE = ", share "
 _SPARE = 1.2  # times the steps of a trial that a budget of chatter has to be; those of other runs differ
 _SEEDS = 3  # of the trials of the best candidate
@@ -375,15 +376,16 @@ class OnPlant:
     def walk(self, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int) -> dict[str, Trial]:
         """Return trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none.
 
-        The best one is run with other seeds too, and counts with its largest errors: what rings at times may have been lucky.
+        A larger share counts where it is clearly better: of shares that are alike the smallest is kept. The best one is run with
+        other seeds too, and counts with its largest errors: what rings at times may have been lucky.
         """
         results: dict[str, Trial] = {}
-        new, proven, again = dict(shortlist), set(), set()
+        new, proven, again, needed = dict(shortlist), set(), set(), np.inf
         while True:
             outcomes = {name: self.trial(one.deformation, seed) for name, one in new.items()}
             notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
-            results |= {name: one for name, one in outcomes.items() if isinstance(one, Trial)}
-            name, new = best(results), {}
+            results |= {n: one for n, one in outcomes.items() if isinstance(one, Trial) and one.error <= needed}
+            name, new, needed = best(results), {}, np.inf
             if name is None:
                 return results
             chosen = shortlist[name]
@@ -399,7 +401,8 @@ class OnPlant:
             titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
             new = {title: one for title, one in titled.items() if one.deformation not in known}
             # An error falls with the share until the loop is lost, so a smaller one is tried where no larger one is better.
-            new = {title: one for title, one in new.items() if one.setting.is_larger(chosen.setting)} or new
+            larger = {title: one for title, one in new.items() if one.setting.is_larger(chosen.setting)}
+            new, needed = (larger, _CLEARLY * results[name].error) if larger else (new, np.inf)
             shortlist |= new
             if not new and name in again:
                 return results

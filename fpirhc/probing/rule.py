@@ -325,19 +325,14 @@ class Rule:
         return one if self._accepted(one) and not 1 < one.steps < math.inf else None
 
     def beside(self, one: Predicted, tried: Iterable[Predicted]) -> dict[float, Predicted]:
-        """Return by share the next smaller and the next larger share of the same form, safe and calm where this one is safe.
+        """Return by share the next smaller and the next larger share of the same form, which trials have to show.
 
         They are those of the list. Where the next larger one is tried already, it is their geometric mean, down to a ratio of 1.05:
         an error falls with the share until the loop is lost, so the best one is near that limit.
         """
         known = {other.setting.share for other in tried if other.setting.form == one.setting.form}
         neighbours = [self._predicted(one.setting.with_share(share)) for share in _between(one.setting.share, known)]
-        safe = self._safe(one)
-        return {
-            other.setting.share: other
-            for other in neighbours
-            if (other.steps <= 1 and self._safe(other) if safe else self._accepted(other))
-        }
+        return {other.setting.share: other for other in neighbours if self._accepted(other)}
 
     def _daring(self, one: Predicted) -> bool:
         """Whether it keeps its margins at the estimate alone."""

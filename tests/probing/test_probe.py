@@ -232,6 +232,28 @@ def test_shares_between_two_that_are_tried_are_finer_towards_the_larger_one():
     assert set(_between(1.0, {0.65, 1.0})) == set()
 
 
+def test_shares_beside_the_best_one_are_tried_whatever_is_predicted_of_them(monkeypatch):
+    """A margin at the ends of the likelihood refused a larger share that the plant bears with 1.4 times its gain."""
+    monkeypatch.setattr(Rule, "_predicted", lambda _, one: Predicted(one, fp.Identity(), np.inf, np.inf))
+    monkeypatch.setattr(Rule, "_accepted", lambda *_: True)
+    monkeypatch.setattr(Rule, "_safe", lambda _, one: one.setting.share <= 0.25)
+    best_one = Predicted(Setting(True, 0.25, 0.0, (0.0,), (0.0,), 0.0), fp.Identity(), 0.1, 0.5)
+    assert set(Rule.__new__(Rule).beside(best_one, [best_one])) == {0.16, 0.4}
+
+
+@pytest.mark.parametrize(("error", "kept"), [(0.29, ["bold"]), (0.2, ["bold", "bold, share 0.4"])])
+def test_of_shares_that_are_alike_the_smallest_is_kept(monkeypatch, error, kept):
+    """With errors that hardly depend on the share every larger one was tried with three seeds and a larger gain."""
+    small, large = (
+        Predicted(Setting(True, g, 0.0, (0.0,), (0.0,), 0.0), fp.Affine(gain=-g), 0.1, 0.5) for g in (0.25, 0.4)
+    )
+    errors = {small.deformation: 0.295, large.deformation: error}
+    monkeypatch.setattr(OnPlant, "trial", lambda _, one, *__, **___: Trial(errors.get(one, error), 0.3))
+    monkeypatch.setattr(OnPlant, "_seeds", lambda *_: [1])
+    rule = cast(Rule, SimpleNamespace(beside=lambda *_: {0.4: large}))
+    assert list(OnPlant(body_problem(1.0), RHC).walk(rule, {"bold": small}, [], 1)) == kept
+
+
 def test_a_candidate_lags_as_estimated_without_a_dead_time():
     """A mirror that knows the dead time too leaves it as it is."""
     rule = Rule.__new__(Rule)
