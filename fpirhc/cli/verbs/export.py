@@ -35,7 +35,7 @@ def _add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bare", action="store_true", help=text)
     text = "build what was exported, here or for an emulated Cortex-M7, run the plant with it, and say how far apart the runs are"
     parser.add_argument("--check", action="store_true", help=text)
-    text = "write misra.md too: where the C deviates from MISRA C:2012 and why, by cppcheck, in a minute or two"
+    text = "write misra.md too: where the C deviates from MISRA C:2012 and why, by cppcheck, in minutes"
     parser.add_argument("--misra", action="store_true", help=text)
 
 
