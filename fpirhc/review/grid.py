@@ -329,6 +329,19 @@ class ReviewGrid:
         """Inputs that the reference needs with these parameters, shape (m, nu)."""
         return each(self.problem.plant.equations.inverse, self.states, self.responses, self._rows(parameters))
 
+    def with_exact(self, parameters: np.ndarray) -> ReviewGrid:
+        """Return the points of a plant with these exact parameters and inner states of its own; itself where they are the same."""
+        if not self.inner or np.array_equal(parameters, self.draws[0]):
+            return self
+        return _MODELS.of((self,), (parameters.tobytes(),), lambda: self._moved(parameters))
+
+    def _moved(self, parameters: np.ndarray) -> ReviewGrid:
+        [motion] = inner_motion(self.problem, self.inner, parameters[None, :], self.times)
+        states = self.states.copy()
+        if motion is not None:
+            states[:, list(self.inner)] = motion
+        return replace(self, states=states, draws=np.vstack([parameters[None, :], self.draws[1:]]))
+
     def requests(self, believed: np.ndarray) -> np.ndarray:
         """Requests r* of a controller with the believed parameters along the reference, shape (m, n)."""
         function = self.problem.plant.equations.controlled_response
@@ -339,6 +352,9 @@ class ReviewGrid:
 
 
 _REFERENCES: Latest[Evaluator] = Latest(4)  # at so many times
+
+
+_MODELS: Latest[ReviewGrid] = Latest(4)
 
 
 def review_grid(problem: Problem, mismatch: float, seed: int) -> ReviewGrid:

@@ -164,7 +164,8 @@ class Points:
         """Return the linear loop at a point where the plant is the model."""
         if place not in self._ideals:
             believed = self.asked.controller.plant_model(self.grid.problem).parameters(self.grid.problem.plant)
-            quiet = self._quiet(place, self.grid.states[place], self.grid.needed(believed)[place], believed)
+            own = self.grid.with_exact(believed)
+            quiet = self._quiet(place, own.states[place], own.needed(believed)[place], believed)
             self._ideals[place] = self._linear.at(quiet)
         return self._ideals[place]
 
@@ -219,10 +220,10 @@ class Points:
         whole = np.full((self._cycles, asked.problem.real_plant.state.size), np.nan)
         whole[:, list(known.values())] = led[:, list(known)]
         quiet = asked.quietest(asked.run(start, self._cycles, whole, self._fixed_point(state, command)))
-        if not asked.quick or asked.inside(quiet) or not asked.has_room(command):
+        if asked.inside(quiet) or not (asked.has_room(command) and asked.feasible(quiet)):
             return quiet
-        # Integrals of a law without a model find their place by errors alone.
-        free = asked.quietest(asked.run(start, max(_CYCLES, self._cycles)))
+        # Integrals of a law without a model, and plans of a wrong one, find their place by errors alone.
+        free = asked.quietest(asked.run(start, max(_CYCLES, self._cycles) if asked.quick else self._cycles))
         return free if asked.inside(free) else quiet
 
     @cached_property
@@ -266,7 +267,7 @@ def ideal_loops(grid: ReviewGrid, controller: Controller, count: int) -> list[Li
 
 def ideal_places(grid: ReviewGrid, believed: np.ndarray, count: int) -> list[int]:
     """Return points of the reference at which a model with these parameters has a finite inverse."""
-    return thinned(_finite(grid.needed(believed), "model's inverse"), count)
+    return thinned(_finite(grid.with_exact(believed).needed(believed), "model's inverse"), count)
 
 
 def usable(grid: ReviewGrid) -> list[int]:

@@ -15,8 +15,8 @@ from reviewed import about, answer
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import loops_along, own_loops, points_of
-from fpirhc.review.questions.horizon import plan_gain
+from fpirhc.review.loops import Points, loops_along, own_loops, points_of
+from fpirhc.review.questions.horizon import horizon_long_enough, plan_gain
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 
 STEP = 0.05  # s
@@ -216,3 +216,20 @@ def test_a_plan_that_feeds_no_state_back_says_nothing_about_its_horizon():
     found = answer(problem, PLAIN, "horizon long")
     assert found.verdict == "unknown"
     assert found.evidence == "3 s; near the reference the plan feeds no state back, whatever its length"
+
+
+def test_a_loop_does_not_depend_on_what_was_asked_before():
+    """On the reference the plan of a wrong model stands at a limit, where nothing has a size by which other points are scaled.
+
+    The model's own loop at rest decays as its run does, by 0.96 a cycle, whether it is asked first or last.
+    """
+    task = fp.load_problem("diabetes")
+    grid = review_grid(task.problem, 0.0, 0)
+    first = Points(grid, task.controllers["RHC"]).ideal(0).radius
+    found = loops_along(grid, task.controllers["RHC"])
+    assert found.ideal is not None
+    assert found.ideal.radius == pytest.approx(first, rel=1e-4)
+    assert 0.95 < first < found.radii.max() < 0.99
+    horizon = horizon_long_enough(grid)
+    assert horizon is not None
+    assert horizon.numbers["growth"] * task.problem.period == pytest.approx(np.log(first), abs=0.01)

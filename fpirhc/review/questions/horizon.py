@@ -36,6 +36,7 @@ from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 LONG_ENOUGH = "Is the horizon long enough?"
 _SAME = 0.1  # relative change of the plan's feedback
 _LITTLE = 0.1  # growth over the run, as a share, that the run does not show
+_REST = 1e-10  # change of a state in a stage, as a share of the largest, below which it rests
 _STILL = 1e-6  # of a growth per stage: a mode that neither decays nor grows
 
 
@@ -45,6 +46,7 @@ def horizon_long_enough(grid: ReviewGrid) -> Answer | None:
     if problem.horizon is None or problem.cost is None:
         return None
     reach, unit = float(problem.horizon.nodes[-1]), problem.time_unit
+    grid = grid.with_exact(plant.approximate)
     try:
         first, second = (plan_gain(problem, one, grid.states_at) for one in (problem.horizon, _longer(problem.horizon)))
     except (FpirhcError, np.linalg.LinAlgError) as error:
@@ -122,13 +124,19 @@ def _longer(horizon: Horizon) -> Horizon:
 def _motion(
     ocp: OptimalControl, inverse: ca.Function, state: np.ndarray, responses: np.ndarray, data: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States (ns, N + 1) and inputs (nu, N) of the model with the responses of the reference."""
+    """States (ns, N + 1) and inputs (nu, N) of the model with the responses of the reference.
+
+    A model at rest stays there: what rounding makes of it grows where the inverse does not converge.
+    """
+    held = np.ptp(responses, axis=1).max() <= _REST * max(1.0, np.abs(responses).max())
     inputs = [np.asarray(inverse(state, responses[:, 0], p).full()).ravel()]
     columns = [np.asarray(ocp.start(state, inputs[0]).full()).ravel()]
     for k in range(ocp.stages):
         if k:
             inputs.append(np.asarray(inverse(columns[k][: len(state)], responses[:, k], p).full()).ravel())
         columns.append(np.asarray(ocp.dynamics(columns[k], inputs[k], data[:, k]).full()).ravel())
+        if not k and held and np.abs(columns[1] - columns[0]).max() <= _REST * max(1.0, np.abs(columns[0]).max()):
+            return np.tile(columns[0][:, None], ocp.stages + 1), np.tile(inputs[0][:, None], ocp.stages)
     return np.column_stack(columns), np.column_stack(inputs)
 
 

@@ -30,6 +30,7 @@ class Linearisation:
         self.asked = asked
         self._poles, self._noises = (places_of(name, asked.loop) for name in (POLE, NOISE))
         self._known: dict[bytes, list[Directions]] = {}  # of the points of `at`
+        self._at_limits: dict[bytes, np.ndarray] = {}  # scales at points of commands at limits
 
     def at(self, memory: np.ndarray) -> LinearLoop:
         """Return the linear loop of the period that begins at a memory; entries of long delay lines are not written out."""
@@ -80,9 +81,10 @@ class Linearisation:
         if self._noise is None:
             raise NotSupported("no sensor has noise")
         period = self.asked.period(memory)
-        ways = [[self._noise.way(at, self._scales(period[0]))] for at in period]
+        scales = self._scales(period[0])
+        ways = [[self._noise.way(at, scales)] for at in period]
         directions = self._directions(ways, self._noise.width, None)
-        plain = self._linear(directions, 0, self._scales(period[0])[self._places], self.asked.command)
+        plain = self._linear(directions, 0, scales, self.asked.command)
         return plain.with_noise([at.kicked[0][1][self.asked.command] for at in directions], correlation)
 
     @cached_property
@@ -118,11 +120,9 @@ class Linearisation:
         scales, names = self._scales(periods[0][0]), [b"".join(map(bytes, period)) for period in periods]
         ways = [[self.asked.step.way(at, scales) for at in together] for together in zip(*periods, strict=True)]
         directions = self._directions(ways, self.asked.step.width, self._known.get(names[-1]))
-        if len(periods) == 1:
+        if len(periods) == 1 and self._sizes is not None:
             self._known[names[0]] = directions
-        return tuple(
-            self._linear(directions, k, scales[self._places], self.asked.arriving) for k in range(len(periods))
-        )
+        return tuple(self._linear(directions, k, scales, self.asked.arriving) for k in range(len(periods)))
 
     @property
     def _places(self) -> np.ndarray:
@@ -137,7 +137,7 @@ class Linearisation:
 
     def _linear(self, directions: list[Directions], number: int, scales: np.ndarray, sent: slice) -> LinearLoop:
         """The linear loop of one of the ways of every cycle, and the commands in one place of the trace."""
-        cycles, shaken = [], None if self._sizes is None else self._sizes[self._noises]
+        cycles, shaken, scales = [], scales[self._noises], scales[self._places]
         for at, later in zip(directions, [*directions[1:], directions[0]], strict=True):
             state, onto, kicked = at.basis[self.asked.state] * scales[:, None], later.basis.T, at.kicked[number][0]
             entry = onto @ kicked if not self._noises else onto[:, self._noises] / shaken
@@ -156,10 +156,19 @@ class Linearisation:
         return ~fixed
 
     def _scales(self, memory: np.ndarray) -> np.ndarray:
-        """The size by which every entry deviates at the first point where states and inputs deviate by their own sizes."""
-        if self._sizes is None:
+        """The size by which every entry deviates where states and inputs deviate by their own sizes.
+
+        It is that of the first point inside the limits, for at a limit a plan feeds nothing back, and most deviates by nothing.
+        """
+        if self._sizes is not None:
+            return self._sizes
+        if self.asked.inside(memory):
             self._sizes = self._deviations(memory)
-        return self._sizes
+            return self._sizes
+        name = memory.tobytes()
+        if name not in self._at_limits:
+            self._at_limits[name] = self._deviations(memory)
+        return self._at_limits[name]
 
     _sizes: np.ndarray | None = None
 
