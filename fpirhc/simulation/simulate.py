@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import factors_along, identified_factor, jacobians_along
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import name_in_task
+from fpirhc.controllers.contract import innermost, name_in_task
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.controllers.reference_states import own_signals
 from fpirhc.describe import describe
@@ -48,7 +48,7 @@ Compiled: TypeAlias = tuple[Evaluator, bool, str]  # whether it is compiled, and
 Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 _TOO_SHORT = "compiled=None was given, and the run is short"
-_SHORT_RUN = 100_000  # cycles times stages, below which a compiler takes longer than the virtual machine
+_SHORT_RUN = 150_000  # cycles times stages of plans, below which a compiler takes longer than the virtual machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,8 +287,8 @@ class ComposedLoop:
 
     def worth_compiling(self, compiled: bool | None) -> bool:
         """Return whether a compiler is asked; `compiled` as in `simulator`."""
-        horizon = self.problem.horizon
-        long = self.problem.cycles * (horizon.stages if horizon is not None else 1) > _SHORT_RUN
+        horizon, plans = self.problem.horizon, innermost(self.live.controller).planner is not None
+        long = self.problem.cycles * (horizon.stages if plans and horizon is not None else 1) > _SHORT_RUN
         return bool(compiled or (compiled is None and long))
 
     @property

@@ -20,9 +20,11 @@ from fpirhc.cli.main import main
 from fpirhc.cli.verb import ExitCode
 from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidValue, ProblemFileError
 from fpirhc.problem_files.problem_file import Task, in_case
+from fpirhc.simulation import simulate
 from fpirhc.studies.comparison.compare import check_gains
 from fpirhc.studies.scenarios.bench import Bench, Conditions, scenarios
 from fpirhc.studies.scenarios.draws import COMPARING
+from fpirhc.symbolic.native import find_compiler
 
 CASES = """
 cases = fp.Cases({
@@ -84,6 +86,20 @@ def test_the_run_of_a_case_is_that_of_its_problem(task):
     loops = {id(one) for (owner, _), one in bench._simulators.items() if owner == "CTC"}
     # 'weak', 'stiff' and 'narrow' have the loop of 'usual': exact parameters and limits are data.
     assert len(loops) == len(task.cases.names) - 3
+
+
+@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+def test_a_loop_that_serves_one_case_is_compiled_where_its_run_is_long(task, monkeypatch):
+    """A compiler takes longer than a short run; the numbers are the same."""
+    bench = Bench(task, Conditions(3, COMPARING, 0.0, compiled=True, named=True))
+    interpreted = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))
+    for name, compiled in (("usual", True), ("known", False)):
+        number = task.cases.names.index(name)
+        assert bench._simulator("CTC", bench._scenario(number)).compiled == compiled
+        assert bench.record(number, "CTC")["metrics"] == interpreted.record(number, "CTC")["metrics"]
+    monkeypatch.setattr(simulate, "_SHORT_RUN", 0)
+    long = Bench(task, Conditions(3, COMPARING, 0.0, compiled=True, named=True))
+    assert long._simulator("CTC", long._scenario(task.cases.names.index("known"))).compiled
 
 
 def test_dead_times_are_data_where_the_longest_is_stated(task):

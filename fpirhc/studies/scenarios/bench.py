@@ -245,8 +245,11 @@ class Bench:
     def _built(self, name: str, scenario: Scenario) -> Simulator | FpirhcError:
         live, compiled = self._live.get(name, ()), self._conditions.compiled
         compile_it = compiled if compiled is not None else bool(live)
+        once = scenario.alone and compile_it and not live  # a loop that runs once: compiled where the run is long
         try:
             controller = self._scenarios.automatic(self._task.controllers[name])
+            if once:
+                return built(scenario.built, controller, None, (), (), self._known)
             shared = self._shared_loop(name, controller, scenario.shared, compile_it) if scenario.shared else None
             if shared is not None:
                 checked(scenario.built, controller)

@@ -92,6 +92,7 @@ class Scenario:
         built: the problem for which the loop is built.
         problem: the same with the scenario's exact parameters.
         shared: what decides a loop with live settings that serves more scenarios; None: there is none.
+        alone: whether no other scenario has its loop, with or without live settings.
     """
 
     name: str
@@ -102,6 +103,7 @@ class Scenario:
     built: Problem
     problem: Problem
     shared: Shared | None = None
+    alone: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +205,8 @@ class NamedCases(Scenarios):
         exact = np.array([one.exact for one in moved.parameters.values()])
         mismatch = _mismatch(problem.plant, moved, exact)
         group, seed = self.cases.group(name), seed if own is None else own
-        return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built))
+        alone = self._alike[self.cases.key(name, self._data)] == 1
+        return Scenario(name, group, seed, mismatch, key, built, problem, self._shared(name, built), alone)
 
     def options(self, number: int) -> tuple[str, ...]:
         name = self.cases.names[number]
