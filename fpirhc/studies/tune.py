@@ -58,7 +58,7 @@ class TunedController(FoundByName):
 
 
 @dataclass(frozen=True, eq=False)
-class Tuning:
+class Tuning(FoundByName):
     """The result of `tune`.
 
     Args:
