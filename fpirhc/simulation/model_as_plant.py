@@ -113,8 +113,8 @@ class ModelAsPlant:
 
     def _part(self, before: int) -> Progress | None:
         """What a run tells that has so many before it in a pair."""
-        told = self._progress
-        return told and (lambda done, total: told(before * total + done, 2 * total))
+        report = self._progress
+        return report and (lambda done, total: report(before * total + done, 2 * total))
 
     def run(self, loop: Simulator, model: Problem, progress: Progress | None = None) -> Run:
         """Return the run of a loop, of the problem, on one of the models."""

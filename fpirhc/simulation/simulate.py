@@ -47,7 +47,7 @@ Progress = Callable[[int, int], None]
 Compiled: TypeAlias = tuple[Evaluator, bool, str]  # whether it is compiled, and why not
 Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
-_TOO_SHORT = "compiled=None was given, and the run is short"
+_TOO_SHORT = "the run is short, and a compiler would take longer"
 _SHORT_RUN = 150_000  # cycles times stages of plans, below which a compiler takes longer than the virtual machine
 
 
@@ -93,7 +93,8 @@ class Simulator:
         loop = close_loop(problem, live.controller, live if live.paths else None)
         if loop.function.serialize() == self.loop.function.serialize():
             return replace(self, problem=problem, controller=live.controller, loop=loop, live=live)
-        return replace(built(problem, self.live.unresolved, self.compiled, (), self.live.paths), held=self.held)
+        anew = ComposedLoop.of(problem, self.live.unresolved, self.live.paths)
+        return replace(anew.simulator(self.compiled), held=self.held)
 
     @property
     def remembers(self) -> bool:
@@ -248,22 +249,7 @@ def simulator(
         NotSupported: a setting that decides what the loop is made of, or that this loop needs as a number.
         CompileError: the compiler fails on a loop with live settings.
     """
-    return built(problem, controller, compiled, flags, live)
-
-
-def built(
-    problem: Problem,
-    controller: Controller,
-    compiled: bool | None,
-    flags: Sequence[str],
-    live: Sequence[str],
-    known: dict[object, Compiled] | None = None,
-) -> Simulator:
-    """Return what `simulator` does; a loop whose code is `known` is not compiled again, and `known` gets that of every other one.
-
-    Loops of one code differ in their first memory alone, as those of most starts do.
-    """
-    return ComposedLoop.of(problem, controller, live).simulator(compiled, flags, known)
+    return ComposedLoop.of(problem, controller, live).simulator(compiled, flags)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +285,11 @@ class ComposedLoop:
     def simulator(
         self, compiled: bool | None, flags: Sequence[str] = (), known: dict[object, Compiled] | None = None
     ) -> Simulator:
-        """Return the loop ready to run; arguments as in `built`."""
+        """Return the loop ready to run.
+
+        A loop whose code is `known` is not compiled again, and `known` gets that of every other one: loops of one code differ in
+        their first memory alone, as those of most starts do.
+        """
         ready, worth = self.live.controller, self.worth_compiling(compiled)
         if known is None:
             return Simulator(self.problem, ready, self.loop, *self._code(compiled, flags), self.live)

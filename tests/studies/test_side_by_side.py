@@ -16,7 +16,7 @@ import tasks
 import fpirhc as fp
 from fpirhc.errors import NoCode
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.simulation.simulate import Simulator, built
+from fpirhc.simulation.simulate import ComposedLoop, Simulator
 from fpirhc.studies.scenarios import scenario_study
 from fpirhc.studies.scenarios.bench import Bench, Conditions, ranges, relative_error
 from fpirhc.studies.scenarios.draws import COMPARING
@@ -154,12 +154,13 @@ def test_one_case_that_cannot_be_summed_up_leaves_the_others_alone() -> None:
 def test_a_loop_without_lanes_is_built_once_for_every_run_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     """A solver that starts at its last solution needs a new loop for every run, and no second one to ask for lanes."""
     made: list[object] = []
+    simulator = ComposedLoop.simulator
 
     def counted(*given: Any, **named: Any) -> Simulator:
         made.append(given)
-        return built(*given, **named)
+        return simulator(*given, **named)
 
-    monkeypatch.setattr("fpirhc.studies.scenarios.bench.built", counted)
+    monkeypatch.setattr(ComposedLoop, "simulator", counted)
     monkeypatch.setattr("fpirhc.simulation.simulate.Simulator.remembers", True)
     own = replace(
         short(tasks.two_mass),

@@ -228,11 +228,11 @@ def _skipping(name: str, skipped: dict[str, str]) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class _Composed:
-    """A controller before its compilers have ended: its loop, and its step by hand, None where that is broken."""
+    """A controller before its compilers have ended: its loop, and the step by hand, None where that is broken."""
 
     ready: Controller
     loop: ComposedLoop
-    step: ComposedStep | None
+    by_hand: ComposedStep | None
     changes: Changes
     broken: tuple[str, ...]
 
@@ -240,8 +240,8 @@ class _Composed:
         """Start the compilers of both."""
         if self.loop.worth_compiling(compiled):
             begin(self.loop.function, calls=self.loop.calls)
-            if self.step is not None:
-                begin(self.step.function)
+            if self.by_hand is not None:
+                begin(self.by_hand.function)
 
 
 def _composed(
@@ -279,7 +279,7 @@ def _entry(
     part = partial(attempted, broken=broken)
     metrics = measure(problem, run, task.metrics)
     view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
-    stepper = part(_CYCLE, Stepper.of, composed.step, compiled=compiled) if composed.step else None
+    stepper = part(_CYCLE, Stepper.of, composed.by_hand, compiled=compiled) if composed.by_hand else None
     built[name], told = Built(loop, stepper), [view.text] if view else []
     contraction = part("the contraction", _contraction, problem, ready, run, metrics)
     optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)

@@ -24,7 +24,7 @@ from fpirhc.simulation.metrics import Metric, Metrics, measure
 from fpirhc.simulation.metrics.base import first_measured
 from fpirhc.simulation.pictures.base import NOT_DRAWN, Kept, Picture
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import JUDGING, Compiled, Simulator, built, with_judgements
+from fpirhc.simulation.simulate import JUDGING, Compiled, ComposedLoop, Simulator, with_judgements
 from fpirhc.studies.comparison.causes import error_left_alone
 from fpirhc.studies.scenarios.draws import NamedCases, RandomScenarios, Scenario, Scenarios, Shared, draws_differ
 from fpirhc.studies.view import finite_alone
@@ -248,13 +248,13 @@ class Bench:
         once = scenario.alone and compile_it and not live  # a loop that runs once: compiled where the run is long
         try:
             controller = self._scenarios.automatic(self._task.controllers[name])
-            if once:
-                return built(scenario.built, controller, None, (), (), self._known)
-            shared = self._shared_loop(name, controller, scenario.shared, compile_it) if scenario.shared else None
+            many = None if once else scenario.shared
+            shared = self._shared_loop(name, controller, many, compile_it) if many else None
             if shared is not None:
                 checked(scenario.built, controller)
                 return shared
-            return built(scenario.built, controller, compile_it, (), live, self._known)
+            loop = ComposedLoop.of(scenario.built, controller, live)
+            return loop.simulator(None if once else compile_it, known=self._known)
         except FpirhcError as error:
             return error
 
@@ -264,7 +264,7 @@ class Bench:
         if key not in self._shared:
             live = (*self._live.get(name, ()), *shared.live)
             try:
-                ready = built(shared.built, controller, compile_it, (), live, self._known)
+                ready = ComposedLoop.of(shared.built, controller, live).simulator(compile_it, known=self._known)
                 self._shared[key] = None if ready.remembers else ready
             except FpirhcError:  # what is wrong in every scenario is said by the loops of their own
                 self._shared[key] = None

@@ -35,11 +35,6 @@ FIELDS = tuple(one.name for one in fields(RecordFields) if one.name != "metrics"
 _UNTUNED = "No file of tuned settings was given: all settings are those of the problem file."
 
 
-def flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
-    """Return numbers by 'metric.element', and by 'metric' where there is one number."""
-    return {f"{name}.{e}" if e else name: value for name, some in metrics.items() for e, value in some.items()}
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScenarioComparison(Study, FoundByName):
     """The result of `compare_scenarios`.
@@ -107,7 +102,7 @@ class ScenarioComparison(Study, FoundByName):
         left, first = self._every(), True
         while (part := list(islice(left, rows))) or first:
             facts = {name: [one[name] for one in part] for name in FIELDS}
-            numbers = [flat(one["metrics"]) for one in part]
+            numbers = [_flat(one["metrics"]) for one in part]
             metrics = {name: np.array([some.get(name) for some in numbers], dtype=float) for name in self.units}
             yield in_units(pd.DataFrame({**facts, **metrics}).astype({"error": float}), self.units)
             first = False
@@ -162,6 +157,11 @@ def _to_look_at(comparison: ScenarioComparison) -> Iterator[str]:
     for name, some in comparison.to_look_at.items():
         for what, options in some.items():
             yield f"{name}, {what}: {shlex.join(['fpirhc', 'run', task, name, *options])}"
+
+
+def _flat(metrics: Mapping[str, Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Numbers by 'metric.element', and by 'metric' where there is one number."""
+    return {f"{name}.{e}" if e else name: value for name, some in metrics.items() for e, value in some.items()}
 
 
 def _controllers(comparison: ScenarioComparison, conditions: str) -> Table:
