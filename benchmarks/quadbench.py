@@ -19,7 +19,6 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -27,6 +26,7 @@ import numpy as np
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.variants import CasesOf
 
 FOLDER = Path(__file__).parents[1] / "problems" / "outside" / "quadbench"
 sys.path.insert(0, str(FOLDER))
@@ -121,13 +121,9 @@ def ours(task: Task, patterns: Sequence[str]) -> dict[str, np.ndarray]:
     if not task.controllers:
         return {}
     with tempfile.TemporaryDirectory() as folder:
-        study = fp.compare_scenarios(task, cases=patterns, seed=0, folder=Path(folder), compiled=False)
-        return {name: np.array([_distance(one) for one in records]) for name, records in study.records.items()}
-
-
-def _distance(record: Mapping[str, Any]) -> float:
-    value = next(iter(record["metrics"]["distance"].values()))
-    return np.nan if value is None else float(value)
+        table = fp.study(task, CasesOf(tuple(patterns)), folder=Path(folder), compiled=False).table
+        distance = next(column for column in table if column.startswith("distance"))
+        return {name: rows[distance].to_numpy(float) for name, rows in table.groupby("controller", sort=False)}
 
 
 def theirs(task: Task, patterns: Sequence[str], names: Sequence[str]) -> dict[str, np.ndarray]:

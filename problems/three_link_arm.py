@@ -104,7 +104,7 @@ problem = fp.Problem(
     limits=fp.Limits(inputs={"tau1": (-80.0, 80.0), "tau2": (-40.0, 40.0), "tau3": (-15.0, 15.0)}),  # N m
     sensing=fp.Sensing(
         dict.fromkeys(plant.coordinates, fp.Sensor(quantum=6.283185 / 4096)),  # rad
-        fp.StateVariableFilter(bandwidth=300.0),  # rad/s
+        fp.SavitzkyGolay(window=9, degree=2),
     ),
     measure_from=10.0,  # s
 )

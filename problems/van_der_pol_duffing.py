@@ -66,14 +66,12 @@ known = {
     "bias": fp.Uncertain(lower=-10.0, upper=10.0, deviation=2.0),
 }
 recursive = fp.RecursiveLeastSquares(known, noise={"q": 3.0}, time=1.0)
-window = fp.MovingHorizon(known, noise={"q": 0.1}, window=50, time=5.0)
 
 controllers = {
     "RHC": plain,
     "RHC+FPI": fp.RecedingHorizon(plain.optimiser, sigmoid),
     "RHC offset-free": fp.Estimating(plain, filter),
     "RHC+RLS": fp.Estimating(plain, recursive),
-    "RHC+MHE": fp.Estimating(plain, window),
     "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI")
@@ -88,5 +86,4 @@ tuning = {
         "estimator.measured.q'": fp.LogSpan(1e-4, 1e-1),  # m/s
     },
     "RHC+RLS": {"estimator.noise.q": fp.LogSpan(0.1, 10.0), "estimator.time": fp.LogSpan(0.5, 20.0)},
-    "RHC+MHE": {"estimator.noise.q": fp.LogSpan(0.1, 10.0), "estimator.time": fp.LogSpan(0.5, 20.0)},
 }
