@@ -9,10 +9,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import make_api
-import make_command_line
 
 make_api.PAGE.write_text(make_api.page(), encoding="utf-8")
-make_command_line.PAGE.write_text(make_command_line.page(), encoding="utf-8")
 
 project = "fpirhc"
 author = "The fpirhc authors"

@@ -19,10 +19,8 @@ def __getattr__(name: str) -> object:
     if name.startswith("_"):  # tools look for such names in whatever they meet, and nobody means a public one by them
         raise AttributeError(f"module 'fpirhc' has no attribute '{name}'")
     from fpirhc.errors import InvalidName, nearest
-    from fpirhc.members import FORMER, adapter_module, public_member
+    from fpirhc.members import adapter_module, public_member
 
-    if name in FORMER:
-        raise InvalidName(f"fpirhc.{name} is called fpirhc.{FORMER[name]} now.")
     member = public_member(name)
     if member is None and (module := adapter_module(name)):
         raise InvalidName(f"fpirhc.{name} is in the module of its adapter; write: from {module} import {name}")

@@ -1,12 +1,12 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .baselines.check import check_baseline
+from .baselines.baseline import check
 from .controllers import rivals
 from .controllers.computed_torque import ComputedTorque, FeedforwardOnly
-from .controllers.receding_horizon import Feedforward, HoldPlan, RecedingHorizon, StopRun
-from .controllers.replanning import FromMeasurement, FromMeasurementTracked, FromPlan
+from .controllers.receding_horizon import RecedingHorizon
+from .controllers.replanning import FromMeasurement, FromPlan
 from .controllers.rivals.pid import PID
-from .controllers.slots.schedules import ByError, ByLookAhead, FixedSchedule, Periodic
+from .controllers.slots.schedules import Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
 from .controllers.wrappers.cascade import Cascade, TargetUnit, ThroughModel
@@ -19,22 +19,16 @@ from .deformation.model_referenced import ModelReferenced
 from .deformation.rfpt import RFPT, RFPTVector
 from .deformation.rotation import Rotation
 from .deformation.sigmoid import Sigmoid
-from .deformation.wrappers.beyond_limit import BeyondLimit
-from .deformation.wrappers.damped import Damped
 from .deformation.wrappers.delayed import Increment, Paired
 from .deformation.wrappers.filtered import Filtered
-from .deformation.wrappers.guarded import Guarded
 from .deformation.wrappers.haar import Haar
-from .deformation.wrappers.self_paired import DelayWatched, SelfPaired
 from .deformation.wrappers.tuned import Tuned
 from .errors import FpirhcError, HarmfulAdaptation
-from .export.processor import Processor
 from .horizon.cost import CustomCost, LQRTerminal, Quadratic
 from .horizon.hessian_models import ExactHessian, GaussNewton
 from .horizon.horizon import Horizon
 from .learning.estimators.base import Uncertain
 from .learning.estimators.disturbance_kalman import DisturbanceKalman
-from .learning.estimators.moving_horizon import MovingHorizon
 from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
 from .learning.rules.lyapunov_rule import LyapunovRule
 from .learning.rules.projection import Projection
@@ -46,7 +40,7 @@ from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
-from .plant.integrators import Cvodes, Euler, ImplicitMidpoint, RadauIIA, RungeKutta4
+from .plant.integrators import Cvodes, Euler, RungeKutta4
 from .plant.motion import Algebraic, Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
@@ -54,11 +48,7 @@ from .probing.probe import probe
 from .problem_files.problem_file import load_problem
 from .problem_files.settings import LogSpan, Span, with_settings
 from .report.html import write_report
-from .review.limits_certificate import certify_limits
-from .review.question import Answer
-from .review.questions.noise import suggest
-from .review.response_prediction import predict_response, tightened
-from .review.review import review
+from .review.review import Answer, review
 from .sensing import (
     LowPassDifference,
     Measured,
@@ -66,13 +56,10 @@ from .sensing import (
     SavitzkyGolay,
     Sensing,
     Sensor,
-    StateVariableFilter,
     StepDifference,
     VelocityDifference,
 )
 from .sensing.observers.kalman_filter import KalmanFilter
-from .sensing.observers.model_states import ModelStates
-from .sensing.observers.moving_horizon_states import MovingHorizonStates
 from .simulation.machine import RunMonitor
 from .simulation.metrics import Metric, figures, measure
 from .simulation.pictures.base import Quantity
@@ -85,10 +72,9 @@ from .simulation.simulate import simulate, simulator
 from .simulation.stepper import Stepper
 from .status import Status
 from .studies.comparison.compare import compare
-from .studies.information import compare_information
+from .studies.limits import limits
 from .studies.open_loop import certify
-from .studies.operating_limits import operating_limits
-from .studies.scenarios.scenario_study import compare_scenarios
+from .studies.study import study
 from .studies.tune import tune
 from .symbolic.layout import Layout
 from .symbolic.live import signed_power
@@ -97,7 +83,7 @@ from .task.dead_time import DeadTime
 from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
 from .task.exogenous import Believed, Known, Samples, Unknown
 from .task.external_plant import ExternalPlant
-from .task.limits import Ellipsoid, Limits, PathConstraint
+from .task.limits import Limits, PathConstraint
 from .task.problem import Problem
 from .task.reality import Reality
 from .task.reference import Table, Trajectory
@@ -114,10 +100,7 @@ __all__ = [
     "Answer",
     "Band",
     "Believed",
-    "BeyondLimit",
     "ByDesired",
-    "ByError",
-    "ByLookAhead",
     "ByModel",
     "Cascade",
     "Cases",
@@ -125,11 +108,8 @@ __all__ = [
     "ComputedTorque",
     "CustomCost",
     "Cvodes",
-    "Damped",
     "DeadTime",
-    "DelayWatched",
     "DisturbanceKalman",
-    "Ellipsoid",
     "Estimating",
     "Euler",
     "ExactHessian",
@@ -137,29 +117,23 @@ __all__ = [
     "Exponential",
     "ExternalPlant",
     "Fatrop",
-    "Feedforward",
     "FeedforwardOnly",
     "Filtered",
     "FixedPoint",
-    "FixedSchedule",
     "Formula",
     "FpirhcError",
     "Fractional",
     "FromMeasurement",
-    "FromMeasurementTracked",
     "FromPlan",
     "FullSpaceFixedPoint",
     "GaussNewton",
     "GradientFixedPoint",
     "Grid",
-    "Guarded",
     "Haar",
     "HarmfulAdaptation",
     "HeatMap",
-    "HoldPlan",
     "Horizon",
     "Identity",
-    "ImplicitMidpoint",
     "Increment",
     "Ipopt",
     "KalmanFilter",
@@ -174,9 +148,6 @@ __all__ = [
     "Measured",
     "Metric",
     "ModelReferenced",
-    "ModelStates",
-    "MovingHorizon",
-    "MovingHorizonStates",
     "Noise",
     "Normal",
     "Osqp",
@@ -193,14 +164,12 @@ __all__ = [
     "PositionDifference",
     "Predicted",
     "Problem",
-    "Processor",
     "Projection",
     "Pulse",
     "Qrqp",
     "Quadratic",
     "Quantity",
     "RFPTVector",
-    "RadauIIA",
     "Raster",
     "Reality",
     "RecedingHorizon",
@@ -212,7 +181,6 @@ __all__ = [
     "RungeKutta4",
     "Samples",
     "SavitzkyGolay",
-    "SelfPaired",
     "Sensing",
     "Sensor",
     "SequentialQuadratic",
@@ -225,12 +193,10 @@ __all__ = [
     "Slotted",
     "Span",
     "Spread",
-    "StateVariableFilter",
     "Status",
     "Step",
     "StepDifference",
     "Stepper",
-    "StopRun",
     "Table",
     "TargetUnit",
     "ThroughModel",
@@ -241,18 +207,15 @@ __all__ = [
     "Unknown",
     "VelocityDifference",
     "certify",
-    "certify_limits",
-    "check_baseline",
+    "check",
     "compare",
-    "compare_information",
-    "compare_scenarios",
     "figures",
     "load_problem",
     "load_run",
     "measure",
-    "operating_limits",
+    "limits",
+    "study",
     "outside",
-    "predict_response",
     "probe",
     "review",
     "rivals",
@@ -260,8 +223,6 @@ __all__ = [
     "simulate",
     "simulator",
     "solve",
-    "suggest",
-    "tightened",
     "tune",
     "with_settings",
     "write_report",

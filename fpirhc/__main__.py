@@ -2,6 +2,6 @@
 
 import sys
 
-from fpirhc.cli.main import main
+from fpirhc.cli import main
 
 sys.exit(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
@@ -16,7 +17,7 @@ def describe(value: Any) -> Any:
     """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
 
     A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. So is one with
-    {"setting": "apart"}, which decides what a study draws and no single run; `fpirhc.content` has it. One with
+    {"setting": "apart"}, which decides what a study draws and no single run. One with
     {"setting": "where given"} is left out while it is empty or its default: a setting that came later makes no earlier baseline
     stale.
     """
@@ -41,6 +42,12 @@ def describe(value: Any) -> Any:
 
 class FunctionName(str):
     """What `describe` has of a function: its numbers count, and not what it is called."""
+
+
+def digest(*values: Any) -> str:
+    """Return 16 hexadecimal digits of settings: what `describe` says, and the code of the functions that it only names."""
+    code = [one.__code__.co_code for value in values for one in _named(value) if hasattr(one, "__code__")]
+    return hashlib.sha256(repr(([*map(describe, values)], code)).encode()).hexdigest()[:16]
 
 
 def identity(value: Any) -> tuple[str, tuple[object, ...]]:

@@ -146,14 +146,6 @@ class CompileError(FpirhcError, RuntimeError):
     """The C compiler failed on generated code."""
 
 
-class DeviceFailed(FpirhcError, RuntimeError):
-    """A device, such as a graphics processor, that did not finish what it was given."""
-
-
-class WorkerDied(FpirhcError, RuntimeError):
-    """Worker processes died repeatedly."""
-
-
 def nearest(name: object, valid: Iterable[str]) -> str:
     """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`, which may be no text.
 

@@ -76,7 +76,7 @@ _REMEDIES = {
     Status.SATURATED: "the command has been at a limit for longer than the stated time; integrals go no further into it: check the "
     "actuator, the sign of its gain, and whether the limits allow the task.",
     Status.NOT_CONTRACTING: "the measured response errors grow from cycle to cycle: the gain is too large or has the wrong sign "
-    "for this plant; lower it, or put Guarded(...) around the map.",
+    "for this plant; lower it.",
     Status.BRIDGED: "cycles without a sample came before this one, lost or not called: estimators and queues were moved over the "
     "gap; look at the sensor's connection, or at what delays the cycles.",
     Status.SETTLING: "more cycles than are bridged went by without a sample: estimators began anew, and what was learned is held "

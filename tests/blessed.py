@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 LINE = '''"""A mass on a line with a wrong gain."""
 import casadi as ca
 import fpirhc as fp
@@ -57,14 +55,3 @@ problem = fp.Problem(
 )
 controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=6.0))}
 '''
-
-
-def write_problems(folder: Path) -> None:
-    """Write both problems and their baselines, measured in the virtual machine."""
-    from fpirhc.baselines.check import accept
-    from fpirhc.problem_files.problem_file import load_problem
-
-    for name, text in (("line", LINE), ("noisy", NOISY)):
-        path = folder / f"{name}.py"
-        path.write_text(text)
-        accept(load_problem(str(path)), "first", baselines=folder / "baselines", compiled=False, working=folder)

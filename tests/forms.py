@@ -96,8 +96,6 @@ FORMS = {
     "late": moved(chain(2), 2, **LATE),
     "late curve": moved(CURVE, 1, **LATE),
     "encoder": moved(chain(2), 2, sensing=fp.Sensing(**ENCODER)),
-    "believed": moved(MASS, 2, sensing=fp.Sensing(**ENCODER, measured=("y",), observer=fp.ModelStates())),
-    "believed map": moved(STEPS, 2, sensing=fp.Sensing(measured=("y",), observer=fp.ModelStates())),
     "reality": moved(chain(2), 2, reality=fp.Reality(MASS, start={"a": 0.1, "w": 0.0})),
     "outside": moved(chain(2), 2, reality=fp.ExternalPlant(Body(), measures=SEEN)),
 }

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -15,7 +14,6 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.simulation.lanes import lanes_library, written_in_lanes
 from fpirhc.symbolic.native import native
 
 REST = fp.Trajectory(lambda t: {"a": 0.3 * ca.sin(t), "b": 0 * t})
@@ -111,31 +109,3 @@ def within_its_arrays(pair_of: Pair, calls: Iterator[tuple[np.ndarray, ...]]) ->
             function(*arguments)
         os._exit(0)
     return os.waitpid(child, 0)[1] == 0
-
-
-def in_lanes(graph: ca.Function, calls: Sequence[Sequence[np.ndarray]]) -> list[list[np.ndarray]]:
-    """Results of calls that run side by side, as many as there are lanes at a time."""
-    (own, *drivers), [callee] = written_in_lanes(graph)
-    sizes = [[graph.numel_in(k) for k in range(graph.n_in())], [graph.numel_out(k) for k in range(graph.n_out())]]
-    ends = [np.cumsum([0, *some]) for some in sizes]
-    rows = [", ".join(f"{base} + {at}" for at in end[:-1]) for base, end in zip(("given", "made"), ends, strict=True)]
-    call = f"""
-int call(const double* from, double* to) {{
-  static V given[{ends[0][-1]}], made[{ends[1][-1]}], w[{callee.room + 1}];
-  const V* arg[] = {{{rows[0]}}};
-  V* res[] = {{{rows[1]}}};
-  memcpy(given, from, sizeof given);
-  if ({callee.name}(arg, res, 0, w, 0)) return 1;
-  memcpy(to, made, sizeof made);
-  return 0;
-}}
-"""
-    library, lanes = lanes_library([own + call, *drivers])
-    results = []
-    for k in range(0, len(calls), lanes):
-        some = [np.concatenate([np.ravel(v, order="F") for v in one]) for one in calls[k : k + lanes]]
-        given = np.ascontiguousarray(np.array([*some, *[some[0]] * (lanes - len(some))], dtype=float).T)
-        made = np.empty((ends[1][-1], lanes))
-        assert library.call(given.ctypes.data_as(ctypes.c_void_p), made.ctypes.data_as(ctypes.c_void_p)) == 0
-        results += [np.split(column, ends[1][1:-1]) for column in made.T[: len(some)]]
-    return results

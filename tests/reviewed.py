@@ -9,12 +9,6 @@ import numpy as np
 from plants import heavy
 
 import fpirhc as fp
-from fpirhc.controllers.contract import resolved
-from fpirhc.review.grid import review_grid
-from fpirhc.review.prediction import NominalRuns
-from fpirhc.review.question import Case, ControllerQuestion, ProblemQuestion, known_questions
-from fpirhc.review.questions.convergence import CONVERGES
-from fpirhc.review.review import predict
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
 
 PERIOD = 1e-3  # s
@@ -40,25 +34,6 @@ def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict
 def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
     [question] = [q for q in result if words in q]
     return result[question]
-
-
-def case(problem: fp.Problem, controller: Any, mismatch: float = 0.0) -> Case:
-    """What one question of a review is asked with; the linear loops are built if it reads them."""
-    grid = review_grid(problem, mismatch, 0)
-    ready = resolved(grid.problem, controller)
-    return Case(grid, ready, NominalRuns(grid.problem))
-
-
-def answer(problem: fp.Problem, controller: Any, words: str, mismatch: float = 0.0) -> Any:
-    """The answer to the question with these words, the others not asked; None where it is not asked of the controller."""
-    of_problem = [q for q in known_questions(ProblemQuestion) if words in q.text]
-    if of_problem:
-        return of_problem[0].ask(review_grid(problem, mismatch, 0))
-    one = case(problem, controller, mismatch)
-    asked = [q for q in known_questions(ControllerQuestion) if words in q.text and q.concerns(one.controller)]
-    if any(q.text == CONVERGES for q in asked):
-        return predict(problem, controller)
-    return next((found for found in (q.ask(one) for q in asked) if found is not None), None)
 
 
 def linear(dynamics: Any, entry: Any, arriving: Any, state: Any, period: float) -> LinearLoop:

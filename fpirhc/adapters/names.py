@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
-from fpirhc.fields.checked import Checked, checked_call
+from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import described
 from fpirhc.plant.plant import Plant
 
@@ -41,29 +40,6 @@ def adapter(function: Callable[P, R]) -> Callable[P, R]:
             raise InvalidProblem(f"{function.__name__}: {words}") from error
 
     return adapted
-
-
-class InMessage(Checked):
-    """A place in a message of a CAN bus: its identifier has 11 bits, or 29, and its format of `struct` is that of one number."""
-
-    identifier: int
-    format: str
-    extended: bool
-
-    def __post_init__(self) -> None:
-        if not re.fullmatch("[@=<>!]?[bBhHiIlLqQefd?]", self.format):
-            raise InvalidValue(
-                f"Field.format: expected that of one number, such as '<f', '>h' or 'B', got {self.format!r}"
-            )
-        bits = 29 if self.extended else 11
-        if self.identifier >> bits:
-            words = f"0x{self.identifier:X} has more than {bits} bits; with extended=True it has 29"
-            raise InvalidValue(f"Field.identifier: {words}")
-
-
-def in_format(format_: str, number: float) -> float:
-    """Return a number as a format of `struct` takes it, which rounds none."""
-    return number if format_[-1] in "efd" else round(number)
 
 
 def finite_numbers(where: str, values: object, names: Iterable[str]) -> np.ndarray:

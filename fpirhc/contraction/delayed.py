@@ -7,16 +7,13 @@ filters the error with a pole. The derivations for large errors stand in docs/th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.contraction.spectrum import Array
-from fpirhc.deformation.base import Deformation, Iteration, Mirror
-from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.deformation.base import Iteration, Mirror
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import AboveZero, Count, NotNegative, Positive
+from fpirhc.fields.kinds import Count, NotNegative, Positive
 
 _NONE = 1e-9  # a damping below this counts as none
 _DIGITS = 6  # decimals of the pairing in cycles, so that a number next to a whole one becomes whole
@@ -200,85 +197,9 @@ def _circled_nothing(curves: Array) -> Array:
 _BISECTIONS = 60
 
 
-@checked_call
-def damped_product(period: Positive, lag: NotNegative, rate: NotNegative, poles: Count, *, damping: Positive) -> float:
-    """Return the largest a lambda whose fast pair keeps that damping behind an unknown lag; 0 where none does.
-
-    It is (T / tau) ((1 - N Lambda tau) / (2 zeta))^2 for the increment and the model-referenced form, and infinite without a lag.
-
-    Args:
-        period: T of the control cycle, s.
-        lag: tau, s.
-        rate: Lambda of the tracking law, 1/s.
-        poles: N of the tracking law.
-        damping: zeta, dimensionless.
-
-    Raises:
-        InvalidValue: a period or a damping that is not positive, a negative lag or rate, fewer than one pole.
-    """
-    if not lag:
-        return math.inf
-    spare = max(1 - poles * rate * lag, 0.0)
-    return period / lag * (spare / (2 * damping)) ** 2
-
-
-@checked_call
-def bearable_lag(product: Positive, period: Positive, rate: NotNegative, poles: Count, *, damping: Positive) -> float:
-    """Return the longest unknown lag, s, with which the fast pair keeps that damping: `damped_product` solved for tau.
-
-    Args:
-        product: a lambda, dimensionless.
-        period: T of the control cycle, s.
-        rate: Lambda of the tracking law, 1/s.
-        poles: N of the tracking law.
-        damping: zeta, dimensionless.
-
-    Raises:
-        InvalidValue: a product, period or damping that is not positive, a negative rate, fewer than one pole.
-    """
-    low, high = 0.0, period / product / (2 * damping) ** 2
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        fits = damped_product(period, middle, rate, poles, damping=damping) >= product
-        low, high = (middle, high) if fits else (low, middle)
-    return low
-
-
-@checked_call
-def resonant_limit(
-    period: Positive,
-    rate: NotNegative,
-    poles: Count,
-    *,
-    frequency: Positive,
-    damping: NotNegative,
-    eigenvalue: Positive = 1.0,
-) -> float:
-    """Return the largest effective gain behind the resonance, T (2 zeta w0 / lambda - N Lambda); 0 or less where none is stable.
-
-    The value is accurate to 10 % where w0 > 20 Lambda and the margin is large. A negative value means that the tracking law alone
-    excites the resonance.
-
-    Args:
-        period: T of the control cycle, s.
-        rate: Lambda of the tracking law, 1/s; 0 for the iteration alone.
-        poles: N of the tracking law.
-        frequency: w0 of the resonance, rad/s.
-        damping: zeta of the resonance, dimensionless.
-        eigenvalue: lambda of the response Jacobian.
-
-    Raises:
-        InvalidValue: a period, frequency or eigenvalue that is not positive, a negative rate or damping, fewer than one pole.
-    """
-    return period * (2 * damping * frequency / eigenvalue - poles * rate)
-
-
 _SPARE, _SPARE_OF_TWO_POLES = 1.25, 1.5
 _REAL = 1e-6  # imaginary part of an eigenvalue, relative, below which it is real
-_ZERO = 1e-12  # share of the largest eigenvalue below which an eigenvalue counts as zero
-_DECADES = (1e-6, 1e6)  # range of amplitudes that is searched, as multiples of the typical size
 _POINTS = 400
-_BISECTED = 50
 
 
 @checked_call
@@ -310,26 +231,6 @@ def least_product(poles: Count, rate: Positive, period: Positive) -> float:
 
 
 @checked_call
-def basin_of_plain_form(
-    largest_step: AboveZero, poles: Count, rate: Positive, period: Positive, *, eigenvalue: Positive = 1.0
-) -> float:
-    """Return the largest |f - d| from which the plain form comes back; infinite for one pole or an unbounded step.
-
-    Args:
-        largest_step: of the map per cycle, in units of the response.
-        poles: N of the tracking law, as in `slowest_iteration`.
-        rate: Lambda of the tracking law, 1/s.
-        period: T of the control cycle, s.
-        eigenvalue: lambda of the response Jacobian.
-
-    Raises:
-        InvalidValue: a step, rate, period or eigenvalue that is not positive, or fewer than one pole.
-    """
-    slowest = least_product(poles, rate, period)
-    return largest_step * eigenvalue / slowest if slowest else math.inf
-
-
-@checked_call
 def step_for_basin(
     largest_error: NotNegative, poles: Count, rate: Positive, period: Positive, *, eigenvalue: Positive = 1.0
 ) -> float:
@@ -347,61 +248,3 @@ def step_for_basin(
     """
     spare = _SPARE_OF_TWO_POLES if poles == 2 else _SPARE
     return spare * least_product(poles, rate, period) * largest_error / eigenvalue
-
-
-def two_cycle_limit(low: np.ndarray, high: np.ndarray, gains: Sequence[float]) -> float:
-    """Return the gain from which on a two-cycle exists; infinite where no gain leads to one.
-
-    A secant gain beyond it, at any size of the error, leads to a bounded two-cycle. Below it there is no two-cycle.
-
-    Args:
-        low: matrix of the closed loop over one cycle with the first effective gain, shape (m, m).
-        high: the same with the second effective gain.
-        gains: the two effective gains, different and of one sign.
-
-    Raises:
-        InvalidShape: matrices of different shapes.
-        InvalidValue: two equal gains, or of different signs.
-    """
-    first, second = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    if first.shape != second.shape or first.ndim != 2 or first.shape[0] != first.shape[1]:
-        raise InvalidShape(f"loops of shape {first.shape} and {second.shape}: expected two square matrices of one size")
-    if len(gains) != 2 or gains[0] == gains[1] or gains[0] * gains[1] <= 0:
-        raise InvalidValue(f"gains={gains!r}: expected two different effective gains of one sign")
-    per_gain = (second - first) / (gains[1] - gains[0])
-    without = first - gains[0] * per_gain
-    inverse = -np.linalg.solve(np.eye(len(first)) + without, per_gain)
-    values = np.linalg.eigvals(inverse) * np.sign(gains[0])
-    size = float(np.abs(values).max())
-    real = values.real[(np.abs(values.imag) <= _REAL * np.abs(values)) & (values.real > _ZERO * size)]
-    return float(1 / real.max()) if real.size else float("inf")
-
-
-@checked_call
-def two_cycle_amplitudes(deformation: Deformation, limit: AboveZero, *, size: Positive) -> tuple[float, ...]:
-    """Return every |h| at which the map's secant is the limit, smallest first; empty where there is no two-cycle.
-
-    Args:
-        deformation: a map without memory.
-        limit: from `two_cycle_limit`.
-        size: typical size of errors, in units of the response; amplitudes from 1e-6 to 1e6 times this size are searched.
-
-    Raises:
-        InvalidValue: a map with memory, a limit or a size that is not positive.
-    """
-    if deformation.memory(("q",)).size:
-        raise InvalidValue(f"{deformation}: expected a map without memory; give the innermost one")
-    h = ca.SX.sym("h")
-    secant = ca.Function("secant", [h], [ca.fabs(deformation.step(ca.SX(0), h, ca.SX(0), {})[0] / h)])
-
-    grid = size * np.geomspace(*_DECADES, _POINTS)
-    above = np.asarray(secant(grid[None, :]).full()).ravel() > limit
-    amplitudes = []
-    for k in np.flatnonzero(above[1:] != above[:-1]):
-        low, high = grid[k], grid[k + 1]
-        for _ in range(_BISECTED):
-            middle = 0.5 * (low + high)
-            same = (float(secant(middle)) > limit) == above[k]
-            low, high = (middle, high) if same else (low, middle)
-        amplitudes.append(float(0.5 * (low + high)))
-    return tuple(amplitudes)

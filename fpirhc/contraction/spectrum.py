@@ -5,8 +5,7 @@ J is that of the equations, of a cycle of a reality differentiated through its i
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
@@ -16,9 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
-from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Count, Seed
+from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -95,63 +92,6 @@ def response_jacobian(plant: Plant) -> ca.Function:
     return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])
 
 
-def spectrum_over_run(
-    plant: Plant, states: Array, deformed: Array, *, exact: Array | None = None, approximate: Array | None = None
-) -> Spectrum:
-    """Return the eigenvalues of J along a run; long runs are thinned to `LARGEST_SAMPLE` cycles.
-
-    Args:
-        plant: that ran.
-        states: state of every cycle, shape (cycles, nx).
-        deformed: request of every cycle, shape (cycles, n).
-        exact: parameters of the plant, shape (np,); None: the plant's own.
-        approximate: parameters of the model, shape (np,); None: the plant's own.
-
-    Raises:
-        InvalidShape: arrays that do not fit the plant or each other.
-        InvalidValue: no finite eigenvalue.
-    """
-    states, deformed = _checked_rows(plant, states, deformed)
-    rows = _thinned(len(states))
-    true = plant.exact if exact is None else np.asarray(exact, dtype=float)
-    parameters = np.repeat(true[None, :], len(rows), axis=0)
-    return _spectrum(plant, states[rows], deformed[rows], parameters, approximate)
-
-
-@checked_call
-def spectrum_over_box(
-    plant: Plant, box: Mapping[str, tuple[float, float]], states: Array, deformed: Array, *, samples: Count, seed: Seed
-) -> Spectrum:
-    """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
-
-    Every corner of the box is a sample where there are at least as many samples as corners; the other samples are uniform.
-    Parameters that the box does not name keep the plant's exact value.
-
-    Args:
-        plant: whose exact parameters vary.
-        box: parameter -> (lower, upper), in its unit.
-        states: states to draw from, shape (rows, nx).
-        deformed: the requests at these states, shape (rows, n).
-        samples: number of draws.
-        seed: of the draws.
-
-    Raises:
-        InvalidName: the box names an unknown parameter.
-        InvalidValue: an interval whose ends are swapped or not finite, or fewer than one sample.
-        InvalidShape: arrays that do not fit the plant or each other.
-    """
-    states, deformed = _checked_rows(plant, states, deformed)
-    lower, upper = _box_ends(plant, box)
-    generator = np.random.default_rng(seed)
-    parameters = generator.uniform(lower, upper, size=(samples, lower.size))
-    places = [list(plant.parameters).index(name) for name in box]
-    if 2 ** len(places) <= samples:
-        for row, upper_ends in enumerate(itertools.product((False, True), repeat=len(places))):
-            parameters[row, places] = np.where(upper_ends, upper[places], lower[places])
-    rows = generator.integers(len(states), size=samples)
-    return _spectrum(plant, states[rows], deformed[rows], parameters, None)
-
-
 def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
     """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); every entry is a number.
 
@@ -204,38 +144,6 @@ def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:
 def _thinned(cycles: int) -> Array:
     """Numbers of at most `LARGEST_SAMPLE` cycles, evenly chosen, with the first and the last."""
     return np.unique(np.linspace(0, cycles - 1, min(cycles, LARGEST_SAMPLE)).astype(int))
-
-
-def _spectrum(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Spectrum:
-    jacobians = response_jacobians(plant, states, deformed, exact, approximate)
-    finite = jacobians[np.isfinite(jacobians).all(axis=(1, 2))]
-    return Spectrum(np.linalg.eigvals(finite))
-
-
-def _checked_rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, Array]:
-    states = np.atleast_2d(np.asarray(states, dtype=float))
-    deformed = np.atleast_2d(np.asarray(deformed, dtype=float))
-    widths = (plant.state.size, len(plant.controlled_names))
-    if (states.shape[1], deformed.shape[1]) != widths or len(states) != len(deformed):
-        raise InvalidShape(
-            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {widths[0]}) "
-            f"and (cycles, {widths[1]})"
-        )
-    if len(states) == 0:
-        raise InvalidShape("states and deformed have no rows; give at least one state and request")
-    return states, deformed
-
-
-def _box_ends(plant: Plant, box: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
-    lower, upper = plant.exact.copy(), plant.exact.copy()
-    names = list(plant.parameters)
-    for name, (low, high) in box.items():
-        if name not in names:
-            raise InvalidName(f"box: parameter '{name}' is unknown.{nearest(name, names)}")
-        if not -np.inf < low <= high < np.inf:
-            raise InvalidValue(f"box: '{name}' is from {low!r} to {high!r}; expected finite ends with lower <= upper")
-        lower[names.index(name)], upper[names.index(name)] = low, high
-    return lower, upper
 
 
 def predicted_factor(eigenvalues: Array, effective_gain: float) -> float:

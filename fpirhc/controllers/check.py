@@ -1,7 +1,7 @@
 """Checks a controller against its problem before a run, and refuses a deformation that cannot converge.
 
 Where eigenvalues of the response Jacobian at the start have real parts of both signs, no gain converges. Where they have one sign,
-gains of the other sign enlarge every error, and a delay of the response lowers the largest one that converges; see `BeyondLimit`.
+gains of the other sign enlarge every error, and a delay of the response lowers the largest one that converges.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     """Raise if a gain is beyond the limit of the iteration: that of the plant itself, or behind the delay of estimator and filter.
 
     The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged. A
-    map that changes its gain on line begins where it likes, and so does `BeyondLimit`.
+    map that changes its gain on line begins where it likes.
     """
     gain, iteration, mirror = deformation.effective_gain(), deformation.iteration, deformation.mirror
     if gain == 0 or not iteration.limited or not iteration.constant or not _REFUSES.get():
@@ -94,18 +94,6 @@ def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eig
     return limit_behind_weights(iteration, deformation.mirror, _late(weights, late), _paired(iteration), eigenvalue)
 
 
-def product_limit(problem: Problem, deformation: Deformation) -> float | None:
-    """Return the limit of effective gain times a positive eigenvalue behind an estimator or a filter.
-
-    It is None without estimator and filter, and where the inputs have different dead times.
-    """
-    iteration = deformation.iteration
-    weights = _delayed_weights(problem, iteration)
-    return min(
-        (limit_behind_weights(iteration, deformation.mirror, w, _paired(iteration), 1.0) for w in weights), default=None
-    )
-
-
 def _delayed_weights(problem: Problem, iteration: Iteration) -> list[np.ndarray]:
     """Weights of past requests in the estimated responses, dead time included; empty without estimator and filter."""
     orders = set(problem.plant.response_orders.values())
@@ -136,7 +124,7 @@ def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> No
     largest = values[np.argmax(np.abs(values))]
     value_text = f"{largest.real if largest.imag == 0 else largest:.3g}"
     return NotContractive(
-        f"{with_its_gain(deformation)} is too large, and runs in BeyondLimit(map) alone",
+        f"{with_its_gain(deformation)} is too large",
         f"use 0 < |{name}| < {_in_own(deformation, limit):.3g}, where the iteration converges: the largest eigenvalue of the "
         f"response Jacobian at the start is {value_text}",
     )

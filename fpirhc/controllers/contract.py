@@ -373,11 +373,6 @@ def with_optimiser(controller: Controller, optimiser: Optimiser) -> Controller:
     return _replaceable(controller, "optimiser", optimiser, "optimiser that can be replaced")
 
 
-def with_margins(controller: Controller, margins: Mapping[str, Sequence[float]]) -> Controller:
-    """Return the controller whose plans keep these distances from limits of states; see `Horizon`."""
-    return _replaceable(controller, "margins", margins, "plan that could keep margins")
-
-
 def _replaceable(controller: _Own, name: str, value: object, what: str) -> _Own:
     changed = with_setting(controller, name, value)
     if changed is None:

@@ -228,7 +228,7 @@ def check_observed(problem: Problem) -> None:
         raise NoAnswer(
             f"{type(observer).__name__}: {' and '.join(free.states)} cannot be observed along the reference from {measured}, and "
             f"an error of what is believed does not decay (pole {free.pole:.3g} {problem.rate_unit}); measure {free.states[0]}, or "
-            "another quantity that depends on it; ModelStates() believes the model alone"
+            "another quantity that depends on it"
         )
 
 

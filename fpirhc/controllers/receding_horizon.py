@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -11,7 +10,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, command_before, like, reference_block
 from fpirhc.controllers.contract import Planner
-from fpirhc.controllers.reference_states import motion_of, own_signals, own_values, preview_of
+from fpirhc.controllers.reference_states import own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import (
     FromMeasurement,
     Replanning,
@@ -25,10 +24,8 @@ from fpirhc.controllers.replanning import (
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
-from fpirhc.fields.checked import Checked
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import in_tuple
-from fpirhc.horizon.nominal import feedforward, require_reference_of_states
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -36,94 +33,15 @@ from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
-from fpirhc.status import STOPPED, Status
+from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.live import (
-    DERIVED,
-    PREFIX,
-    Derived,
-    LiveNumber,
-    copied,
-    live_numbers,
-    nan_where,
-    nominal,
-    numbers,
-    settled,
-)
+from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, live_numbers, nominal, numbers, settled
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
-
-
-class OnFailure(Checked, ABC):
-    """Contract: the input to apply when the solve failed, and the status to report."""
-
-    @property
-    def uses_feedforward(self) -> bool:
-        """Whether the input that the model needs along the reference is applied; False by default."""
-        return False
-
-    @property
-    def stops(self) -> bool:
-        """Whether a failed solve ends the run; False by default."""
-        return False
-
-    @abstractmethod
-    def choose(
-        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
-    ) -> tuple[Expression, Expression]:
-        """Return (input, status).
-
-        Args:
-            failed: whether the solve failed, a scalar expression.
-            planned: first input of the plan.
-            feedforward: input that the model needs along the reference.
-            status: of the solve.
-        """
-
-
-@dataclass(frozen=True)
-class HoldPlan(OnFailure):
-    """Use the plan that the optimiser returns where it fails, with the status HELD.
-
-    Where a horizon cannot be kept, `FixedPoint` returns a plan of least violation; where nothing is finite, every optimiser returns
-    its remembered plan, shifted.
-    """
-
-    def choose(
-        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
-    ) -> tuple[Expression, Expression]:
-        del feedforward
-        return planned, ca.if_else(failed, int(Status.HELD), status)
-
-
-@dataclass(frozen=True)
-class Feedforward(OnFailure):
-    """Apply the input that the model needs along the reference, without feedback from the plan."""
-
-    uses_feedforward = True
-
-    def choose(
-        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
-    ) -> tuple[Expression, Expression]:
-        return ca.if_else(failed, feedforward, planned), ca.if_else(failed, int(Status.HELD), status)
-
-
-@dataclass(frozen=True)
-class StopRun(OnFailure):
-    """Stop: the planned input becomes NaN, which holds the last command and ends the run with this status."""
-
-    stops = True
-
-    def choose(
-        self, failed: Expression, planned: Expression, feedforward: Expression, status: Expression
-    ) -> tuple[Expression, Expression]:
-        del feedforward
-        return ca.if_else(failed, nan_where(failed), planned), status
-
 
 _SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
@@ -136,8 +54,7 @@ class RecedingHorizon(Controller):
     Args:
         optimiser: finds the plan.
         deformation: the map between desired response and request; Identity() is plain receding-horizon control.
-        replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromMeasurementTracked, FromPlan).
-        on_failure: what is applied when a solve fails (HoldPlan, Feedforward, StopRun).
+        replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromPlan).
         cost: of the plan; None: the problem's.
         margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
         follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
@@ -147,7 +64,6 @@ class RecedingHorizon(Controller):
     optimiser: Optimiser
     deformation: Deformation = field(default_factory=Identity)
     replanning: Replanning = field(default_factory=FromMeasurement)
-    on_failure: OnFailure = field(default_factory=HoldPlan)
     cost: Cost | None = None
     margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False, metadata={"setting": "where given"})
     follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
@@ -172,12 +88,6 @@ class RecedingHorizon(Controller):
             InvalidProblem: horizon or cost missing.
             NotSupported: the optimiser cannot keep the problem's bounds; references of states are needed that no output gives.
         """
-        if self.on_failure.uses_feedforward:
-            require_reference_of_states(
-                problem.plant,
-                f"RecedingHorizon does not cover outputs that are expressions of the state ({', '.join(problem.plant.chains)}): "
-                f"{type(self.on_failure).__name__} needs references of states that no output gives; use HoldPlan",
-            )
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
@@ -192,7 +102,7 @@ class RecedingHorizon(Controller):
         cycles = cycles_per_plan(problem.horizon, problem.period)
         before, after, late, remembered = self.replanning.parts(problem)
         room = _room(problem, self.replanning)
-        same = task, self.optimiser, self.on_failure, self.replanning, self.cost, self.margins
+        same = task, self.optimiser, self.replanning, self.cost, self.margins
         others = self.deformation.adapts, self.follows_model, plans_are_compiled()
         plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
         closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
@@ -269,7 +179,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
-    optimiser, on_failure, restarts = controller.optimiser, controller.on_failure, controller.replanning.restarts
+    optimiser, restarts = controller.optimiser, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     count = live_signals(ocp.settings, plant.input).size
     data_of = _stage_data(problem, count)
@@ -278,14 +188,11 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     start = nominal(problem)
     memory = optimiser.memory(ocp).starting_at(built_first_memory(start, optimiser, ocp, data_of))
     solve = built(optimiser, ocp, "step")
-    feedforward_of = _feedforward(problem)
     low, high = problem.limits.input_ends(plant)
-    stopped = (scalar(STOPPED),) if on_failure.stops else ()
     writes = (
         like(plant.input, "planned"),
         Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)),
         discrete("_solve_status"),
-        *stopped,
         *map(scalar, optimiser.logged),
     )
 
@@ -311,16 +218,17 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
         failed = status > int(Status.NOT_CONVERGED) + 0.5
-        planned, judged = on_failure.choose(failed, inputs[:, 0], feedforward_of(s.time, *own, s.parameters), status)
+        judged = ca.if_else(
+            failed, int(Status.HELD), status
+        )  # the plan is held, of least violation or the last one, shifted
         after = memory.split(next_memory)
         remembered_next = {f"{m}_next": v for m, v in after.items()}
         shown = {name: after[source] for name, source in optimiser.logged.items()}
         return {
-            "planned": planned,
+            "planned": inputs[:, 0],
             "solve": diagnostics,
             "_solve_status": judged,
             "plan_begun_next": 1,
-            **({STOPPED: nan_where(failed)} if on_failure.stops else {}),
             **remembered_next,
             **shown,
         }
@@ -413,21 +321,6 @@ def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: S
 def _minus(ends: Sequence[float], shift: Expression) -> Expression:
     """Limits, which may be live, minus a column."""
     return numbers(ends, shift) - shift
-
-
-def _feedforward(problem: Problem) -> ca.Function:
-    """Function (time, own signals of the reference, parameters) -> input that the model needs.
-
-    It is zero for a model without inverse, or with states without a reference.
-    """
-    plant = problem.plant
-    t, p = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
-    own = [ca.MX.sym(signal.name, signal.size) for signal in own_signals(problem)]
-    state, response = motion_of(problem)(t, *own)
-    invertible = plant.controlled is not None or len(plant.inputs) == len(plant.chains)
-    known = invertible and plant.equations.known_on_reference
-    needed = feedforward(plant, state, response, p) if known else ca.MX.zeros(len(plant.inputs))
-    return ca.Function("fpirhc_feedforward", [t, *own, p], [needed])
 
 
 def _command_shift_block(problem: Problem, deformation: Deformation) -> Block:

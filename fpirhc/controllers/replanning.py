@@ -90,26 +90,6 @@ class FromMeasurement(Replanning):
 
 
 @dataclass(frozen=True)
-class FromMeasurementTracked(Replanning):
-    """Plan from the measured state; between plans track the motion that the model propagates.
-
-    Args:
-        tracking: the law between plans.
-    """
-
-    tracking: Tracking
-
-    restarts = True
-
-    def parts(self, problem: Problem) -> Parts:
-        def start(s: Signals) -> dict[str, Expression]:
-            fresh = ca.logic_or(s.warm_up < 0.5, s._due > 0.5)
-            return {"_plan_state": s.state, _FOLLOWED: ca.if_else(fresh, s.state, s._target_before)}
-
-        return _tracked(problem, self.tracking, start)
-
-
-@dataclass(frozen=True)
 class FromPlan(Replanning):
     """Plan from the model's own state and track the planned motion.
 

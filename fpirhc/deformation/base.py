@@ -19,7 +19,6 @@ import numpy as np
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
-from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout
 
 Wrapping = TypeVar("Wrapping")
@@ -322,15 +321,6 @@ def of_last_pair(deformation: Deformation) -> bool:
     return iteration.pairing is None and not (deformation.mirror.share or iteration.error_pole)
 
 
-def form_of(deformation: Deformation) -> str:
-    """What the form is called: 'model-referenced', 'increment', 'paired' or 'plain'."""
-    if deformation.mirror.share:
-        return "model-referenced"
-    if not deformation.iteration.slows_desired:
-        return "increment"
-    return "plain" if deformation.iteration.pairing is None else "paired"
-
-
 _FORGETTING = 0.1  # share of the newest sign
 _RETURNED = 0.3  # relative distance below which an error counts as equal to the error of two cycles before
 
@@ -409,12 +399,6 @@ def memory_of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int)
     """Return the part of a wrapper's memory that belongs to the map; `size` is the number of coordinates."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
     return {name: memory[name] for name in own.names}
-
-
-def start_of_map(wrapper: Wrapper, size: int) -> dict[str, Expression]:
-    """Return what the map remembers at the start; `size` is the number of coordinates."""
-    own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
-    return own.split(expression(ca.DM(own.start())))
 
 
 def forget(before: Expression, sign: Expression) -> Expression:

@@ -11,7 +11,7 @@ import math
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import BelowOne, NotNegative, Product, finite_number
+from fpirhc.fields.kinds import NotNegative, Product, finite_number
 from fpirhc.symbolic.live import between, ceil, larger, largest, positive, smaller, sqrt
 from fpirhc.task.dead_time import MOST, Cycles, every
 
@@ -33,22 +33,6 @@ def leaky_pole(product: Product, uncertainty: NotNegative) -> float:
         InvalidValue: a product outside (0, 2), for which no pole is large enough; a negative or infinite uncertainty.
     """
     return _least_pole(product, uncertainty)
-
-
-@checked_call
-def leaky_margin(product: Product, pole: BelowOne) -> float:
-    """Return the error of the dead time, in cycles, up to which the pairing is stable: 2 sqrt(p / (g (2 + g))) / (1 - p).
-
-    The bound is sufficient: the true margin may be larger.
-
-    Args:
-        product: g, effective gain times the largest eigenvalue of the response Jacobian, in (0, 2).
-        pole: p, in [0, 1).
-
-    Raises:
-        InvalidValue: a product outside (0, 2), a pole outside [0, 1).
-    """
-    return 2 * math.sqrt(pole / (product * (2 + product))) / (1 - pole)
 
 
 def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from fpirhc.errors import CompileError, NotInstalled, package
-from fpirhc.symbolic.native import find_compiler, why_no_compiler
+from fpirhc.errors import CompileError, package
+from fpirhc.symbolic.native import find_compiler
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
 _FLAGS = ("-std=c99", "-O2", "-s", "-ffp-contract=off")
@@ -29,54 +29,10 @@ PLATFORMS = {  # and the names that zig has for them
 }
 WEB_STACK = 262144  # bytes, which hold the deepest plan
 
-# Headers of a libc, and of it what is reached, which makes no system calls.
-_THUMB = "thumb-linux-musleabihf"
-_CORTEX = {"m7": ("-mcpu=cortex_m7+fp_armv8d16",), "m4f": ("-mcpu=cortex_m4+vfp4d16sp", "-Dcasadi_real=float")}
-# Short loops over small matrices are written out: 2 % fewer instructions, 4 % more code.
-_BARE = (
-    "-g0",
-    "-mllvm",
-    "-unroll-threshold=200",
-    "-fno-math-errno",
-    "-fomit-frame-pointer",
-    "-fno-unwind-tables",
-    "-fno-asynchronous-unwind-tables",
-    "-ffunction-sections",
-    "-fdata-sections",
-    "-fno-sanitize=all",
-    "-fno-stack-protector",
-)
-
 
 def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
     """Return a shared library by platform, "x86_64-linux" and so on; nothing where there is no compiler."""
     return {place: _compiled(files, command, place) for place, command in _compilers().items()}
-
-
-def program(sources: Sequence[Path], made: Path, *flags: str) -> None:
-    """Build a program of C files for this machine."""
-    command = [
-        own_compiler(),
-        "-std=c99",
-        "-O2",
-        "-ffp-contract=off",
-        *flags,
-        *map(str, sources),
-        "-o",
-        str(made),
-        "-lm",
-    ]
-    _done(command, "no program")
-
-
-def own_compiler() -> str:
-    """Return the C compiler of this machine."""
-    own = find_compiler()
-    if own is None:
-        raise NotInstalled(
-            f"a program of this machine needs a C compiler: {why_no_compiler()}; install gcc or clang, or name one by FPIRHC_CC"
-        )
-    return own
 
 
 def web_module(files: Mapping[str, str]) -> bytes:
@@ -85,46 +41,6 @@ def web_module(files: Mapping[str, str]) -> bytes:
     # zig's own 16 MB are all that a page would ask for.
     flags = ("-mexec-model=reactor", f"-Wl,-z,stack-size={WEB_STACK}", "-Wl,--no-entry")
     return _compiled(files, [*_ZIG, "wasm32-wasi", *flags], "wasm32")
-
-
-def arm_programs(
-    files: Mapping[str, str], around: Mapping[str, str], script: str
-) -> tuple[dict[str, bytes], dict[str, str]]:
-    """Return a program and a library of C files by processor, "m7.elf", "m7.a" and so on; M7 computes in double, M4F in float.
-
-    And by processor what the compiler says of the stack frames of the files.
-    """
-    package("ziglang", "cortex", "the target cortex-m")
-    made, said = dict[str, bytes](), dict[str, str]()
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for file, text in {**files, **around, "board.ld": script}.items():
-            (folder / file).write_text(text, encoding="utf-8")
-        for place, flags in _CORTEX.items():
-            library, others = (
-                dict(_object(folder, file, place, flags) for file in part if file.endswith(".c"))
-                for part in (files, around)
-            )
-            said[place] = "".join(library.values())
-            program, archive = folder / f"{place}.elf", folder / f"{place}.a"
-            image = (
-                "-static",
-                "-Wl,-e,reset",
-                f"-Wl,-T,{folder / 'board.ld'}",
-                "-Wl,--gc-sections",
-                *map(str, [*library, *others]),
-            )
-            _done([*_ZIG, _THUMB, *flags, *image, "-o", str(program)], f"no program for {place}")
-            _done([*_ZIG[:3], "ar", "rcs", str(archive), *map(str, library)], f"no library for {place}")
-            made |= {path.name: path.read_bytes() for path in (program, archive)}
-    return made, said
-
-
-def _object(folder: Path, file: str, place: str, flags: Sequence[str]) -> tuple[Path, str]:
-    """An object, and what the compiler says of the stack frames of its functions."""
-    made = folder / f"{Path(file).stem}_{place}.o"
-    own = ("-std=c99", "-O2", "-ffp-contract=off", "-Wframe-larger-than=0", *_BARE, *flags)
-    return made, _done([*_ZIG, _THUMB, *own, "-c", str(folder / file), "-o", str(made)], f"no object for {place}")
 
 
 def _done(command: Sequence[str], otherwise: str) -> str:

@@ -6,7 +6,7 @@ The C is that of `Stepper.function`; no target computes anything of the controll
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,16 +16,12 @@ import numpy as np
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import BRIDGED
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.errors import InvalidName, NotSupported
-from fpirhc.export.straight import condensed
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
-from fpirhc.symbolic.driver import works_alone
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
-from fpirhc.symbolic.native import native
 from fpirhc.symbolic.program import generate
 from fpirhc.task.problem import Problem
 
@@ -45,7 +41,7 @@ _C_WORDS = frozenset(
 _FILES = frozenset(
     re.findall(
         r"\w+",
-        """processor board example replay samples layout sizes controller all install clean help package test
+        """example replay samples layout sizes controller all install clean help package test
         assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef stdint stdio
         stdlib string tgmath time wchar wctype""",
     )
@@ -62,11 +58,10 @@ class Device:
     problem: Problem  # of the controller
     controller: Controller  # as the problem file has it
     # of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit
-    stepper: Stepper | BareStep
+    stepper: Stepper
     cycles: int  # number of cycles that are recorded for a replay
     # "system" or "own": exp, log, pow, sin, cos, tanh and atanh of the machine, or those with the same bits everywhere
     libm: str = "system"
-    bare: bool = False  # whether the step is the controller's alone, without gate, watch and missed cycles
 
     @cached_property
     def inputs(self) -> Layout:
@@ -121,48 +116,6 @@ class Device:
         return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
 
 
-class BareStep:
-    """A controller's own step, with what targets ask a `Stepper`.
-
-    A sample that is no number, or beyond all reason, reaches its memory, and stays there until the next reset. Missed cycles are
-    not made up for.
-
-    Args:
-        behind: the step of the same controller behind its gate; its data are taken.
-    """
-
-    def __init__(self, problem: Problem, controller: Controller, behind: Stepper) -> None:
-        composite = compose_with_sensing(problem, controller)
-        self.function, self.memory, self.signals = composite.function, composite.memory, composite.trace
-        self.reads = Layout(tuple(behind.reads[name] for name in composite.reads.names))
-        self.numbers = behind.numbers
-        ready = native(self.function)
-        self.compiled, self._step, self._trace = ready.compiled, ready.function, self.signals.start()
-
-    def start(self) -> np.ndarray:
-        """Return the first memory."""
-        return self.memory.start()
-
-    def bounds(self) -> Mapping[str, tuple[float, float]]:
-        """Nothing is live."""
-        return {}
-
-    def outdated(self) -> dict[str, str]:
-        """Nothing is live."""
-        return {}
-
-    def trace(self) -> dict[str, np.ndarray]:
-        """Return the signals of the last step."""
-        return self.signals.unpack(self._trace)
-
-    def step_measured(self, time: float, measured: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (command, memory for the next cycle), as `Stepper.step_measured`."""
-        values = np.concatenate([[time], measured, self.reads.start()[1 + len(measured) :]])
-        after, trace, command = self._step(memory, *self.reads.unpack(values).values())
-        self._trace = trace.full().ravel()
-        return command.full().ravel(), after.full().ravel()
-
-
 def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, int]]:
     """Return the C files of a Function, whose name in C is NAME_raw, and the sizes of its work: arg, res, iw, w.
 
@@ -171,8 +124,6 @@ def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, i
     texts, files = generate(function), []
     sizes = {key: max(1, int(size)) for key, size in re.findall(r"\*sz_(\w+) = (\d+);", texts[0])}
     text, sizes["w"] = _without_wrapper(texts[0], sizes["w"])
-    if works_alone(function) and text != texts[0]:
-        text, sizes = condensed(text), {"arg": function.n_in(), "res": function.n_out(), "iw": 1, "w": 1}
     texts = (text, *texts[1:])
     for text in texts:
         entry = re.match(r"#define ENTRY (\w+)\n", text)

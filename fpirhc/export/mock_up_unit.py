@@ -20,7 +20,6 @@ import numpy as np
 from fpirhc.errors import package
 from fpirhc.export.binaries import ENDINGS, shared_libraries
 from fpirhc.export.device import Device
-from fpirhc.export.footprint import bytes_here
 from fpirhc.export.targets.c import data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
@@ -114,7 +113,7 @@ def _sizes(device: Device, contents: Mapping[str, str | bytes]) -> str:
     words = numbers + stepper.signals["command"].size + work["arg"] + work["res"] + work["iw"] + 3
     libraries = {name: len(data) for name, data in contents.items() if name.startswith("binaries/")}
     lines = [f"{name}: {size} bytes\n" for name, size in libraries.items()]
-    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n", bytes_here(device)])
+    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n"])
 
 
 # Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest

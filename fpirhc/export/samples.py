@@ -22,15 +22,13 @@ def recorded(device: Device) -> bytes:
 
     Samples are those of a run, again from its beginning where it is too short; a plant outside is not run, but its model is.
     """
-    stepper, rows = device.stepper, _samples(device)
-    if not device.bare:  # there nothing catches them
-        rows = with_faults(rows, device.problem)
-    rows = rows[: device.cycles]
+    stepper = device.stepper
+    rows = with_faults(_samples(device), device.problem)[: device.cycles]
     exact = device.libm == "system" and (stepper.compiled or stepper.function.is_a("SXFunction"))
     head = struct.pack("<4i", len(rows), rows.shape[1], device.problem.plant.input.size, exact)
     memory, parts = stepper.start(), [head]
     for k, row in enumerate(rows):
-        damaged = memory.size - 3 if k == _DAMAGED and not device.bare else -1
+        damaged = memory.size - 3 if k == _DAMAGED else -1
         if damaged >= 0:
             memory = memory.copy()
             memory[damaged] = np.nan

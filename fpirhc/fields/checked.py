@@ -36,7 +36,6 @@ from fpirhc.fields.kinds import (
     signature_of,
 )
 from fpirhc.fields.user_code import users_place
-from fpirhc.members import FORMER_MEMBERS
 
 _WITH_UNIT = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)? ?[a-zA-Z%/^*]+\d?")  # '1 ms'
 
@@ -81,22 +80,8 @@ class Checked(metaclass=_CheckedWhenCalled):
 
 
 def missing(owner: type, name: str) -> AttributeError:
-    """The error of an attribute that is not there, with the name that took the place of an earlier one."""
-    now = next(filter(None, [FORMER_MEMBERS.get(f"{base.__name__}.{name}") for base in owner.__mro__]), None)
-    return AttributeError(
-        f"{owner.__name__} has no attribute '{name}'" + (f"; it is called '{now}' now" if now else ""), name=name
-    )
-
-
-def mistakes_of(owner: type, named: Mapping[str, object]) -> Iterator[str]:
-    """Yield the mistakes of some arguments of a class, whose others are not known."""
-    arguments = _arguments_of(owner)
-    yield from replace(arguments, required=()).mistakes((), named)
-
-
-def field_names(owner: type) -> tuple[str, ...]:
-    """Names of the arguments of a class."""
-    return tuple(_arguments_of(owner).expected)
+    """The error of an attribute that is not there, with its owner."""
+    return AttributeError(f"{owner.__name__} has no attribute '{name}'", name=name)
 
 
 def expects_whole_number(owner: type, name: str) -> bool:
@@ -213,9 +198,7 @@ class _Arguments:
             if key in values:
                 yield f"{name}: '{key}' is given twice, by its place and by its name"
             elif key not in self.expected and not self.open:
-                now = FORMER_MEMBERS.get(f"{name}({key})")
-                hint = f" It is called '{now}' now." if now else nearest(key, self.expected)
-                yield f"{name} has no {self.noun} '{key}'.{hint}"
+                yield f"{name} has no {self.noun} '{key}'.{nearest(key, self.expected)}"
         if len(arguments) > len(self.positional) and not self.open:
             extra = described(arguments[len(self.positional)])
             yield f"{name} takes {len(self.positional)} values without a name, got {len(arguments)}; {extra} is too many"

@@ -28,7 +28,7 @@ class Horizon(Checked):
     Args:
         stages: number of stages N.
         step: length of one stage, s, over which the input is constant.
-        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), ImplicitMidpoint(), RadauIIA(). A
+        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(). A
             map has none: a stage is a whole number of its steps.
         terminal: names of states that must meet the reference at the end of the horizon.
         lengths: of the stages, as multiples of `step`, which is that of the first one: fine stages first. One number of at least
@@ -37,7 +37,7 @@ class Horizon(Checked):
         blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
             stage has inputs of its own.
         margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
-            state's unit: room for what the model does not predict (`tightened` computes them). The problem's limits stay as they
+            state's unit: room for what the model does not predict. The problem's limits stay as they
             are for the run and its metrics.
         replan: when the next plan is made: after one "stage", after one control "cycle", or after so many cycles, at most those of
             a stage. Where a plan follows sooner than a stage, the horizon begins at the cycle's own time, the last plan is
@@ -88,9 +88,7 @@ class Horizon(Checked):
                     f"horizon: margins of '{name}' must be {self.stages} numbers, one for every stage, got {described(margin)}"
                 )
         if self.discretisation.opaque:
-            raise InvalidValue(
-                "a horizon needs an integrator of plain expressions, such as RungeKutta4() or RadauIIA()"
-            )
+            raise InvalidValue("a horizon needs an integrator of plain expressions, such as RungeKutta4()")
 
     @property
     def relative_lengths(self) -> np.ndarray:

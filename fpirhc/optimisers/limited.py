@@ -18,7 +18,7 @@ from fpirhc.horizon.hessian_models import (
     hessian_stage,
     partial_count,
     split_hessian,
-    stage_leaves,
+    split_stage,
 )
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import PIVOT
@@ -75,9 +75,9 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = "") -> Driver:
     """The loops in C with what they call; `iterations` are those of the settings unless the text is given."""
     measures = scales(ocp)
-    stage, linearise = stage_leaves(ocp, ("evaluate",))
     leaves = {
-        **stage,
+        "evaluate": split_stage(ocp)["evaluate"],
+        "linearise": split_stage(ocp)["linearise"],
         **split_hessian(ocp, settings.hessian or ExactHessian()),
         "plain": hessian_stage(ocp, GaussNewton()),
         "end": hessian_end(ocp),
@@ -86,11 +86,10 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = ""
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    texts.insert(1, linearise)
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
     constants = {**sizes, **_constants(settings, measures), "ITERATIONS": iterations or settings.iterations}
     memory = (4, 2)
-    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures), in_place=memory, side_by_side=False)
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures), in_place=memory)
 
 
 def _room(ocp: OptimalControl, measures: Scales) -> int:

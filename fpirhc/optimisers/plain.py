@@ -9,7 +9,7 @@ from importlib import resources
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, stage_leaves
+from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
 from fpirhc.horizon.stage_data import SCALE, STEEPEST
@@ -111,16 +111,14 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 
 def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[str, object]) -> Driver:
     """Return the loops in C with what they call; `stops` are the definitions of STOP_EARLY and ITERATIONS."""
-    stage, linearise = stage_leaves(ocp, ("evaluate", "pull"))
     leaves = {
-        **stage,
+        **split_stage(ocp),
         "hessian": hessian_stage(ocp, settings.hessian),
         "end": hessian_end(ocp),
         "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages, ocp),
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    texts.insert(1, linearise)
     costates = _costates(ocp, leaves["hessian"])
     constants = {**_sizes(ocp), "COSTATES": costates, **_metric(ocp), **_constants(ocp, settings), **stops}
     return Driver("\n".join(texts), leaves, constants, _room(ocp, costates), in_place=(4, 2))  # the memory

@@ -91,13 +91,6 @@ def response_units(plant: Plant) -> tuple[str, ...]:
     return tuple(derivative_unit(units[name], order, time) for name, order in plant.chains.items())
 
 
-def controlled_unit(plant: Plant, derivative: int = 0) -> str:
-    """Return the unit of all controlled responses, or of a time derivative of them; '1' where they have several."""
-    units, time = followed_units(plant), plant.time_unit
-    every = {derivative_unit(units[name], order + derivative, time) for name, order in plant.response_orders.items()}
-    return every.pop() if len(every) == 1 else "1"
-
-
 def nominal_responses(
     plant: Plant, outputs: Matrix, responses: Matrix, later: Callable[[], Matrix] | None = None
 ) -> Matrix:

@@ -163,34 +163,6 @@ def step_of(plant: Motion, matrix: np.ndarray, time: float) -> np.ndarray:
     return np.linalg.matrix_power(np.eye(len(matrix)) + sampling(plant) * matrix, round(time / sampling(plant)))
 
 
-def quick_step_of(plant: Motion, matrix: np.ndarray, time: float) -> np.ndarray:
-    """Return `step_of` to rounding, by numpy alone: Taylor's series of a small share of the time, squared."""
-    if plant.step is not None:
-        return step_of(plant, matrix, time)
-    size = max(float(np.abs(matrix * time).sum(axis=0).max(initial=0.0)), 1e-300)
-    halvings = max(math.ceil(math.log2(size)) + 1, 0)
-    part, term = np.eye(len(matrix)), np.eye(len(matrix))
-    for k in range(1, _TERMS):
-        term = term @ matrix * (time / 2**halvings / k)
-        part = part + term
-    return np.asarray(np.linalg.matrix_power(part, 2**halvings))
-
-
-_TERMS = 18  # of a series in at most 1/2
-
-
-def poles_over(plant: Motion, modes: np.ndarray, time: float) -> np.ndarray:
-    """Return what eigenvalues of the rates, or of a map's divided differences, become over a time: whole cycles of a map."""
-    if plant.step is None:
-        return np.asarray(np.exp(modes * time))
-    return np.asarray((1 + sampling(plant) * modes) ** round(time / sampling(plant)))
-
-
-def rate_of_decay(plant: Motion, time: float) -> float:
-    """Return the rate of what decays as exp(-t / time): -1 / time, or on a map that of its divided differences."""
-    return -1 / time if plant.step is None else math.expm1(-sampling(plant) / time) / sampling(plant)
-
-
 def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
     return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import contextlib
 import importlib.util
-import io
 import linecache
 import sys
 import textwrap
@@ -19,7 +18,7 @@ from typing import Any, ClassVar
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError, nearest
-from fpirhc.fields.checked import Checked, FoundByName, checked_call, mistakes_of
+from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.fields.kinds import call_of, described
 from fpirhc.fields.user_code import explained
 from fpirhc.problem_files.pairs import not_a_pair
@@ -275,9 +274,7 @@ def _imported(path: Path) -> ModuleType:
     except SystemExit as error:
         raise ProblemFileError(_message(path, error, "the file ends the program; leave the exit out")) from None
     except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown with its line
-        with _neighbours(path):
-            every = _MistakesOfFile(path, _empty(path)).text()
-        raise ProblemFileError(every or _message(path, error, _cause_of(error))) from None
+        raise ProblemFileError(_message(path, error, _cause_of(error))) from None
     return module
 
 
@@ -324,77 +321,6 @@ def _neighbours(path: Path) -> Iterator[None]:
                 del sys.modules[name]
 
 
-@dataclass
-class _MistakesOfFile:
-    """All mistakes of a file that has raised an error; Python shows the first.
-
-    The file's statements run once more, one by one. Of a statement that fails or needs what is missing, those calls of fpirhc still
-    run that need nothing missing; of the others, the arguments that are there are checked.
-    """
-
-    path: Path  # of the file
-    module: ModuleType  # its module, without names of the file's own
-    missing: set[str] = field(default_factory=set)  # names that are not defined, because what should define them failed
-    said: dict[int, list[str]] = field(default_factory=dict)  # line -> messages
-
-    def text(self) -> str:
-        """Return every mistake once, by line: "file.py, line 12: source", and the cause below it."""
-        with contextlib.redirect_stdout(io.StringIO()):  # what the file prints is on the screen already
-            for statement in ast.parse(self.path.read_bytes()).body:
-                if self._lacks(statement) or not self._runs(statement):
-                    self.missing |= set(_defined(statement))
-                    for call in _calls(statement):
-                        self._check(call)
-        return "\n".join(
-            f"{_place(self.path, line)}\n{_indented(one)}" for line in sorted(self.said) for one in self.said[line]
-        )
-
-    def _lacks(self, source: ast.AST) -> bool:
-        """Whether a piece of source needs a name that is missing."""
-        return any(isinstance(n, ast.Name) and n.id in self.missing for n in ast.walk(source))
-
-    def _runs(self, statement: ast.stmt) -> bool:
-        """Run a statement; its error is kept."""
-        try:
-            exec(compile(ast.Module([statement], []), self.path, "exec"), vars(self.module))
-        except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown
-            self._keep(statement, error)
-            return False
-        return True
-
-    def _check(self, call: ast.Call) -> None:
-        """Run a call of fpirhc that needs nothing missing; of another one, check the named arguments that do not."""
-        try:
-            one = None if self._lacks(call.func) else self._value(call.func)
-            if not getattr(one, "__module__", "").startswith("fpirhc"):
-                return
-            if not self._lacks(call):
-                self._value(call)
-            elif isinstance(one, type) and issubclass(one, Checked):
-                wrong = tuple(mistakes_of(one, dict(self._named(call))))
-                if wrong:
-                    self._keep(call, InvalidField(wrong))
-        except FpirhcError as error:
-            self._keep(call, error)
-        except Exception:  # noqa: BLE001 -- the statement around it has told it
-            return
-
-    def _named(self, call: ast.Call) -> Iterator[tuple[str, object]]:
-        """Name and value of the named arguments that have one."""
-        for one in call.keywords:
-            if one.arg and not self._lacks(one.value):
-                with contextlib.suppress(Exception):  # an argument that fails is told where it stands
-                    yield one.arg, self._value(one.value)
-
-    def _value(self, source: ast.expr) -> Any:
-        return eval(compile(ast.Expression(source), self.path, "eval"), vars(self.module))
-
-    def _keep(self, source: ast.stmt | ast.expr, error: Exception) -> None:
-        messages = self.said.setdefault(_line(self.path, error) or source.lineno, [])
-        if _cause_of(error) not in messages:
-            messages.append(_cause_of(error))
-
-
 def _message(path: Path, error: BaseException, cause: str) -> str:
     """Return "file.py, line 12: source" of the innermost line of the file in the traceback, and the cause below it."""
     line = _line(path, error)
@@ -426,26 +352,3 @@ def _line(path: Path, error: BaseException) -> int | None:
 
 def _place(path: Path, line: int) -> str:
     return f"{path.name}, line {line}: {linecache.getline(str(path), line).strip()}"
-
-
-def _calls(source: ast.AST) -> Iterator[ast.Call]:
-    """Calls that happen where the source stands, the inner ones first; not those of functions and loops in it."""
-    if isinstance(source, _LATER):
-        return
-    for child in ast.iter_child_nodes(source):
-        yield from _calls(child)
-    if isinstance(source, ast.Call):
-        yield source
-
-
-def _defined(statement: ast.stmt) -> Iterator[str]:
-    for node in ast.walk(statement):
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
-            yield node.id
-        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
-            yield node.name
-        elif isinstance(node, ast.alias):
-            yield node.asname or node.name.partition(".")[0]
-
-
-_LATER = (ast.Lambda, ast.FunctionDef, ast.ClassDef, ast.ListComp, ast.DictComp, ast.SetComp, ast.GeneratorExp)

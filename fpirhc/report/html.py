@@ -20,22 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.report.figures import (
-    colours_of,
-    contraction_figure,
-    limits_figure,
-    lyapunov_figure,
-    mismatch_figure,
-    pair_figures,
-    sweep_cells,
-    sweep_figure,
-    sweep_panels,
-)
+from fpirhc.report.figures import colours_of, contraction_figure, lyapunov_figure, pair_figures
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
-from fpirhc.simulation.pictures.base import readable
-from fpirhc.simulation.run import judged_motion
-from fpirhc.studies.comparison.changes import Outcome
+from fpirhc.studies.comparison.verdict import Outcome
 from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole
 
@@ -44,13 +32,9 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
     from fpirhc.simulation.picture import Drawing
-    from fpirhc.simulation.pictures.base import Kept, Picture
+    from fpirhc.simulation.pictures.base import Picture
     from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.comparison import Comparison
-    from fpirhc.studies.comparison.entry import Entry
-    from fpirhc.studies.operating_limits import OperatingLimits
-    from fpirhc.studies.scenarios.scenario_comparison import ScenarioComparison
-    from fpirhc.studies.sweep import Sweep
+    from fpirhc.studies.comparison.compare import Comparison, Entry
     from fpirhc.studies.view import View
 
 
@@ -67,21 +51,6 @@ _LYAPUNOV = (
     "measured part. A small response error keeps V near zero."
 )
 _CONTRACTION = "Predicted contraction factor against the gain, and the response error's decay"
-_MISMATCH = (
-    "One point per scenario and controller, of thousands every second, fourth and so on; lines join medians of scenarios with "
-    "similar mismatch, crosses at the upper edge are runs that ended early. Mismatch: rms over the parameters of the relative "
-    "distance between the model and the drawn plant. Error: rms error divided by the reference's range, root mean square over the "
-    "coordinates."
-)
-_LIMITS = (
-    "One point per run, crosses are failed ones: above the dashed line by their error, at the upper edge they ended early, below "
-    "the line they left a limit of a state. The first point of a line is the problem as it stands."
-)
-
-_SWEEP = "One cell per run, all maps in one scale of colours. Grey cells failed; rings are the settings as they stand."
-_WINNERS = " The last map shows which controller is best."
-_CELL = "Click on one, or choose it below: its number, and the command of its run."
-_LINES = "One point per run; crosses at the upper edge are runs that failed, dotted lines the settings as they stand."
 
 
 @dataclass(frozen=True)
@@ -104,7 +73,7 @@ def write_report(comparison: Comparison, path: Path) -> None:
 
 def render(comparison: Comparison, lab: str = "") -> str:
     """Return the page's text; `lab` is the address of a page beside it that the reader can go on to."""
-    pair, entries = headline_pair(comparison), comparison.entries
+    pair = headline_pair(comparison)
     own, motions = own_pictures(comparison)
     begin = [e.name for e in pair] if pair else []
     series = {**chart_data(comparison), "bands": BANDS, "begin": begin, "motions": motions}
@@ -119,7 +88,6 @@ def render(comparison: Comparison, lab: str = "") -> str:
             *([planar.script()] if motions else []),
             f"const DATA={data};\n{asset('report.js')}",
         ),
-        predicted=any(e.prediction is not None and e.prediction.tube is not None for e in entries),
         slots=_slots(comparison),
         bands=BANDS,
         pairs=_pairs(*pair) if pair else [],
@@ -219,48 +187,6 @@ def _new_numbers(entry: Entry) -> Iterator[tuple[float, str, float]]:
         last = numbers
 
 
-def write_scenarios(comparison: ScenarioComparison, path: Path) -> None:
-    """Write the report, atomically.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    write_whole(render_scenarios(comparison), path, "report")
-
-
-def render_scenarios(comparison: ScenarioComparison) -> str:
-    """Return the page's text."""
-    figure = mismatch_figure(comparison) if comparison.summaries else None
-    of = comparison.records if comparison.pictures else {}
-    kept = {name: [one.get("pictures", {}) for one in some] for name, some in of.items()}
-    own = [image for wanted in comparison.pictures if (image := _of_cases(wanted, kept))]
-    return render_charted(comparison.view, figure, "Error against mismatch", _MISMATCH, own)
-
-
-def _of_cases(wanted: Picture, kept: Mapping[str, Sequence[Mapping[str, Kept]]]) -> Image | None:
-    """The picture of what was kept of the cases; None where it keeps nothing, or none of its controllers ran."""
-    every = {name: [one[wanted.title] for one in some if wanted.title in one] for name, some in kept.items()}
-    shown = {name: cases for name, cases in every.items() if cases}
-    return _drawn(wanted, list(shown), lambda figure: wanted.draw_cases(figure, readable(shown)))
-
-
-def render_limits(result: OperatingLimits) -> str:
-    """Return the page's text."""
-    return render_charted(
-        result.view, limits_figure(result) if result.limits else None, "Error against what grows", _LIMITS
-    )
-
-
-def render_sweep(result: Sweep) -> str:
-    """Return the page's text."""
-    figure, name = sweep_figure(result), " and ".join(axis.path for axis in result.axes)
-    caption = f"{_SWEEP + _WINNERS * result.ranks if len(result.axes) > 1 else _LINES} {_CELL}"
-    chart = Image(figure.address, f"Over {name}", caption)  # drawn first: only then it is known where its panels lie
-    data = json.dumps({**sweep_cells(result), "panels": sweep_panels(figure, result)}, separators=(",", ":"))
-    script = f"const SWEEP={_in_script(data)};\n{asset('sweep.js')}"
-    return render_page("scenarios.html", result.view, [script], chart=chart, own=(), cells=True)
-
-
 def _in_script(data: str) -> str:
     """JSON as a page's script has it: no text ends the script."""
     return data.replace("<", "\\u003c")
@@ -271,7 +197,7 @@ def render_charted(
 ) -> str:
     """Return the text of a page with a figure, where there is one, below a heading, and with the problem's own pictures."""
     chart = Image(figure.address, heading, caption) if figure else None
-    return render_page("scenarios.html", view, chart=chart, own=own, cells=False)
+    return render_page("scenarios.html", view, chart=chart, own=own)
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:
@@ -378,7 +304,6 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
     charts += _reality_charts(entries, edges)
-    charts += [chart for e in entries for chart in _tubes(e, edges)]
     return {
         "controllers": [
             {
@@ -420,23 +345,6 @@ def _responses(name: str, run: Run, edges: np.ndarray) -> list[dict[str, Any]]:
         lines = [("the model expected", np.concatenate([real[:1], requested[:-1]])), ("the reality did", real)]
         title = f"{name}: response of {c}, observer and reality"
         charts.append({**_chart(title, run.unit(f"deformed.{c}"), lines, edges), "only": name})
-    return charts
-
-
-def _tubes(entry: Entry, edges: np.ndarray) -> list[dict[str, Any]]:
-    """Charts of every coordinate's distance from the model's own run inside the band that was predicted; none without a tube."""
-    prediction, run = entry.prediction, entry.run
-    if prediction is None or prediction.tube is None or not np.isfinite(prediction.tube).all():
-        return []
-    motion = judged_motion(run.layout)  # of which the band is
-    places = {e: k for k, e in enumerate(run.layout[motion].elements)}
-    count, charts = min(run.cycles, len(prediction.tube)), []
-    for c in (c for c in run.layout["error"].elements if c in places):
-        half = prediction.tube[:count, places[c]]
-        apart = run[f"{motion}.{c}"][:count] - prediction.nominal.motion[:count, places[c]]
-        lines = [("distance", apart), ("predicted at most", half), ("predicted at least", -half)]
-        title = f"{entry.name}: {c}, distance from the model's own run"
-        charts.append(_chart(title, run.unit(f"error.{c}"), lines, edges) | {"only": entry.name, "band": [2, 3]})
     return charts
 
 

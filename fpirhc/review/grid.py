@@ -211,13 +211,6 @@ def roomy(problem: Problem, percent: float) -> Problem:
     return replace(problem, dead_time=replace(times, longest={**times.longest, **stated}))
 
 
-def live_paths(problem: Problem) -> tuple[str, ...]:
-    """Return the paths of the dead times of a problem with queues for other ones."""
-    times = problem.dead_time
-    inputs = tuple(f"dead_time.inputs.{name}" for name in times.inputs if name in times.longest)
-    return (*inputs, "dead_time.measurement") if MEASUREMENT in times.longest else inputs
-
-
 def is_late(problem: Problem) -> bool:
     """Whether there is a dead time."""
     return bool(problem.dead_time.measurement or any(problem.dead_time.inputs.values()))

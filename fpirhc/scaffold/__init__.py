@@ -11,8 +11,7 @@ from importlib.machinery import PathFinder
 from importlib.resources import files as resources
 from pathlib import Path
 
-from fpirhc.baselines.baseline import baseline_path
-from fpirhc.baselines.check import accept
+from fpirhc.baselines.baseline import accept, baseline_path
 from fpirhc.errors import InvalidName, OutputError, not_writable
 from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.problem_files.shipped import shipped_problems
@@ -64,7 +63,7 @@ def kept_when_whole(folder: Path) -> Iterator[list[Path]]:
 def first_baseline(problem_file: Path) -> Path:
     """Measure the first baseline of a new problem and return its path."""
     task = load_problem(str(problem_file))
-    _, path = accept(task, "first numbers of a new problem", working=problem_file.parent)
+    path = accept(task, "first numbers of a new problem")
     return path
 
 

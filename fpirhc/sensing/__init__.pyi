@@ -3,7 +3,6 @@
 from .base import DerivativeEstimator, Measured
 from .positions import PositionDifference, SavitzkyGolay, StepDifference
 from .sensing import Sensing, Sensor
-from .state_filter import StateVariableFilter
 from .velocities import LowPassDifference, VelocityDifference
 
 __all__ = [
@@ -14,7 +13,6 @@ __all__ = [
     "SavitzkyGolay",
     "Sensing",
     "Sensor",
-    "StateVariableFilter",
     "StepDifference",
     "VelocityDifference",
 ]

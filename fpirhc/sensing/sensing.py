@@ -72,7 +72,7 @@ def uncovered(
     elif observer is None and missing:
         yield (
             f"measured: {type(estimator).__name__} also needs {', '.join(missing)}; measure it, or state how it is "
-            "believed: Sensing(measured=..., observer=ModelStates())"
+            "believed: Sensing(measured=..., observer=KalmanFilter(...))"
         )
     if plant.outputs:
         yield from _of_outputs(plant, estimator, missing, measured, believes=observer is not None)
@@ -104,9 +104,9 @@ class Sensing(Checked):
             highest derivative of a controlled coordinate ("q1''"). A quantity that is not named is measured perfectly. Of a plant
             with outputs, coordinates are its outputs; with an observer, states may be measured beside them.
         estimator: of state and response from the measured quantities: Measured, VelocityDifference, LowPassDifference,
-            PositionDifference, SavitzkyGolay, StateVariableFilter.
+            PositionDifference, SavitzkyGolay.
         measured: names of the quantities that sensors show; None: all that the estimator needs.
-        observer: how the states that no sensor shows are known: ModelStates, KalmanFilter, MovingHorizonStates. See
+        observer: how the states that no sensor shows are known: KalmanFilter. See
             `fpirhc.sensing.base`.
     """
 

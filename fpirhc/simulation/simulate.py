@@ -27,7 +27,6 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.changes import Changes, InForce, in_force
-from fpirhc.simulation.lanes import Columns, ManyRuns, run_many
 from fpirhc.simulation.loop import close_loop, start_memory
 from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, moving
 from fpirhc.simulation.ranges import Dropped
@@ -186,43 +185,6 @@ class Simulator:
             facts["model is reality"] = model.plant is not problem.plant
         title = name or type(self.controller).__name__
         return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
-
-    def run_many(
-        self,
-        exact: np.ndarray | None = None,
-        *,
-        settings: Mapping[str, Columns] | None = None,
-        starts: Mapping[str, Columns] | None = None,
-        seed: Seed | Sequence[int] | np.ndarray = 0,
-        device: str | None = None,
-    ) -> ManyRuns:
-        """Run many scenarios and return their errors, without logs: side by side in vector registers where the loop can be.
-
-        A scenario has its own exact parameters, numbers of live settings, first states and noise. Every argument has a row or
-        number for each scenario, or one for all. Exact parameters alone take the least time: with
-        settings every scenario's problem is checked (milliseconds), and for every different start the loop is composed again
-        (a tenth of a second) and not compiled.
-
-        Args:
-            exact: parameters, shape (scenarios, parameters), in the order of the parameters of what moves, which is the reality
-                where the problem has one; None: the problem's.
-            settings: numbers of live settings by path, shape (scenarios,) each; an interval by its ends.
-            starts: first values of states by name, shape (scenarios,) each, in their units; other states begin where the problem
-                says.
-            seed: of the noise of disturbances and sensors.
-            device: part of the name of an OpenCL device ('': the first graphics processor, else the first one), for loops that
-                are scalar code; None: the vector registers of this machine.
-
-        Raises:
-            InvalidName: a setting that is not live; no device has this name.
-            InvalidProblem: unknown states, or first values that the problem refuses.
-            InvalidShape: another number of parameters; arguments of different numbers of scenarios.
-            InvalidValue: a number that is not finite, or that a parameter or setting does not accept; a wrong seed.
-            NotInstalled: pyopencl (pip install 'fpirhc[opencl]'), or a device with double precision.
-        """
-        if settings:
-            settings = {**self.live.flat(self.held), **settings}
-        return run_many(self, exact, settings=settings, starts=starts, seed=seed, device=device)
 
 
 @checked_call

@@ -267,11 +267,11 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
         yield
     except NotContractive as error:
         # of a layer above, which is only asked when nothing else follows
-        review = import_module("fpirhc.review.questions.gain")
+        review = import_module("fpirhc.review.review")
         advice = review.recommended_for(problem, controller)
         if advice is None:
             raise
-        raise NotContractive(error.fault, advice.text) from None
+        raise NotContractive(error.fault, f"recommended effective gain {advice:.3g}") from None
 
 
 @contextmanager

@@ -32,7 +32,7 @@ OF_TYPE = """#include <float.h>
 #define FINITE (OF_TYPE(DBL_MAX, FLT_MAX) / 134217728)
 #define TINY (OF_TYPE(DBL_MIN, FLT_MIN) * 67108864)
 """
-# The words with which loops are written once for one number at a time and for numbers side by side (`lanes.c` has those).
+# The words with which the loops in C are written.
 WORDS = """#if defined(__GNUC__)
 #define INLINE static inline __attribute__((always_inline)) /* so that sizes are constants in every loop */
 #else
@@ -85,15 +85,13 @@ class Driver:
 
     # C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys. ROOM
     # is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw; all their
-    # arguments and results have an address. Truths are written by `WORDS`, so that the same text computes numbers side by
-    # side.
+    # arguments and results have an address. Truths are written by `WORDS`.
     text: str
     leaves: Mapping[str, ca.Function]  # generated Functions by key
     constants: Mapping[str, object]  # preprocessor definitions by name
     room: int = 0  # numbers that the driver needs in w
     # (argument, result) that may lie at one place: the argument is not read after the result is begun
     in_place: tuple[int, int] | None = None
-    side_by_side: bool = True  # whether the text keeps to `WORDS`
 
     @property
     def fits(self) -> bool:
@@ -143,12 +141,12 @@ def works_alone(function: ca.Function) -> bool:
 
 
 @contextmanager
-def compiled_plans() -> Iterator[None]:
+def compiled_plans(yes: bool = True) -> Iterator[None]:  # noqa: FBT001, FBT002
     """Within it a loop of the virtual machine calls the compiled plan: a short run is not worth a compiler, its plans are.
 
     What is composed within calls a library, so it cannot be compiled as a whole.
     """
-    token = _COMPILED.set(True)
+    token = _COMPILED.set(yes)
     try:
         yield
     finally:

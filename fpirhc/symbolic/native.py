@@ -26,7 +26,7 @@ from pathlib import Path
 import casadi as ca
 
 from fpirhc.errors import CompileError, NoCode
-from fpirhc.symbolic import dataflow, driver, flat_code, placement, program
+from fpirhc.symbolic import driver, program
 from fpirhc.symbolic.program import NAME, generate
 
 # -ffp-contract=off: no fused multiply-add, so that C and the virtual machine round alike.
@@ -63,23 +63,6 @@ def find_compiler() -> str | None:
         if path:
             return path
     return None
-
-
-def machine_facts() -> dict[str, str]:
-    """Return what decides the last bits of numbers here, apart from packages: compiler, its flags, C library, wide registers.
-
-    Levels of optimisation are left out, because they change no bit.
-    """
-    compiler = find_compiler()
-    flags = [flag for flag in shlex.split(os.environ.get("FPIRHC_CFLAGS", "")) if not flag.startswith("-O")]
-    lines = _version(compiler).splitlines() if compiler else []
-    return {
-        "compiler": lines[0] if lines else "none",
-        "flags": " ".join(flags) or "none",
-        "C library": " ".join(platform.libc_ver()).strip(),
-        "wide registers": " ".join(flag for flag in ("avx2", "fma", "avx512f") if f" {flag} " in _processor())
-        or "none",
-    }
 
 
 def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False, calls: int = 0) -> Native:
@@ -265,10 +248,7 @@ def _note(function: ca.Function, compiler: str, more: Sequence[str], calls: int)
 @cache
 def _writer() -> str:
     """Hash of the code that writes C."""
-    files = (
-        Path(__file__),
-        *(Path(module.__file__ or "") for module in (dataflow, driver, flat_code, placement, program)),
-    )
+    files = (Path(__file__), *(Path(module.__file__ or "") for module in (driver, program)))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
@@ -341,22 +321,6 @@ def _library(sources: Sequence[str], compiler: str, more: Sequence[str]) -> tupl
     if plan.key not in _loaded:
         _loaded[plan.key] = _load(plan)
     return plan.key, _loaded[plan.key]
-
-
-def shared_library(sources: Sequence[str], flags: Sequence[str] = (), libraries: Sequence[str] = ()) -> Path:
-    """Return the path of a library of C files, compiled where it is not in the cache.
-
-    `sources`: C; all but the first may be shared with other libraries. `libraries`: for the linker, such as '-lm'.
-    """
-    compiler = find_compiler()
-    if compiler is None:
-        raise CompileError(why_no_compiler())
-    units, link = [_unit(source, compiler, flags) for source in sources], (compiler, *flags, *_LINK)
-    key = hashlib.sha256("\0".join((*(unit.key for unit in units), *link, *libraries)).encode()).hexdigest()[:32]
-    path = cache_folder() / f"{key}{_suffix()}"
-    if not _is_intact(path):
-        _compile(units, link, path, libraries)
-    return path
 
 
 def _suffix() -> str:

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
+from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Finite, Positive
+from fpirhc.fields.kinds import Positive
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.expression import Expression, Value, total
+from fpirhc.symbolic.expression import Expression, Value
 from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import nominal
 
@@ -99,47 +99,6 @@ class PathConstraint(Limit):
 
 
 @dataclass(frozen=True, eq=False)
-class Ellipsoid(Limit):
-    """Quantities that stay inside an ellipsoid together: sum ((y - centre) / axis)^2 <= 1.
-
-    Args:
-        axes: half axes by name of a state, an output or an input, in their units.
-        centre: the middle by name, in the same units; 0 for names that are left out.
-
-    Raises:
-        InvalidValue: no axis, an axis that is not positive, or a centre of something without axis.
-    """
-
-    axes: Mapping[str, Positive]
-    centre: Mapping[str, Finite] = field(default_factory=dict)
-
-    upper: ClassVar[float] = 1.0
-    unit: ClassVar[str] = "1"
-
-    def __post_init__(self) -> None:
-        if not self.axes:
-            raise InvalidValue(
-                "Ellipsoid(axes={}): expected a half axis by name of at least one state, output or input"
-            )
-        for name in self.centre.keys() - self.axes.keys():
-            raise InvalidValue(f"Ellipsoid(centre): '{name}' has no axis.{nearest(name, list(self.axes))}")
-
-    def value(self, view: OfStage) -> Value:
-        """Return the sum of squares.
-
-        Raises:
-            InvalidName: an axis of something that is no state, output or input.
-        """
-        quantities = {name: part[name] for part in (view.input, view.output, view.state) for name in part}
-        unknown = [name for name in self.axes if name not in quantities]
-        if unknown:
-            raise InvalidName(
-                f"Ellipsoid: '{unknown[0]}' is no state, output or input.{nearest(unknown[0], quantities)}"
-            )
-        return total(((quantities[n] - self.centre.get(n, 0.0)) / axis) ** 2 for n, axis in self.axes.items())
-
-
-@dataclass(frozen=True, eq=False)
 class _Box(Limit):
     part: str  # of a stage, 'input' or 'state', which may have entries of one name
     name: str  # of the entry
@@ -178,7 +137,7 @@ class Limits(Checked):
         inputs: intervals (lower, upper) by name of the input.
         states: intervals (lower, upper) by name of the state (q1, q1', ...).
         rates: intervals of the change of inputs from stage to stage, per second, by name of the input.
-        paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, `Ellipsoid`, or a
+        paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, or a
             `Limit` of your own.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
             path, or by name of an input for its rate ("NAME rate" where a state has that name). The cost then has the term

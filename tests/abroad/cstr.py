@@ -75,7 +75,6 @@ def task(plant, period=PERIOD):
 
 
 problem = task(reactor(1.0, 1.0))
-wrong = task(reactor(0.95, 1.1))
 
 optimiser = fp.FixedPoint(iterations=3, tolerance=1e-2)
 plain = fp.RecedingHorizon(optimiser)

@@ -79,5 +79,4 @@ controllers = {
     "RHC+FPI, increment": fp.RecedingHorizon(optimiser, fp.Increment(own, cycles=LATE / PERIOD)),
     "RHC exact model": fp.ExactModel(plain),
 }
-unpaired = fp.RecedingHorizon(optimiser, replace(own, gain=0.5))
 headline = ("RHC", "RHC+FPI")

@@ -40,24 +40,3 @@ class Tank:
         self.now += seconds
         self.level += seconds * (self.inflow() - 0.5 * self.level)
         self.show(self.level)
-
-
-def errors(tank: Tank, body: fp.ExternalPlant) -> list[float]:
-    """The errors of the level on a ramp: without adaptation, and with it."""
-    found = []
-    for form in (fp.Identity(), fp.ModelReferenced(fp.Affine(gain=-0.5))):
-        tank.begin()
-        task = fp.Problem(
-            plant=TANK,
-            reality=body,
-            sensing=fp.Sensing(estimator=fp.PositionDifference()),
-            reference=fp.Trajectory(lambda t: {"h": 1.0 + 0.1 * t}),
-            start={"h": 1.0},
-            period=PERIOD,
-            duration=3.0,
-            measure_from=1.0,
-        )
-        run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=2.0), form), seed=0, compiled=False)
-        assert run.stop is None
-        found.append(fp.measure(task, run).rms_error["h"])
-    return found

@@ -8,18 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from shutil import copyfile
 
 import numpy as np
 
 import fpirhc as fp
 from attack.problems import line_task
-from fpirhc.baselines.check import read_baseline
 from fpirhc.errors import FpirhcError
-from fpirhc.studies.scenarios.ledger import Ledger
 
-SHIPPED_BASELINE = Path(__file__).resolve().parents[2] / "problems" / "baselines" / "two_mass.json"
-HEADER = {"problem": "line", "seed": 5, "percent": 20.0}
 Read = Callable[[Path], object]
 
 
@@ -52,30 +47,7 @@ def _run_file(folder: Path) -> tuple[Path, Read]:
     return path, read
 
 
-def _ledger(folder: Path) -> tuple[Path, Read]:
-    path, generator = folder / "scenarios.jsonl", np.random.default_rng(0)
-    with Ledger(path, HEADER) as ledger:
-        for k in range(20):
-            ledger.append({"scenario": k, "metrics": {"rms error": float(generator.normal()), "effort": k / 7}})
-
-    def read(path: Path) -> object:
-        with Ledger(path, HEADER) as ledger:
-            return list(ledger.records)
-
-    return path, read
-
-
-def _baseline(folder: Path) -> tuple[Path, Read]:
-    path = folder / SHIPPED_BASELINE.name
-    copyfile(SHIPPED_BASELINE, path)
-    return path, lambda path: repr(read_baseline(path))
-
-
-ARTEFACTS: dict[str, Callable[[Path], tuple[Path, Read]]] = {
-    "saved run": _run_file,
-    "ledger of a study": _ledger,
-    "baseline": _baseline,
-}
+ARTEFACTS: dict[str, Callable[[Path], tuple[Path, Read]]] = {"saved run": _run_file}
 
 
 def flipped(name: str, folder: Path, count: int, *, seed: int) -> Flips:

@@ -2,68 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import io
 import os
-import random
 from collections.abc import Iterator
 from pathlib import Path
 
 from attack.problems import LINE
-from fpirhc.cli.main import main
-from fpirhc.cli.verb import shipped
-
-CHEAP = ("accept", "check", "compare", "completion", "list", "new", "review", "run", "solve", "tune")
-WORDS = (
-    "line.py", "line.py", "line.py", "no_such.py", "broken.py", "empty.py", "two_mas", "", ".", "/", "CTC", "CTC+FPI", "CTC+FP",
-    "0", "1", "2", "-1", "1e300", "nan", "inf", "0.1%", "x", "--", "-", "y", "out", "file", "\x00", "ü", "a" * 300, "=", "a=b",
-    "deformation.gain=-0.4", "tracking.rate=nan", "rms error", "*", "../..", "~", "bash", "csh",
-)  # fmt: skip
-FLAGS = ("--help", "--debug", "--no-such-option", "-x", "--out", "--scenarios", "--processes", "--seed", "--no-compile")
-SLOW = ("--trials", "--scenarios", "--seeds", "--processes")  # options with a number that is kept small
-
-
-def random_line(seed: int) -> list[str]:
-    """The words of one command line."""
-    numbers = random.Random(seed)
-    if numbers.random() < 0.05:
-        return [numbers.choice((*WORDS, *FLAGS)) for _ in range(numbers.randrange(3))]
-    name = numbers.choice(CHEAP)
-    options = list(_options(shipped()[name].parser()))
-    words = [name, *(["line.py"] if numbers.random() < 0.7 else [])]
-    for _ in range(numbers.choice((0, 0, 1, 1, 2, 3, 4))):
-        if numbers.random() < 0.6:
-            option, takes = numbers.choice(options)
-            value = numbers.choice(("0", "-1", "1", "2", "x")) if option in SLOW else numbers.choice(WORDS)
-            words += [option, value] if takes and numbers.random() < 0.9 else [option]
-        else:
-            words.append(numbers.choice((*WORDS, *FLAGS)))
-    # What runs is short: one process, few trials, and no compiler.
-    if name == "tune":
-        words += ["--trials", "2", "--seeds", "1"]
-    return words
-
-
-def raw_end(words: list[str]) -> str:
-    """What is wrong with the end of a command line; empty where nothing is. A working folder must have been prepared."""
-    printed, complained = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complained):
-        try:
-            code = main(list(words))
-        except SystemExit as error:  # argparse ends so
-            code = error.code if isinstance(error.code, int) else -1
-        except BaseException as error:  # noqa: BLE001 -- what is looked for
-            return f"{words}: {type(error).__name__}: {error}"
-    name = words[0] if words and words[0] in shipped() else ""
-    documented = {0, 2} if not name else {int(c) for c in shipped()[name].exit_codes}
-    if code not in documented or code == 70:
-        return f"{words}: exit code {code}: {complained.getvalue()[-300:]}"
-    if "Traceback" in complained.getvalue() and "--debug" not in words:
-        return f"{words}: a traceback"
-    if code == 2 and not (printed.getvalue() + complained.getvalue()).strip():
-        return f"{words}: bad input without a word"
-    return ""
 
 
 @contextlib.contextmanager
@@ -85,11 +29,3 @@ def prepared(folder: Path) -> Iterator[None]:
             del os.environ["FPIRHC_CC"]
         else:
             os.environ["FPIRHC_CC"] = compiler
-
-
-def _options(parser: argparse.ArgumentParser) -> Iterator[tuple[str, bool]]:
-    """Long options and whether they take a value."""
-    for action in parser._actions:
-        for option in action.option_strings:
-            if option.startswith("--"):
-                yield option, action.nargs != 0

@@ -98,31 +98,6 @@ def strangers() -> str:
     return _table([["planted in the cache", "code of others run"], *([way, str(int(run))] for way, run in ran.items())])
 
 
-def studies() -> str:
-    """A study that is killed again and again."""
-    from attack.studies import killed_studies
-
-    with tempfile.TemporaryDirectory() as folder:
-        kills = killed_studies(Path(folder) / "study", KILLS, seed=1)
-    return _table(
-        [
-            ["kills of a running study", "results lost", "results doubled", "results with other numbers"],
-            [str(kills.tried), str(kills.lost), str(kills.doubled), str(kills.changed)],
-        ]
-    )
-
-
-def commands() -> str:
-    """Random command lines."""
-    from attack.commands import prepared, random_line, raw_end
-
-    with tempfile.TemporaryDirectory() as folder, prepared(Path(folder) / "work"):
-        ends = [raw_end(random_line(seed)) for seed in range(LINES)]
-    wrong = [end for end in ends if end]
-    rows = [["random command lines", "tracebacks, or codes that are not documented"], [str(LINES), str(len(wrong))]]
-    return f"{_table(rows)}\n\n{_what_went(wrong)}"
-
-
 def problems() -> str:
     """Problem files with mistakes."""
     import pytest
@@ -140,8 +115,6 @@ SECTIONS: dict[str, tuple[str, Callable[[], str]]] = {
     "loop": ("The loop", loop),
     "files": ("Files and processes", files),
     "strangers": ("Other users", strangers),
-    "studies": ("Studies", studies),
-    "commands": ("The command line", commands),
     "problems": ("Problem files", problems),
 }
 

@@ -8,12 +8,10 @@ import pytest
 
 import fpirhc as fp
 from attack.artefacts import ARTEFACTS, flipped
-from attack.commands import prepared, random_line, raw_end
 from attack.faults import FAULTS
 from attack.files import flipped_bits, killed_compilations
 from attack.harness import PROBLEMS, Bench, shipped
 from attack.strangers import planted_and_run
-from attack.studies import killed_studies
 from fpirhc.symbolic.native import find_compiler
 
 QUICK = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("noisy_motor", None))
@@ -67,17 +65,3 @@ def test_flipped_bits_of_files_are_noticed(name, flips, tmp_path):
 def test_no_planted_library_runs(tmp_path):
     """In whatever way another user could have written it."""
     assert {way: ran for way, ran in planted_and_run(tmp_path).items() if ran} == {}
-
-
-@pytest.mark.slow
-def test_a_study_survives_its_kills(tmp_path):
-    """Thirty kills: no result is lost, doubled, or another one."""
-    assert killed_studies(tmp_path / "study", 30, seed=1).wrong == 0
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("seeds", [range(5000, 5020), pytest.param(range(1000), marks=pytest.mark.slow)], ids=len)
-def test_random_command_lines(seeds, tmp_path):
-    with prepared(tmp_path / "work"):
-        ends = [raw_end(random_line(seed)) for seed in seeds]
-    assert [end for end in ends if end] == []

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 import tasks
 
@@ -47,18 +46,6 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
 @pytest.mark.parametrize("gain", [-0.99 * LARGEST, -0.1])
 def test_a_gain_below_the_limit_runs(gain):
     assert fp.simulate(brief(), affine(-0.5), seed=0, settings={"deformation.gain": gain}).stop is None
-
-
-def test_who_asks_for_it_gets_it():
-    """The wrapper changes nothing but the refusal: below the limit the run is the same, bit by bit."""
-    one, other = (
-        fp.simulate(brief(), affine(-0.5, around), seed=0, compiled=False) for around in (lambda m: m, fp.BeyondLimit)
-    )
-    assert np.array_equal(one["command"], other["command"])
-    beyond = fp.simulate(brief(), affine(-1.02 * LARGEST, fp.BeyondLimit), seed=0, compiled=False)
-    assert np.abs(beyond["realised"] - beyond["desired"])[-1].max() > np.abs(one["realised"] - one["desired"])[-1].max()
-    with pytest.raises(NotContractive, match="wrong sign"):
-        fp.simulate(brief(), affine(0.5, fp.BeyondLimit), seed=0)
 
 
 def test_a_map_that_lowers_its_gain_begins_where_it_likes():

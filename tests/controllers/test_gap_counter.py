@@ -12,7 +12,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.gate import AGAIN, Gap, across_gaps, gap_of
+from fpirhc.controllers.gate import AGAIN, Gap, across_gaps
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.status import Status
 from fpirhc.symbolic.block import LONG, Block, compose
@@ -82,17 +82,6 @@ def test_counts_that_cannot_be_are_those_of_the_start(bad):
     assert cycle(gap, bad, fits=True)[:2] == ((0.0, 0.0), Status.OK)
     for good in ((6.0, 0.0), (0.0, 3.0), (6.0, 3.0)):
         assert cycle(gap, good, fits=False)[2] == good if good[0] == 6.0 else (1.0, good[1])
-
-
-def test_the_counter_of_a_problem():
-    """Nothing settles where everything is measured; else the window of the start does, and a filter forgets. It begins at -1."""
-    measured = two_masses()
-    windows = {fp.SavitzkyGolay(window=11, degree=4): 0, fp.StateVariableFilter(bandwidth=100.0): 1}
-    assert gap_of(measured, 7) == Gap(7, 0.0)
-    for estimator, forgets in windows.items():
-        problem = replace(measured, sensing=fp.Sensing(estimator=estimator))
-        assert gap_of(problem, 7) == Gap(7, problem.longest_warm_up + forgets * estimator.settles(2, problem.period))
-    assert Layout(Gap(7, 0.0).memory).start().tolist() == [-1.0, 0.0]
 
 
 def test_a_step_reads_the_gap_where_a_block_knows_it():

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import re
 from dataclasses import replace
-from functools import cache, partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -19,13 +15,9 @@ from plants import pendulum
 from plants import simulated as run
 
 import fpirhc as fp
-from fpirhc.cli.main import main
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import output_chain
-from fpirhc.controllers.slots.slotted import floquet_radius
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue
-from fpirhc.review.review import schedule_stable
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Named
 
@@ -46,120 +38,6 @@ def switches(run_: fp.Run) -> np.ndarray:
 
 
 # Stability of a schedule
-
-
-def test_crane_schedule_is_stable_although_no_slot_is():
-    """The pendulum swings undamped in a cart slot, the cart rolls on in an angle slot; one period shrinks both."""
-    slots = SHIPPED.crane_slots.controllers["slots"]
-    floquet = floquet_radius(SHIPPED.crane_slots.problem, slots.slots, slots.schedule, blend=slots.blend)
-    assert floquet.radius == pytest.approx(0.0485, abs=5e-4)
-    assert floquet.period == pytest.approx(5.3)
-    for values in floquet.eigenvalues.values():
-        assert values.real.max() == pytest.approx(0.0, abs=1e-6)
-
-
-def period_map(problem: fp.Problem, controller: Controller, period: float) -> np.ndarray:
-    """The linear map of state and last command over one period of the schedule, from runs with one entry disturbed.
-
-    It is taken from the second period on, since a run's first slot begins without an offset; the integral and the offset
-    that the next slot begins with follow from state and last command.
-    """
-    size, cycles, names = 1e-4, round(period / problem.period), problem.plant.state.elements
-    before, after = [], []
-    for name in names:
-        result = run(replace(problem, start={e: size * (e == name) for e in names}), controller)
-        at = np.arange(cycles, result.cycles, cycles)
-        ends = np.hstack([result["state"][at], result["command"][at - 1]]) / size
-        before.append(ends[:-1])
-        after.append(ends[1:])
-    return np.linalg.lstsq(np.vstack(before), np.vstack(after), rcond=1e-9)[0].T
-
-
-def test_nonlinear_run_shrinks_by_the_floquet_radius():
-    """Near the set-point, by the wrong model with the deformation: 0.0493 at 5 ms and 0.0487 at 1 ms for 0.0485."""
-    slots = SHIPPED.crane_slots.controllers["slots+FPI"]
-    radius = floquet_radius(SHIPPED.crane_slots.problem, slots.slots, slots.schedule, blend=slots.blend).radius
-    away = []
-    for period in (5e-3, 1e-3):
-        problem = crane({}, period=period, duration=10.6 + 2 * period, limits=fp.Limits())
-        result = np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max()
-        away.append(abs(result / radius - 1))
-    assert away[0] < 0.03
-    assert away[1] < 0.01
-
-
-@pytest.mark.parametrize(
-    ("of_cart", "of_angle", "blend", "radius"),
-    [(True, False, 1.0, 0.150), (False, True, 0.5, 1.266), (True, True, 0.5, 1.460)],
-)
-def test_integrals_and_offsets_are_part_of_the_radius(of_cart, of_angle, blend, radius):
-    """A slow offset, and an integral that starts anew, change the radius from 0.0485 to either side of 1; the run agrees."""
-    slots = SHIPPED.crane_slots.controllers["slots+FPI"]
-    laws = fp.Exponential(rate=1.0, integral=of_cart), fp.Exponential(rate=3.0, integral=of_angle)
-    pair = tuple(replace(s, tracking=law) for s, law in zip(slots.slots, laws, strict=True))
-    slots = replace(slots, slots=pair, blend=blend)
-    assert floquet_radius(SHIPPED.crane_slots.problem, pair, slots.schedule, blend=blend).radius == pytest.approx(
-        radius, rel=1e-3
-    )
-    problem = crane({}, period=2e-3, duration=21.3, limits=fp.Limits())
-    assert np.abs(np.linalg.eigvals(period_map(problem, slots, 5.3))).max() == pytest.approx(radius, rel=0.02)
-
-
-def test_an_unstable_schedule_is_seen_and_grows_so():
-    """The cart-pole's schedule grows by 1.09 per period by Floquet, and the run grows as it says."""
-    slots, problem = SHIPPED.cart_pole_slots.controllers["slots+FPI"], SHIPPED.cart_pole_slots.problem
-    radius = floquet_radius(problem, slots.slots, slots.schedule, blend=slots.blend).radius
-    assert radius == pytest.approx(1.094, abs=1e-3)
-    still = replace(problem, duration=1.21, measure_from=0.0, limits=fp.Limits())
-    assert np.abs(np.linalg.eigvals(period_map(still, slots, 0.6))).max() == pytest.approx(radius, rel=0.02)
-
-
-def test_one_slot_alone_has_the_radius_of_its_eigenvalues():
-    """Without a switch one period is e^(A T), whose radius is e^(largest real part T)."""
-    for integral in (False, True):
-        slot = fp.Slot("q2", fp.Exponential(rate=4.0, integral=integral))
-        floquet = floquet_radius(SHIPPED.mass_spring_slots.problem, [slot], fp.Periodic({"q2": 1.5}), blend=0.1)
-        assert floquet.eigenvalues["q2"].size == 4 + integral
-        assert floquet.eigenvalues["q2"].real.max() == pytest.approx(-0.1, abs=1e-3)
-        assert floquet.radius == pytest.approx(np.exp(1.5 * floquet.eigenvalues["q2"].real.max()), rel=1e-9)
-
-
-def test_no_radius_without_a_set_point_or_a_period():
-    slots = SHIPPED.crane_slots.controllers["slots"]
-    selection = fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=0.5)
-    floquet = floquet_radius(SHIPPED.crane_slots.problem, slots.slots, selection)
-    assert floquet.radius is None
-    assert floquet.reason == "the schedule is not periodic"
-    moving, falling = ((1e-9, 0.0), "still moves"), ((0.0, 1e-9), "no equilibrium")
-    for (speed, angle), reason in (moving, falling):
-        wrong = fp.Trajectory(partial(lambda s, a, t: {"cart": s * t, "angle": a + 0 * t}, speed, angle))
-        problem = replace(SHIPPED.crane_slots.problem, reference=wrong)
-        floquet = floquet_radius(problem, slots.slots, slots.schedule)
-        assert floquet.radius is None
-        assert reason in floquet.reason
-        answer = schedule_stable(problem, slots)
-        assert answer is not None
-        assert answer.change == ""
-
-
-def test_what_a_radius_is_asked_of_is_checked():
-    slots, problem = SHIPPED.crane_slots.controllers["slots"], SHIPPED.crane_slots.problem
-    for schedule, what in (
-        (fp.Periodic({"cart": 1.0, "angel": 1.0}), "'angel' is unknown"),
-        (fp.Periodic({"cart": 1.0}), "never active"),
-    ):
-        with pytest.raises(InvalidProblem, match=what):
-            floquet_radius(problem, slots.slots, schedule)
-
-
-def test_slots_that_get_no_turn_are_noted():
-    slots = SHIPPED.crane_slots.controllers["slots"]
-    late = replace(slots, schedule=fp.Periodic({"cart": 30.0, "angle": 1.0})).notes(SHIPPED.crane_slots.problem)
-    alone = replace(slots, schedule=fp.ByError({"cart": 1.0, "angle": 1.0}, dwell=30.0)).notes(
-        SHIPPED.crane_slots.problem
-    )
-    assert late[0] == "slot 'angle' gets no turn: it would begin at 30 s, and the run ends at 26.5 s"
-    assert alone[0] == "one slot alone gets a turn: it lasts 30 s, and the run ends at 26.5 s"
 
 
 # Relative orders
@@ -208,86 +86,6 @@ def test_chain_of_the_lower_tank():
 
 
 # Schedules
-
-
-def test_fixed_and_periodic_are_the_same_run():
-    problem, slots = crane({"cart": -1.0}, duration=8.0), SHIPPED.crane_slots.controllers["slots+FPI"]
-    spans = [("cart", 0.0, 1.4), ("angle", 1.4, 5.3), ("cart", 5.3, 6.7), ("angle", 6.7, 8.0)]
-    fixed = run(problem, replace(slots, schedule=fp.FixedSchedule(spans)))
-    periodic = run(problem, slots)
-    assert np.array_equal(fixed.log, periodic.log)
-    assert [(round(a, 9), round(b, 9), k) for a, b, k in fixed.spans()] == [
-        (a, b, ("cart", "angle").index(n)) for n, a, b in spans
-    ]
-
-
-def chosen(schedule: Schedule, **changes: Any) -> fp.Run:
-    """The crane with slots that are chosen as it goes."""
-    return run(
-        SHIPPED.crane_slots.problem, replace(SHIPPED.crane_slots.controllers["slots+FPI"], schedule=schedule, **changes)
-    )
-
-
-def test_by_error_keeps_dwell_and_hysteresis():
-    """A slot ends when it has lasted the dwell and another weighted error is clearly larger; then and not otherwise."""
-    weights, dwell, hysteresis = np.array([1.0, 5.0]), 0.7, 0.2
-    result = chosen(fp.ByError({"cart": 1.0, "angle": 5.0}, dwell=dwell, hysteresis=hysteresis))
-    slot, scores = result["slot"][:, 0].astype(int), weights * np.abs(result["error"])
-    assert len(switches(result)) > 10
-    assert min(b - a for a, b, _ in result.spans()[:-1]) == pytest.approx(dwell)
-    assert slot[0] == np.argmax(scores[0])
-    for start, end, active in result.spans():
-        first, last = round(start / result.period), round(end / result.period)
-        free = np.arange(first + round(dwell / result.period), min(last + 1, result.cycles))
-        clear = scores[free, 1 - active] > (1 + hysteresis) * scores[free, active]
-        assert not clear[:-1].any()
-        assert not clear.size or clear[-1] == (last < result.cycles)
-
-
-def test_by_look_ahead_keeps_the_dwell():
-    """No slot is shorter; and with a hysteresis that no prediction exceeds the first slot stays for ever."""
-    weights = {"cart": 1.0, "angle": 1.0}
-    result = chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=0.2))
-    assert len(switches(result)) > 10
-    assert min(b - a for a, b, _ in result.spans()[:-1]) >= 1.0 - 1e-9
-    assert len(chosen(fp.ByLookAhead(weights, dwell=1.0, hysteresis=1e9)).spans()) == 1
-
-
-def test_look_ahead_chooses_what_the_runs_show():
-    """The first slot is the one after which the weighted state is smaller, as runs with each slot alone find."""
-    weights, dwell, random = {"cart": 3.0, "cart'": 1.0, "angle": 1.0, "angle'": 1.0}, 1.0, np.random.default_rng(4)
-    names = SHIPPED.crane_slots.problem.plant.state.elements
-    slots = SHIPPED.crane_slots.controllers["slots exact model"].controller
-    sizes, firsts = np.array([weights[e] for e in names]), []
-    for state in 1e-3 * random.normal(size=(6, 4)):
-        problem = crane(dict(zip(names, state, strict=True)), duration=dwell + 2 * SHIPPED.crane_slots.problem.period)
-        values = []
-        for slot in slots.slots:
-            alone = replace(slots, slots=[slot], schedule=fp.Periodic({slot.coordinate: dwell}))
-            ended = run(problem, fp.ExactModel(alone))["state"][round(dwell / problem.period)]
-            values.append(float(sizes @ ended**2))
-        first = int(run(problem, fp.ExactModel(replace(slots, schedule=fp.ByLookAhead(weights, dwell))))["slot"][0, 0])
-        assert first == np.argmin(values)
-        firsts.append(first)
-    assert set(firsts) == {0, 1}
-
-
-def test_a_slot_without_gain_is_not_chosen():
-    """The angle has the larger error; but tilted by 0.2 rad the force's effect on it is below 99 % of that at the start."""
-    schedule = fp.ByError({"cart": 1e-6, "angle": 1.0}, dwell=0.01)
-    slots = replace(
-        SHIPPED.crane_slots.controllers["slots exact model"].controller, schedule=schedule, smallest_gain=0.99
-    )
-    result = run(crane({"cart": 0.1}, duration=2.0), fp.ExactModel(slots))
-    gain = angle_gain(result["state.angle"])
-    assert gain.min() > 0.99 * gain[0]
-    result = run(crane({"cart": 0.1, "angle'": 0.9}, duration=2.0), fp.ExactModel(slots))
-    gain = angle_gain(result["state.angle"])
-    low = gain < 0.99 * gain[0]
-    # In the dwell of two cycles an active slot may still lose its gain.
-    assert (result["slot"][2:, 0][low[2:] & low[1:-1] & low[:-2]] == 0).all()
-    assert low.sum() > 20
-    assert (result["slot"][:, 0] == 1).any()
 
 
 def pendulum_problem() -> fp.Problem:
@@ -361,47 +159,6 @@ def in_steps(problem: Any, period: float, orders: int) -> fp.Problem:
     )
     start = {**{n: 0.0 for part in chain for n in part}, **problem.start}
     return replace(problem, plant=steps, start=start, period=period, horizon=None, cost=None, judged=names)
-
-
-def masses_in_steps(period: float) -> fp.Problem:
-    """The two masses, of orders 2 and 4, towards rest."""
-    still = replace(
-        SHIPPED.mass_spring_slots.problem,
-        reference=fp.Trajectory(lambda t: {"q1": 0 * t, "q2": 0 * t}),
-        measure_from=0.0,
-    )
-    return in_steps(still, period, 2)
-
-
-SLOW = fp.Exponential(rate=1.0, integral=False)
-
-
-def slow() -> Any:
-    """Slots of the masses whose errors are still there after a period."""
-    slots = SHIPPED.mass_spring_slots.controllers["slots"]
-    pair = [replace(s, tracking=SLOW) for s in slots.slots]
-    return replace(slots, slots=pair, schedule=fp.Periodic({"q2": 0.4, "q1": 0.6}))
-
-
-def test_slots_on_a_map_shrink_by_the_radius_of_the_map():
-    """By the exact model a period of the run is the linear map of the radius, orders 2 and 4, switches and hold included."""
-    problem, slots = replace(masses_in_steps(1e-2), duration=3.01), slow()
-    floquet = floquet_radius(problem, slots.slots, slots.schedule, blend=slots.blend)
-    assert [c.chain.order for c in slots.channels(problem)] == [2, 4]
-    away = np.abs(np.linalg.eigvals(period_map(problem, fp.ExactModel(slots), 1.0))).max()
-    assert away == pytest.approx(floquet.radius, rel=1e-6)
-    assert away != pytest.approx(1.0, abs=1e-2)
-
-
-def test_a_map_is_the_plant_for_short_steps():
-    """The radius of Euler's steps goes to that of the differential equation as the step."""
-    slots = SHIPPED.mass_spring_slots.controllers["slots"]
-    problems = SHIPPED.mass_spring_slots.problem, masses_in_steps(2e-3), masses_in_steps(1e-3)
-    known, *found = (
-        floquet_radius(p, slots.slots, slots.schedule, blend=slots.blend).radius or math.nan for p in problems
-    )
-    away = [abs(one - known) for one in found]
-    assert away[1] == pytest.approx(away[0] / 2, rel=0.05)
 
 
 def referenced(slots: Any, **settings: Any) -> Any:
@@ -685,141 +442,10 @@ def pole_slots(**changes: Any) -> Any:
     return replace(SHIPPED.cart_pole_slots.controllers["slots"], **changes)
 
 
-def crane_with(cart: Any = None, angle: Any = None) -> Any:
-    """The crane's slots, one of them with this map."""
-    maps = zip(SHIPPED.crane_slots.controllers["slots"].slots, (cart, angle), strict=True)
-    return crane_slots(slots=tuple(slot if map is None else replace(slot, deformation=map) for slot, map in maps))
-
-
-def alone(response: Any, *names: str, controlled: tuple[str, ...] = ()) -> fp.Problem:
-    """Coordinates that one force moves, at .1 m, to rest."""
-    plant = fp.Plant(
-        coordinates=dict.fromkeys(names, "m"),
-        inputs={"F": "N"},
-        controlled=controlled or names,
-        parameters={"m": fp.Parameter(1.0, 1.3, "kg")},
-        response=response,
-    )
-    still = fp.Trajectory(lambda t: dict.fromkeys(names, 0 * t))
-    return fp.Problem(plant, still, dict.fromkeys(names, 0.1), period=1e-2, duration=1.0, judged=names)
-
-
-def counted(texts: tuple[str, ...]) -> tuple[str, ...]:
-    """With the number of mistakes, where there are several."""
-    return texts if len(texts) == 1 else (*texts, f"{len(texts)} mistakes")
-
-
 def slotted(*names: str) -> fp.Slotted:
     return fp.Slotted(
         [fp.Slot(n, fp.Exponential(rate=2.0)) for n in names], fp.Periodic(dict.fromkeys(names, 0.5)), 0.1
     )
-
-
-ONE = fp.Exponential(rate=1.0)
-NO_PATH = alone(lambda q, v, u, p: {"a": u.F / p.m, "b": -q.b, "c": q.a - q.c}, "a", "b", "c", controlled=("a",))
-WRONG_SLOTS = fp.Slot("carts", ONE), fp.Slot("angle", ONE, order=3), fp.Slot("angle", ONE, order=2)
-averaged = cache(
-    lambda: replace(SHIPPED.two_tanks_slots.problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=9, degree=2)))
-)
-FALLS = (
-    "slot 'cart' lasts 1.4 s, in which its zero dynamics, diverging at 3.5 1/s, grow e^4.9 times",
-    "make it shorter than 1.32 s",
-)
-MAP = fp.Sigmoid(gain=-0.5, shift=0.3, scale=10.0)
-QUEUES = {
-    "Paired": fp.Paired(MAP, cycles=2),
-    "Increment": fp.Increment(MAP, cycles=2),
-    "SelfPaired": fp.SelfPaired(MAP, most=5),
-    "Paired, tuned": fp.Tuned(fp.Paired(MAP, cycles=2), largest_gain=5.0),
-    "Increment, damped": fp.Damped(fp.Tuned(fp.Increment(MAP, cycles=2), largest_gain=5.0)),
-    "SelfPaired, guarded": fp.Guarded(fp.SelfPaired(MAP, most=5), largest_deformation=5.0),
-}
-SCHEDULES: dict[str, tuple[Schedule, tuple[str, ...]]] = {
-    "fixed": (fp.FixedSchedule([("cart", 0.0, 1.4), ("angel", 1.0, 3.0), ("cart", 4.0, 30.0)]), (
-        "coordinate 'angel' is unknown. Did you mean 'angle'? Valid: cart, angle.",
-        "'angel' from 1 to 3 s overlaps the slot before it, which ends at 1.4 s; let it start there",
-        "no slot from 3 to 4 s; let 'cart' start at 3 s",
-        "the last slot ends at 30 s, after the run's 26.5 s; let it end there",
-    )),
-    "late": (fp.FixedSchedule([("cart", 0.5, 2.0), ("angle", 2.0, 26.5)]), ("no slot from 0 to 0.5 s; let 'cart' start at 0 s",)),
-    "short": (fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 20.0)]), (
-        "no slot from 20 s to the end of the run at 26.5 s; add one",
-    )),
-    "instant": (fp.FixedSchedule([("cart", 0.0, 2.0), ("angle", 2.0, 2.001), ("cart", 2.001, 26.5)]), (
-        "'angle' from 2 to 2.001 s is shorter than one control cycle of 0.005 s; let it end later",
-    )),
-    "periodic": (fp.Periodic({"cart": -1.0, "angle": 1e-3, "angel": 1.0}), (
-        "coordinate 'angel' is unknown. Did you mean 'angle'?",
-        "duration of 'cart' must be a positive number, in s, got -1.0",
-        "duration of 'angle' is 0.001 s, shorter than one control cycle of 0.005 s",
-    )),
-    "by error": (fp.ByError({"cart": 0.0, "angel": 1.0}, dwell=0.0, hysteresis=-1.0), (
-        "weight of coordinate 'angel' is unknown. Did you mean 'angle'?",
-        "the weight of 'cart' must be a positive number, got 0.0",
-        "dwell must be a positive number, in s, got 0.0",
-        "hysteresis must be a number of at least 0, got -1.0",
-    )),
-    "by look-ahead": (fp.ByLookAhead({"carts": 1.0, "angle": -1.0}, dwell=1e-3), (
-        "weight of state 'carts' is unknown. Did you mean 'cart'?",
-        "weights must be numbers of at least 0, one of them positive, got [1.0, -1.0]",
-        "dwell is 0.001 s, shorter than one control cycle of 0.005 s",
-    )),
-}  # fmt: skip
-LONG_FALLS = (
-    fp.Periodic({"angle": 0.5, "cart": 1.4}),
-    fp.FixedSchedule([("angle", 0.0, 0.5), ("cart", 0.5, 1.0), ("cart", 1.0, 1.9), ("angle", 1.9, 6.0)]),
-    fp.ByError({"angle": 1.0, "cart": 1.0}, dwell=1.4),
-)
-refusals = cache(lambda: {  # the problem or its name, the controller, and what is said
-    **{f"schedule {n}": ("crane_slots", crane_slots(schedule=one), counted(texts)) for n, (one, texts) in SCHEDULES.items()},
-    "slots and schedule": ("crane_slots", crane_slots(slots=WRONG_SLOTS, schedule=fp.Periodic({"carts": 1.0})), counted((
-        "coordinate 'angle' has more than one slot",
-        "slot 'carts': coordinate 'carts' is unknown. Did you mean 'cart'? Valid: cart, angle.",
-        "order=3 is not the relative order from 'F' to 'angle', which is 2; write order=2 or leave it out",
-    ))),
-    "none": ("crane_slots", crane_slots(slots=()), ("there are no slots",)),
-    "nothing to look ahead to": (
-        replace(SHIPPED.crane_slots.problem, reference=fp.Trajectory(lambda t: {"cart": 0.1 * t, "angle": 0 * t})),
-        crane_slots(schedule=fp.ByLookAhead({"cart": 1.0}, dwell=0.1)),
-        ("Slotted: ByLookAhead: the reference still moves at its end, t = 26.5 s; use ByError",),
-    ),
-    "not judged": (replace(SHIPPED.crane_slots.problem, judged=("cart",)), crane_slots(), (
-        "slot 'angle' is not among the coordinates that are judged; write Problem(..., judged=('cart', 'angle'))",
-    )),
-    "no path from the input": (NO_PATH, slotted("a", "b"), (
-        "input 'F' does not reach coordinate 'b'",
-        "(relative order by coordinate: a 2, b none, c 4); choose a coordinate that has one",
-    )),
-    # The pole falls at 3.49 1/s: ln(100) / 3.49 = 1.32 s is the longest cart slot, by any schedule that promises more.
-    **{f"falls, {type(one).__name__}": ("cart_pole_slots", pole_slots(schedule=one), FALLS) for one in LONG_FALLS},
-    # Pairs of cycles before a switch belong to another coordinate; also where another wrapper hides them.
-    **{name: ("crane_slots", crane_with(map), (
-        f"slot 'cart': {name.partition(',')[0]} keeps pairs of earlier cycles, which belong to another slot",
-    )) for name, map in QUEUES.items()},
-    "wrong sign": ("crane_slots", crane_with(angle=fp.Sigmoid(gain=2.0, shift=-0.3, scale=10.0)), (
-        "slot 'angle': Sigmoid(gain=2) has the wrong sign",
-    )),
-    "no scale": ("crane_slots", crane_with(angle=fp.Sigmoid(gain=-2.0)), (
-        "slot 'angle': Sigmoid(scale=None): the scale is still to be chosen",
-    )),
-    "gain behind a mean": (averaged(), SHIPPED.two_tanks_slots.controllers["slots"].with_deformation(fp.Affine(gain=-0.9)), (
-        "its response is of several cycles, so the iteration converges only for",
-    )),
-    "not affine": (alone(lambda q, v, u, p: {"y": (u.F + 0.1 * u.F**3) / p.m}, "y"), slotted("y"), (
-        "derivative 2 of 'y' is not affine in 'F', which a slot needs",
-    )),
-    # In a step of the lower level stands the root of the upper one after a step.
-    "steps": (in_steps(SHIPPED.two_tanks_slots.problem, 0.5, 1), SHIPPED.two_tanks_slots.controllers["slots"], (
-        "derivative 2 of 'h2' is not affine in 'inflow'",
-    )),
-})  # fmt: skip
-
-
-def test_mistakes_are_named():
-    """All of them at once, before the run."""
-    for name, (problem, slots, texts) in refusals().items():
-        message = refused(getattr(SHIPPED, problem).problem if isinstance(problem, str) else problem, slots)
-        assert [text for text in texts if text not in message] == [], name
 
 
 def test_zero_dynamics_that_diverge_little_are_accepted():
@@ -877,29 +503,3 @@ def test_a_saved_run_keeps_its_slots(tmp_path):
     assert np.array(loaded.spans()) == pytest.approx(np.array([(0, 1.4, 0), (1.4, 5.3, 1), (5.3, 6.0, 0)]))
     brief = replace(pendulum_problem(), duration=0.02)
     assert run(brief, fp.ComputedTorque(fp.Exponential(rate=8.0))).spans() == []
-
-
-def test_compare_says_the_radius_and_draws_the_slots(tmp_path, capsys):
-    """The Floquet radius in the text; in the report the bands, their legend, and the times of the slots."""
-    arguments = [
-        str(Path(__file__).parents[2] / "problems" / "crane_slots.py"),
-        "--controllers",
-        "slots",
-        "slots+FPI",
-        "--no-compile",
-        "--out",
-        str(tmp_path),
-    ]
-    assert main(["compare", *arguments]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert (
-        "slots: Floquet radius 0.0485 per period of 5.3 s: near the set-point errors of ideal slots shrink" in printed
-    )
-    assert "(largest real part in each slot alone, 1/s: cart 0, angle 0)" in printed
-    assert "cart from 0.49 to 0.00479 m (102 times less)" in printed
-    report = (tmp_path / "report.html").read_text()
-    legend = report.split("<ul id='bands'>")[1].split("</ul>")[0]
-    assert "slot cart" in legend
-    assert "slot angle" in legend
-    assert "(slots, slots+FPI)" in legend
-    assert re.search(r'"slots": ?\[\[0\.0, ?1\.4, ?0\], ?\[1\.4, ?5\.3, ?1\]', report)

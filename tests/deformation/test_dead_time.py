@@ -15,7 +15,7 @@ from test_adaptation import Scalar
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import FpirhcError, InvalidValue, NotSupported
+from fpirhc.errors import FpirhcError
 
 DELAYS = (0, 1, 2, 3, 5, 10, 20)
 
@@ -244,90 +244,8 @@ def test_bad_dead_times(dead_time, sentence):
         replace(two_mass(), dead_time=dead_time)
 
 
-def with_unknown_delay(deformation, desired, delay, noise, seed=0):
-    """Memories over the run of the scalar plant f = r + a slow disturbance, `delay` cycles late, with noise on the response."""
-    step, requests, errors, memories = Scalar(deformation), [0.0] * (delay + 1), [], []
-    white = noise * np.random.default_rng(seed).standard_normal(len(desired))
-    for k, wish in enumerate(desired):
-        response = requests[-1 - delay] + 0.3 * np.sin(0.01 * k)
-        requests.append(step(requests[-1], response + white[k], wish))
-        errors.append(response - wish)
-        memories.append(step.memory)
-    return np.array(errors), {n: np.array(memories)[:, step.layout.slice(n)] for n in step.layout.names}
-
-
 CYCLES = np.arange(4000)
 WHITE, SQUARE = np.random.default_rng(1).standard_normal(4000), np.sign(np.sin(0.02 * CYCLES))
-SELF_PAIRED = fp.SelfPaired(affine(0.3), most=50)
-
-
-@pytest.mark.parametrize("delay", [0, 3, 10, 30])
-@pytest.mark.parametrize("desired", [WHITE, SQUARE], ids=["white", "square"])
-def test_unknown_dead_time_is_found(desired, delay):
-    """At 20 dB of signal to noise, to one cycle, and the loop that uses it is stable."""
-    _, memory = with_unknown_delay(SELF_PAIRED, desired, delay, noise=0.1)
-    assert np.all(memory["pair_cycles"][:90] == -1)  # nothing is believed at first
-    used = memory["pair_cycles"][2000:]
-    assert np.all(np.abs(used - delay) <= 1)
-    assert np.abs(memory["pair_requests"]).max() < 10
-    assert memory["delay_confidence"].max() > 0.6
-
-
-def test_smooth_requests_tell_no_dead_time():
-    """A sine says nothing about a cycle more or less: no confidence, no adaptation, and nothing grows."""
-    _, memory = with_unknown_delay(SELF_PAIRED, np.sin(0.02 * CYCLES), 30, noise=0.0)
-    assert memory["delay_confidence"][100:].max() < 0.3
-    assert np.all(memory["pair_cycles"] == -1)
-
-
-@pytest.mark.parametrize(("size", "says"), [(0.0, True), (0.3, False)])
-def test_a_run_in_which_no_dead_time_was_found_says_so(size, says):
-    """A sine tells none; with noise in the velocities, and so in the request, one is found, and nothing needs to be said."""
-    noisy = fp.Sensing({f"{n}'": fp.Sensor(fp.Noise(size)) for n in ("q1", "q2")}) if size else fp.Sensing()
-    problem = replace(two_mass(), sensing=noisy, duration=2.0, measure_from=1.0)
-    run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.SelfPaired(SIGMOID, most=5)), seed=0, compiled=False)
-    assert bool((run["paired_cycles"] < 0).all()) == says
-    assert any("no dead time was identified in the whole run" in text for text in run.remarks) == says
-    assert ("adaptation never began" in repr(run)) == says
-
-
-def test_watching_changes_nothing():
-    """The estimate beside a map leaves the run as it is, and is in the run by name."""
-    square = replace(late_mass(), duration=2.0, measure_from=0.0)
-    plain, watched = (
-        fp.simulate(square, fp.ComputedTorque(LAW, d), seed=0, compiled=False)
-        for d in (SIGMOID, fp.DelayWatched(SIGMOID, most=80))
-    )
-    np.testing.assert_allclose(watched["command"], plain["command"], rtol=1e-9)
-    assert watched["dead_time_cycles"].shape == watched["dead_time_confidence"].shape == (square.cycles, 1)
-
-
-def test_bad_settings():
-    for most in (0, 201):
-        with pytest.raises(InvalidValue, match="whole number from 1 to 200"):
-            fp.SelfPaired(SIGMOID, most=most)
-    with pytest.raises(InvalidValue, match=r"SelfPaired.confidence: expected a number above 0 and below 1"):
-        fp.SelfPaired(SIGMOID, most=5, confidence=1.0)
-    with pytest.raises(InvalidValue, match="whole cycles from 0 to 4, the dead time of 4"):
-        fp.Paired(SIGMOID, cycles=4, uncertainty=5)
-    with pytest.raises(InvalidValue, match=r"ByModel.residual_time: expected a finite number above 0"):
-        fp.ByModel(residual_time=0.0)
-    for cycles in (-1, float("inf"), 1001):
-        with pytest.raises(InvalidValue, match="dead time between 0 and 1000"):
-            fp.Paired(SIGMOID, cycles=cycles)
-    with pytest.raises(InvalidValue, match=r"Predicted.inputs: expected a finite number of at least 0"):
-        fp.Predicted(fp.ComputedTorque(LAW), inputs=-0.1)
-    with pytest.raises(
-        InvalidValue, match=r"DeadTime.inputs\['Q1'\]: expected a finite number of at least 0, got -0.1"
-    ):
-        fp.DeadTime(inputs={"Q1": -0.1})
-    with pytest.raises(InvalidValue, match="3000 cycles of dead time, more than 1000"):
-        fp.simulate(two_mass(), fp.Predicted(fp.ComputedTorque(LAW), inputs=3.0), seed=0)
-    cart_pole = fp.load_problem("cart_pole")
-    with pytest.raises(NotSupported, match=r"ByModel\(\)"):
-        fp.simulate(
-            cart_pole.problem, fp.Predicted(cart_pole.controllers["RHC"], inputs=0.1, by=fp.ByDesired()), seed=0
-        )
 
 
 def test_commands_on_their_way_at_the_start():

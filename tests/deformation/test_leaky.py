@@ -14,7 +14,7 @@ import fpirhc as fp
 from fpirhc.contraction.delayed import limit_behind_weights, loop_polynomial
 from fpirhc.deformation import Deformation
 from fpirhc.deformation.base import Iteration, LastRequest, Mirror
-from fpirhc.deformation.leaky import leaky_margin, leaky_pole
+from fpirhc.deformation.leaky import leaky_pole
 from fpirhc.errors import InvalidValue, NotSupported
 
 
@@ -43,40 +43,6 @@ def test_bound_is_tight_for_one_cycle(product):
     """A pole 1 % below the bound of m = 1 leaves some dead time unstable: the bound could not be lower."""
     pole = 0.99 * leaky_pole(product, 1)
     assert max(radius(product, pole, d, d + wrong) for d in (40, 80, 120) for wrong in (-1, 1)) > 1
-
-
-def test_poles_and_margins():
-    """The closed form, its inverse, and a table computed independently of both by bisection over the roots."""
-    table = {
-        0.5: (0.20, 0.42, 0.56, 0.70, 0.84),
-        1.0: (0.33, 0.57, 0.68, 0.79, 0.89),
-        1.5: (0.43, 0.65, 0.75, 0.84, 0.92),
-    }
-    for product, poles in table.items():
-        for wrong, pole in zip((1, 2, 3, 5, 10), poles, strict=True):
-            result = leaky_pole(product, wrong)
-            assert result == pytest.approx(pole, abs=0.006)
-            assert 4 * result / (1 - result) ** 2 == pytest.approx(product * (2 + product) * wrong**2, rel=1e-12)
-            assert leaky_margin(product, result) == pytest.approx(wrong, rel=1e-12)
-    assert leaky_pole(1.0, 0) == 0
-
-
-MARGINS = {  # cycles at d = 20 for the poles 0, .3, .5, .8, .9, .95; 20: any
-    0.5: (0, 1, 3, 20, 20, 20),
-    1.0: (0, 0, 2, 6, 20, 20),
-    1.5: (0, 0, 1, 4, 15, 20),
-}
-
-
-@pytest.mark.parametrize("product", MARGINS)
-def test_margin_table(product):
-    """By how many cycles a dead time of 20 may be wrong, counted with the roots; the formula never promises more."""
-    for pole, margin in zip((0, 0.3, 0.5, 0.8, 0.9, 0.95), MARGINS[product], strict=True):
-        counted = 0
-        while counted < 20 and all(radius(product, pole, 20, 20 + s * (counted + 1)) < 1 for s in (-1, 1)):
-            counted += 1
-        assert counted == margin
-        assert min(20, math.floor(leaky_margin(product, pole))) <= margin
 
 
 @pytest.mark.parametrize("form", [fp.Increment, fp.ModelReferenced])
@@ -177,27 +143,9 @@ def test_delayed_mass_with_an_unknown_dead_time(true):
     assert unknown_rms(true, COVERING) <= 7.6e-3
 
 
-def test_what_a_smooth_task_leaves_of_self_pairing():
-    """No dead time is estimated, so the run is the one without adaptation: 17 mm."""
-    none = unknown_rms(33, fp.Identity())
-    assert none == pytest.approx(0.0174, rel=0.02)
-    assert unknown_rms(33, fp.SelfPaired(FASTEST, most=50)) == pytest.approx(none, rel=1e-9)
-
-
 def test_the_theorem_is_of_the_iteration_alone():
     """Not predicted, the loop around it loses at the longest dead time: .18 m, and .012 without adaptation."""
     assert unknown_rms(48, COVERING, 0.0) > 10 * unknown_rms(48, fp.Identity(), 0.0)
-
-
-@pytest.mark.parametrize("most", [1, 7, 50])
-def test_within_covers_every_dead_time(most):
-    """The map itself decays with every dead time from none to the longest one, whole numbers of cycles or not halved evenly."""
-    deformation = fp.Increment.within(affine(1.0), most)
-    assert deformation.cycles == most / 2
-    pole = deformation.iteration.leak
-    assert leaky_margin(1.0, pole) >= most / 2
-    if most % 2 == 0:
-        assert max(radius(1.0, pole, most // 2, true) for true in range(most + 1)) < 1
 
 
 ESTIMATE_LIMITS = {0: 10.0, 1: 6.0, 2: 4.39, 5: 2.97, 10: 2.41, 20: 2.15}
@@ -269,7 +217,6 @@ def test_a_dead_time_for_every_channel():
         (lambda: fp.ModelReferenced(affine(0.5), cycles=900, measurement=200), "between 0 and 1000"),
         (lambda: leaky_pole(2.0, 1), r"leaky_pole.product: expected .* above 0 and below 2, got 2.0"),
         (lambda: leaky_pole(1.0, -1), "leaky_pole.uncertainty: .* at least 0, got -1"),
-        (lambda: leaky_margin(1.0, 1.0), "leaky_margin.pole: .* below 1, got 1.0"),
     ],
 )
 def test_bad_settings(build, sentence):

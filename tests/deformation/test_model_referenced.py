@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -13,7 +12,6 @@ import pytest
 import tasks
 from exchange import told, with_exact_model
 from kinds import shipped
-from plants import linear
 from test_adaptation import stepping
 from test_anti_windup import overshoot, request_kept, settled, step_of_two_metres
 from test_dead_time import affine
@@ -21,7 +19,6 @@ from test_dead_time import affine
 import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
-from fpirhc.review.questions.right_model import Tried, recommended_form, right_form
 from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
@@ -75,28 +72,6 @@ def test_unit_gain_is_incremental_inversion():
     moves = commands(problem, run, run["desired"] - run["realised"]) - zero
     expected = run["command"][:-1] + moves[1:]
     assert np.abs(run["command"][1:] - expected).max() <= 1e-12 * np.abs(expected).max()
-
-
-@pytest.mark.parametrize("form", [lambda m: m, lambda m: fp.Increment(m, cycles=0), fp.ModelReferenced])
-def test_all_forms_have_the_same_edge(form):
-    """The factor is 1 - a lambda: with lambda = 3 the product 1.9 converges and 2.1 does not, in each form."""
-    problem = fp.Problem(
-        plant=linear(3.0, 1.0),
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}),
-        start={"y": 0.2},
-        period=1e-2,
-        duration=5.0,
-        measure_from=3.0,
-    )
-    errors = {}
-    for product in (1.9, 2.1):
-        controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.BeyondLimit(form(affine(product / 3))))
-        run = fp.simulate(problem, controller, seed=0)
-        late = run.time >= problem.measure_from
-        assert late.any() or "more than a million times" in str(run.stop)
-        errors[product] = np.abs(run["realised"] - run["desired"])[late].max(initial=0.0 if late.any() else np.inf)
-    assert errors[1.9] < 0.1
-    assert errors[2.1] > 1.0
 
 
 # Plans that end at their tolerance, along a hard limit, tell rounding apart: of 3e-16 in a state the next ones make 1e-7, and
@@ -220,7 +195,6 @@ MAPS = (
     fp.Rotation(fraction=0.5, radius=1e4),
     fp.Filtered(fp.Affine(gain=-1.0), pole=0.5),
     fp.Tuned(fp.Sigmoid(gain=-1.2, scale=50.0), largest_gain=0.9),
-    fp.Damped(fp.Affine(gain=-1.0)),
 )
 
 
@@ -327,56 +301,3 @@ def test_the_stored_request_is_not_read():
     """The form costs no memory of the last request: the blocks of the loop do not read it."""
     blocks, _ = fp.ComputedTorque(LAW, fp.ModelReferenced(affine(0.5))).blocks(tasks.two_mass.problem)
     assert all(isinstance(b, Block) and "_deformed_last" not in b.reads for b in blocks)
-
-
-def test_guard_lets_it_pass():
-    """A guard around the form changes nothing while nothing trips, and sets the request to the desired one after a trip."""
-    form = fp.ModelReferenced(fp.Sigmoid(gain=-1.5, scale=50.0))
-    problem = short(tasks.two_mass.problem, 2000)
-    bare, guarded, tight = (
-        fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0, compiled=False)
-        for d in (form, fp.Guarded(form, largest_deformation=1e4), fp.Guarded(form, largest_deformation=1.0))
-    )
-    np.testing.assert_allclose(guarded["command"], bare["command"], rtol=1e-9)
-    tripped = tight["adaptation_event"].ravel() == 3
-    assert tripped.any()
-    np.testing.assert_array_equal(tight["deformed"][tripped], tight["desired"][tripped])
-
-
-def test_review_says_which_form():
-    """Advice with a reason: model-referenced, but plain where the response is estimated late; never a no."""
-    expected = {"two_mass": "model-referenced", "delayed_mass": "model-referenced", "three_link_arm": "plain"}
-    for name, form in expected.items():
-        module = fp.load_problem(name)
-        assert recommended_form(module.problem)[0] == form
-    harmless = lambda _: ""  # noqa: E731
-    assert right_form(tasks.two_mass.problem, fp.ModelReferenced(affine(0.5)), harmless).verdict == "yes"
-    advice = right_form(tasks.two_mass.problem, affine(0.5), harmless)
-    assert advice.verdict == "unknown"
-    assert "it is plain; measurements speak for model-referenced" in advice.evidence
-    assert advice.change == f"Try ModelReferenced(map={affine(0.5)!r})."
-    for own, other, verdict in (
-        (1, 1, "yes"),
-        (1.2, 1, "caution"),
-        (math.nan, 1, "unknown"),
-        (math.inf, math.inf, "unknown"),
-    ):
-
-        def error_of(form, own=own, other=other):
-            share = own if form == affine(0.5) else other
-            return {"q1": Tried(share, "1 m")} if not math.isnan(share) else {}
-
-        ran = right_form(tasks.two_mass.problem, affine(0.5), harmless, error_of)
-        assert ran.verdict == verdict
-        told = "the rms error of q1 is 1 m as it is, 1 m with the model-referenced form" in ran.evidence
-        assert told == math.isfinite(own)
-    two = {"q1": Tried(1.0, "1 m"), "q2": Tried(3.0, "3 m")}, {"q1": Tried(1.1, "1.1 m"), "q2": Tried(2.0, "2 m")}
-    worse = right_form(tasks.two_mass.problem, affine(0.5), harmless, lambda form: two[form != affine(0.5)])
-    assert "of q2 is 3 m as it is, 2 m with" in worse.evidence  # that of q1 would speak against the advice
-    assert worse.change.startswith("Try")
-    decided = right_form(tasks.two_mass.problem, affine(0.5), lambda form: "it loses" if form != affine(0.5) else "")
-    assert decided.verdict == "yes"
-    assert decided.evidence.endswith("; but here it loses, and the form in use does no harm")
-    lost = right_form(tasks.two_mass.problem, affine(0.5), lambda _: "with the wrong model it loses")
-    assert lost.evidence.endswith("; but here with the wrong model it loses")
-    assert "Try" not in lost.change

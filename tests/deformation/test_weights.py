@@ -84,26 +84,6 @@ def test_a_gain_that_converges_with_its_weights_alone_is_not_refused():
         fp.simulate(problem, replace(controller, deformation=large), seed=0, compiled=False)
 
 
-@pytest.mark.parametrize(
-    ("form", "wider"),  # a filter of the error with the pole p has (1 + p) / (1 - p) times the limit
-    [(fp.ModelReferenced, 1.0), (lambda one: fp.Filtered(one, pole=0.5), 3.0), (lambda one: one, 1.0)],
-)
-def test_a_review_sees_the_loop_with_its_weights(form, wider):
-    """Its factor is that of J W, its loop the run's; a suggestion and a prediction keep the weights."""
-    problem, controller = coupled(form(fp.Affine(gain=-1.0, weights=INVERSE)))
-    review = fp.review(problem, {"weighted": controller}, mismatch=0.0, seed=0)
-    answers = {one.question: one for one in review.answers}
-    gain = answers["Is the map's gain admissible?"].numbers
-    assert gain["factor"] == pytest.approx(0.5, abs=1e-3)
-    assert gain["linear_limit"] == pytest.approx(-2.4 * wider, rel=0.01)
-    assert answers["Does the deformation converge?"].verdict == "yes"
-    assert answers["Does adaptation lower the response error?"].verdict == "yes"
-    prediction = fp.predict_response(problem, controller, mismatch=None, compiled=False)
-    assert np.isfinite(prediction.half_width["q"])
-    found = fp.suggest(problem, controller, chatter=1.0, noise={"q": 0.01, "p": 0.01})
-    assert found.deformation.iteration.weights == INVERSE
-
-
 @pytest.mark.parametrize("weights", [(), (1.0, 0.0), ((1.0, 2.0), (2.0, 4.0)), ((1.0, 2.0),)])
 def test_weights_that_are_no_regular_matrix_are_refused(weights):
     with pytest.raises(InvalidValue, match="expected a tuple with a finite number other than zero"):

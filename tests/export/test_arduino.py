@@ -5,31 +5,23 @@ simavr executes the program of an ATmega328P and counts its clocks; avr-gcc, avr
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
-from uno import answered
 
 import fpirhc as fp
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device
-from fpirhc.export.footprint import bytes_here, operations, worst_case
 from fpirhc.export.target import device_of, target_called, write
-from fpirhc.plant.motion import NEWTON_ITERATIONS
 from fpirhc.symbolic.native import find_compiler
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 needs_avr = pytest.mark.skipif(shutil.which("avr-gcc") is None, reason="no avr-gcc (packages gcc-avr and avr-libc)")
-needs_simavr = pytest.mark.skipif(shutil.which("simavr") is None, reason="no simavr (package simavr)")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-ffp-contract=off")
-CYCLES = 60
 
 
 def device(title: str, *, bare: bool = True, cycles: int = 400, problem: str = "two_mass") -> Device:
@@ -58,48 +50,6 @@ def test_a_bare_step_is_the_controllers_own_bit_by_bit(title, tmp_path):
     np.testing.assert_allclose(commands, run["command"][:400], rtol=0, atol=1e-9 * np.abs(run["command"]).max())
 
 
-def test_a_bare_step_has_no_live_settings():
-    """Nothing would check them."""
-    task = fp.load_problem("two_mass")
-    title = "CTC+FPI (eq 6)"
-    with pytest.raises(InvalidValue, match=r"no live settings.*leave out 'deformation.gain' or --bare"):
-        device_of(task.problem, task.controllers[title], title, live=["deformation.gain"], bare=True)
-
-
-def test_operations_are_those_of_the_longest_way():
-    """Scalar code, a map, a switch and a product of matrices, counted by hand; Newton's method to its last iteration."""
-    x = ca.SX.sym("x")
-    three = ca.Function("three", [x], [ca.sin(x) * x + 1])
-    one = ca.Function("one", [x], [2 * x])
-    assert operations(three) == 3
-    assert operations(three.map(5)) == 15
-    assert operations(ca.Function.conditional("either", [one], three)) == 3
-    y = ca.MX.sym("y", 4)
-    both = ca.Function("both", [y], [three(y[0]) + one(y[1])])
-    assert operations(both) == 5
-    a = ca.MX.sym("a", 4, 4)
-    assert operations(ca.Function("product", [a, y], [a @ y])) == 2 * 16
-    error = ca.Function("error", [x], [x * x * x])
-    newton = ca.rootfinder("newton", "fast_newton", error, {"max_iter": NEWTON_ITERATIONS})
-    assert operations(newton) > NEWTON_ITERATIONS * operations(error)
-
-
-@needs_compiler
-def test_a_worst_case_names_missed_cycles_and_bytes():
-    """After missed cycles a step does the work of all of them; a bare one never does. What fewer iterations bring is told."""
-    gated, bare = worst_case(device("CTC+FPI (eq 6)", bare=False)), worst_case(device("CTC+FPI (eq 6)"))
-    assert re.match(r"\d+ operations of a step, 501 times as many after 500 missed cycles", gated)
-    assert re.fullmatch(r"\d+ operations of a step", bare)
-    assert int(bare.split()[0]) < 0.3 * int(gated.split()[0])
-    assert re.match(r"here with -Os: \d+ bytes of code .*, at most \d+ of stack", bytes_here(device("CTC+FPI (eq 6)")))
-    task = fp.load_problem("two_mass")
-    limited = replace(task.problem, limits=replace(task.problem.limits, states={"q1": (1.85, 2.35)}))
-    told = worst_case(device_of(limited, task.controllers["RHC+FPI"], "RHC+FPI", cycles=1))
-    found = re.match(r"(\d+) .* with optimiser\.most_iterations=100\. With 2 there are (\d+): ", told)
-    assert found is not None
-    assert int(found[2]) < int(found[1]) / 25
-
-
 @needs_compiler
 def test_an_arduino_library_computes_in_float(tmp_path):
     """Its sources build here with every warning an error, and their type is float; header and sketch have one name.
@@ -126,39 +76,6 @@ def test_own_functions_in_double_are_refused():
     own = device_of(task.problem, task.controllers[title], title, libm="own", bare=True, cycles=1)
     with pytest.raises(InvalidValue, match="leave --libm out"):
         target_called("arduino").files(own)
-
-
-@needs_avr
-def test_sizes_on_boards_and_what_fits_none(tmp_path):
-    """Without gate in 7 kB of flash, with it in 14 kB; a plan of twenty stages on no board, by so many bytes."""
-    for bare, flash in ((True, 7_000), (False, 14_400)):
-        files = target_called("arduino").files(device("CTC+FPI (eq 6)", bare=bare))
-        *said, clock = str(files["sizes.txt"]).splitlines()
-        assert clock.startswith("In float a time tells its cycle for 4194304 cycles, 4.19e+03 s")
-        assert int(said[0].split()[1]) < flash
-        assert [line.endswith(": fits") for line in said] == [True, True]
-    with pytest.raises(
-        NotSupported,
-        match=r"fits no board: Uno lacks \d+ bytes of flash and \d+ bytes of RAM; Mega.*\. Use fewer stages, or --to cortex-m; "
-        r"with --bare the Mega 2560 still lacks \d+ bytes of RAM$",
-    ):
-        write(device("RHC+FPI", bare=False, cycles=1), target_called("arduino"), tmp_path / "none")
-    assert not (tmp_path / "none").exists()
-
-
-@needs_avr
-@needs_simavr
-@pytest.mark.parametrize(("bare", "longest"), [(True, 2.4e-3), (False, 3.2e-3)])
-def test_an_uno_keeps_pace_with_the_controller(bare, longest, tmp_path):
-    """Commands of a run in float are those of double to a ten thousandth of the largest, in time on an ATmega328P."""
-    one = device("CTC+FPI (eq 6)", cycles=1, bare=bare)
-    write(one, target_called("arduino"), tmp_path)
-    run = fp.simulate(one.problem, one.controller, seed=0)
-    rows = np.hstack([np.reshape(run[n], (len(run.time), -1)) for n in one.inputs.names])[:CYCLES]
-    commands, longest_step = answered(tmp_path, "arm", rows)
-    largest = np.abs(run["command"][:CYCLES]).max()
-    np.testing.assert_allclose(commands, run["command"][:CYCLES], rtol=0, atol=1e-4 * largest)
-    assert longest_step < longest
 
 
 # A motor with a finger on it, held by a library on a simulated board

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.cli.verbs.lab import page_in
 from fpirhc.contraction.spectrum import factors_along, response_jacobians
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidValue, NotSupported
@@ -282,14 +281,6 @@ def test_every_loop_has_a_colour_however_many_there_are(short, monkeypatch):
     [listed] = re.findall(r'"colors":(\[[^]]*\])', text)
     colours = json.loads(listed)
     assert colours[10:] == colours[:2]
-
-
-@pytest.mark.parametrize(
-    ("out", "path"),
-    [("results", "results/two_mass-lab.html"), ("new/", "new/two_mass-lab.html"), ("my.html", "my.html")],
-)
-def test_a_place_without_an_ending_is_a_folder_also_where_it_is_not_there_yet(out, path):
-    assert page_in(Path(out), "two_mass") == Path(path)
 
 
 @pytest.mark.slow

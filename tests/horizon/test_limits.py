@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -19,7 +17,6 @@ from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import improved, paid
 from fpirhc.optimisers.plan import _apart
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Named
 from fpirhc.task.limits import Limit
 
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
@@ -60,7 +57,6 @@ CASES = {
         fp.Limits(paths={"power": fp.PathConstraint(lambda v: v.input.torque * v.state["angle'"], upper=0.5)}),
         (),
     ),
-    "ellipsoid": (fp.Limits(paths={"calm": fp.Ellipsoid({"angle": 0.7, "angle'": 0.9}, centre={"angle": 0.1})}), ()),
     "of somebody else": (fp.Limits(paths={"softly": Softly(upper=5.0)}), ()),
     "terminal": (fp.Limits(), ("angle",)),
     "terminal and rate": (fp.Limits(rates={"torque": (-40.0, 40.0)}), ("angle", "angle'")),
@@ -206,7 +202,6 @@ def test_limits_and_the_end_are_kept_in_every_unit(optimiser):
         (fp.Limits(rates={"torque": (1.0, -1.0)}), (), "swap them"),
         (fp.Limits(paths={"angle": fp.PathConstraint(lambda v: v.state.angle)}), (), "already the name"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.angel, upper=1.0)}), (), "angle"),
-        (fp.Limits(paths={"calm": fp.Ellipsoid({"angel": 1.0})}), (), "'angel' is no state, output or input.*'angle'"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), (), "one scalar"),
         (fp.Limits(soft={"angle": 1.0}), (), "soft: limit of"),
         (fp.Limits(), ("angel",), "angle"),
@@ -397,38 +392,9 @@ def test_prices_are_refused_by_who_cannot_take_them():
         horizon_of(fp.Limits(states={"angle": (0, 1)}, soft={"angle": 1.0}, prices={"angle": 1.0}))
 
 
-def test_an_ellipsoid_that_is_none_is_refused():
-    for given, said in (
-        ({"axes": {}}, "expected a half axis by name of at least one"),
-        ({"axes": {"angle": 0.0}}, r"axes\['angle'\]: expected a finite number above 0"),
-        ({"axes": {"angle": 1.0}, "centre": {"angel": 1.0}}, "'angel' has no axis.*'angle'"),
-    ):
-        with pytest.raises(FpirhcError, match=said):
-            fp.Ellipsoid(**given)
-
-
 def test_a_plan_stays_in_its_ellipsoid():
     """By the sum of squares itself, of every stage that is limited."""
     ocp, data, first = horizon_of(CASES["ellipsoid"][0])
     states = fp.solve(ocp, FIXED, first, data).states
     inside = ((states[0, :-1] - 0.1) / 0.7) ** 2 + (states[1, :-1] / 0.9) ** 2
     assert inside.max() == pytest.approx(1.0, abs=1e-6)
-
-
-def test_every_limit_is_a_member_with_an_interval_and_a_unit():
-    """Boxes, rates, paths and a stranger's own stand side by side, and each says of a stage what it limits."""
-    own = {"calm": fp.Ellipsoid({"angle": 0.5, "torque": 2.0}), "softly": Softly(math.inf)}
-    limits = fp.Limits(
-        inputs={"torque": (-3.0, 4.0)}, states={"angle'": (-1.0, 2.0)}, rates={"torque": (-9.0, 8.0)}, paths=own
-    )
-    members = dict(limits.members(PLANT, step=0.05))
-    names = {"state": ("angle", "angle'"), "input": ("torque",), "input_before": ("torque",)}
-    numbers = {"state": [0.1, 0.7], "input": [1.5], "input_before": [1.0]}
-    stage = SimpleNamespace(output={}, **{part: Named(names[part], ca.SX(numbers[part]), part) for part in names})
-    values = {name: float(ca.SX(one.value(stage))) for name, one in members.items()}
-    expected = {"torque": 1.5, "angle'": 0.7, "torque rate": 10.0, "calm": 0.04 + 0.5625, "softly": 1.25}
-    assert values == pytest.approx(expected)
-    assert [members[n].unit for n in ("torque", "angle'", "torque rate")] == ["N m", "rad/s", "N m/s"]
-    held = {n for n, one in members.items() if one.lower <= values[n] <= one.upper}
-    assert {"torque", "angle'", "calm"} <= held
-    assert "torque rate" not in held

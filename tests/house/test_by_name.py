@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -62,27 +61,9 @@ def stepped() -> Any:
     return stepper.trace(), stepper.numbers, stepper.setpoints, stepper.outdated()
 
 
-def compared() -> Any:
-    """A comparison with its null test and its prediction."""
-    comparison = fp.compare(shortened(), controllers=QUICK, seed=0, compiled=False)
-    prediction = fp.predict_response(
-        shortened().problem, shortened().controllers[QUICK[1]], mismatch=5.0, compiled=False
-    )
-    return comparison, prediction.half_width, prediction.rms(prediction.without)
-
-
 def reviewed() -> Any:
     """A review."""
     return fp.review(shortened().problem, {QUICK[1]: shortened().controllers[QUICK[1]]}, mismatch=5.0, seed=0)
-
-
-def studied(folder: Path) -> Any:
-    """Scenarios and tuning."""
-    names = [headline()[1]]
-    study = fp.compare_scenarios(
-        shortened(), count=1, percent=5.0, seed=0, folder=folder / "one", controllers=names, compiled=False
-    )
-    return study, fp.tune(shortened(), trials=1, seed=0, folder=folder / "two", controllers=names, compiled=False)
 
 
 def test_every_mapping_of_a_problem_file_has_one_error_for_a_missing_name():
@@ -90,13 +71,9 @@ def test_every_mapping_of_a_problem_file_has_one_error_for_a_missing_name():
     holds(tasks.two_mass, least=12)
 
 
-@pytest.mark.parametrize(("made", "least"), [(measured, 20), (stepped, 4), (compared, 30), (reviewed, 10)])
+@pytest.mark.parametrize(("made", "least"), [(measured, 20), (stepped, 4), (reviewed, 10)])
 def test_every_mapping_of_a_result_has_one_error_for_a_missing_name(made, least):
     holds(made(), least)
-
-
-def test_every_mapping_of_a_study_has_one_error_for_a_missing_name(tmp_path):
-    holds(studied(tmp_path), 20)
 
 
 def holds(value: Any, least: int) -> None:

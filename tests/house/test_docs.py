@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import pytest
 
 import fpirhc as fp
-from fpirhc.cli.main import main
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.members import FAMILIES, member_classes
@@ -56,23 +55,6 @@ def test_code_runs(page, tmp_path, monkeypatch):
         pytest.importorskip(package, reason="it needs the extra fpirhc[outside]")
     monkeypatch.chdir(tmp_path)
     exec(compile("\n".join(blocks(page)), str(page), "exec"), {"__name__": "__main__"})
-
-
-def test_tutorial_does_what_it_says(tmp_path, monkeypatch, capsys):
-    """Its file compares, a turned sign is refused with the reason, and so is a plant that is too light."""
-    monkeypatch.chdir(tmp_path)
-    text = "\n".join(blocks(DOCS / "tutorial.md")).partition("run = fp.simulate")[0]
-    Path("drone.py").write_text(text)
-    assert main(["compare", "drone.py"]) == 0
-    output = capsys.readouterr().out.replace("\n", " ")
-    assert "from 0.0235 to 1.28e-5 m" in output
-    Path("turned.py").write_text(text.replace("gain=-2.1", "gain=2.1"))
-    assert main(["compare", "turned.py"]) == 2
-    assert "has the wrong sign" in capsys.readouterr().err
-    Path("light.py").write_text(text.replace("exact=1.6", "exact=0.2"))
-    assert main(["compare", "light.py"]) == 2
-    assert "is too large, and runs in BeyondLimit(map) alone" in capsys.readouterr().err.replace("\n", " ")
-    assert main(["review", "light.py", "--controllers", "RHC+FPI"]) == 1
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/tutorial.md", "fpirhc/scaffold/problem.txt"])
@@ -172,14 +154,6 @@ def test_the_readme_says_at_once_what_the_method_asks_for():
     """Before anything can be tried: the response is measured or estimated in every cycle, and its noise reaches the command."""
     begin = " ".join(README.partition("## ")[0].split())
     assert "must be measured or estimated in every cycle, and its noise reaches the command" in begin
-
-
-def test_problem_of_the_readme_runs(tmp_path, monkeypatch, capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    monkeypatch.chdir(tmp_path)
-    Path("pendulum.py").write_text(code)
-    assert main(["compare", "pendulum.py"]) == 0
-    assert "RHC+FPI lowers the rms error of angle" in capsys.readouterr().out.replace("\n", " ")
 
 
 # Pages of theory name modules that are there

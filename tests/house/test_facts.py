@@ -10,22 +10,16 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
 from reviewed import about, answers, mass, torque
 
 import fpirhc
 import fpirhc as fp
-from fpirhc.baselines.measuring import first_plan
-from fpirhc.conformance import check_deformation
-from fpirhc.conformance.deformation_facts import check_deformation_facts
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
 from fpirhc.controllers.contract import resolved, with_optimiser, without_deformation
-from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Reach, Wrapper, automatic
+from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
-from fpirhc.simulation.lyapunov_view import lyapunov_view
-from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.studies.open_loop import with_optimisers
 
 TRACK = fp.Exponential(rate=6.0)
@@ -117,98 +111,6 @@ def test_a_users_map_is_reviewed_as_the_shipped_one_that_it_equals():
     } == shipped
 
 
-def test_a_users_map_keeps_the_laws_and_a_liar_does_not():
-    """A map without wrappers is constant by itself; one that tells what is not so is found."""
-    check_deformation(Gentle(-0.5), seed=1)
-
-    @dataclass(frozen=True)
-    class Steady(fp.Damped):
-        @property
-        def iteration(self):
-            return self.map.iteration
-
-    @dataclass(frozen=True)
-    class Quick(fp.Filtered):
-        @property
-        def iteration(self):
-            return self.map.iteration
-
-    @dataclass(frozen=True)
-    class Early(fp.Paired):
-        @property
-        def iteration(self):
-            return replace(super().iteration, pairing=Pairing(2.0))
-
-    @dataclass(frozen=True)
-    class Boundless(fp.RFPT):
-        iteration = Iteration()
-
-    @dataclass(frozen=True)
-    class Narrow(fp.RFPT):
-        iteration = Iteration(reach=Reach("offset", 1e6))
-
-    @dataclass(frozen=True)
-    class Finished(fp.Sigmoid):
-        def with_scale_for(self, demand):  # noqa: ARG002
-            return self
-
-    @dataclass(frozen=True)
-    class Stubborn(fp.Filtered):
-        def __post_init__(self):
-            object.__setattr__(self, "pole", 0.5 * self.pole)
-
-    @dataclass(frozen=True)
-    class Boasting(fp.Filtered):
-        def shown(self):
-            return {"filtered": "filter_error", "hidden": "filter_state"}
-
-    @dataclass(frozen=True)
-    class Confused(fp.Filtered):
-        def held(self, request, memory):
-            return {**super().held(request, memory), "filter_error": ca.vertcat(request, request)}
-
-    @dataclass(frozen=True)
-    class Inverse(fp.Sigmoid):
-        gain_name = "shift"
-
-    @dataclass(frozen=True)
-    class Blind(fp.Affine):
-        mirror = Mirror()
-
-    inner = fp.Affine(gain=-1.0)
-    liars = {
-        Steady(inner): "constant map",
-        Quick(inner, pole=0.5): "filter and pairing",
-        Early(inner, cycles=3): "filter and pairing",
-        Boundless(offset=10.0, sign=-1, gain=0.05): "reach",
-        Narrow(offset=10.0, sign=-1, gain=0.05): "reach",
-        Finished(gain=-0.5): "automatic settings",
-        Stubborn(inner, pole=0.5): "inner can be exchanged",
-        Inverse(gain=-0.5, scale=5.0): "gain is proportional",
-        Blind(gain=-0.5): "exact model is left alone",
-        Boasting(inner, pole=0.5): "shown is remembered",
-        Confused(inner, pole=0.5): "held keeps the memory",
-    }
-    for liar, law in liars.items():
-        with pytest.raises(AssertionError, match=f"breaks the law '{law}"):
-            check_deformation_facts(liar, seed=1)
-
-
-def test_facts_go_through_wrappers():
-    """Reach, pairing, pole and what is automatic are those of the map inside; a wrapper with a memory is not constant by itself."""
-    inside = fp.Paired(fp.Filtered(fp.RFPT(offset=1e3, sign=-1, gain=1e-4), pole=0.3), cycles=4, uncertainty=1)
-    outside = fp.Damped(inside)
-    assert (outside.iteration.reach, outside.iteration.pairing, outside.iteration.error_pole) == (
-        Reach("offset", 1e3),
-        Pairing(4, 1),
-        0.3,
-    )
-    assert inside.iteration.constant
-    assert not outside.iteration.constant
-    assert automatic(fp.Damped(fp.Sigmoid(gain=-0.5))) == ("scale",)
-    assert isinstance(inside, Wrapper)
-
-
 # Automatic settings
 
 
@@ -224,13 +126,6 @@ def test_a_users_controller_takes_the_recommended_map(wrap):
     assert run.stop is None
     limit: Any = run.settings["step_limit"]
     assert limit > 0
-
-
-def test_settings_are_chosen_for_the_problem_that_the_inner_controller_sees():
-    """An exact model chooses a plan's scale with the exact gain 1 / 1.0, another one with the approximate 1 / 1.5."""
-    problem, plan = mass(**LOOKING_AHEAD), replace(PLAN, deformation=fp.Damped(fp.Sigmoid(gain=-0.5)))
-    own, exact = (resolved(problem, twice(c)).deformation.largest_step() for c in (plan, fp.ExactModel(plan)))
-    assert [own, exact] == pytest.approx([40.0 / 1.5, 40.0], rel=1e-2)
 
 
 # Controllers
@@ -264,55 +159,6 @@ def test_an_estimating_controller_is_reviewed_with_its_learning():
     assert about(told, "margin").numbers["radius"] == pytest.approx(
         (deviation[3500] / deviation[2500]) ** 1e-3, abs=2e-5
     )
-
-
-def test_plan_metrics_are_those_of_the_planner_inside():
-    """The first plan of a baseline, whatever is around: estimating, predicting, exact, or a user's own."""
-    task = replace(fp.load_problem("leaking_tanks"), controllers={})
-    plain = task_plans(task, fp.load_problem("leaking_tanks").controllers["RHC"])
-    assert plain["plan.status"] == "OK"
-    for wrap in (twice, fp.ExactModel, lambda c: fp.Predicted(c, inputs=1.0)):
-        assert task_plans(task, wrap(fp.load_problem("leaking_tanks").controllers["RHC"])) == plain
-    assert task_plans(task, fp.load_problem("leaking_tanks").controllers["RHC offset-free"]) == plain
-    assert task_plans(task, fp.ComputedTorque(TRACK)) == {}
-
-
-def task_plans(task, controller) -> Any:
-    """Metrics of the first plan."""
-    return first_plan(task, task.problem, controller)
-
-
-def test_optimality_and_lyapunov_see_through_wrappers():
-    """The same figures with two wrappers around; a controller that learns has no plans that could be solved again."""
-    problem = mass(**LOOKING_AHEAD)
-    for controller in (PLAN, twice(PLAN)):
-        run = fp.simulate(problem, controller, seed=0, compiled=False)
-        optimality = measure_optimality(problem, controller, run, compiled=False)
-        assert optimality is not None
-        assert optimality.plans > 10
-        assert 0 <= optimality.worst < 1e-2
-    estimating = fp.Estimating(PLAN, FILTER)
-    run = fp.simulate(problem, estimating, seed=0, compiled=False)
-    assert measure_optimality(problem, estimating, run, compiled=False) is None
-    law = fp.ComputedTorque(TRACK)
-    run = fp.simulate(problem, law, seed=0, compiled=False)
-    plain = lyapunov_view(problem, law, run)
-    assert plain is not None
-    wrapped = lyapunov_view(problem, twice(law), run)
-    assert wrapped is not None
-    assert plain.text == wrapped.text
-    assert lyapunov_view(problem, fp.ComputedTorque(fp.Fractional(6.0, 0.9)), run) is None
-
-
-def test_plans_on_a_predicted_state_are_judged_from_there():
-    """The plans of a predicting controller begin where and when the command acts: solved again, nearly optimal."""
-    problem = mass(dead_time=fp.DeadTime(inputs={"u": 2e-3}), **LOOKING_AHEAD)
-    controller = fp.Predicted(PLAN, inputs=2e-3)
-    run = fp.simulate(problem, controller, seed=0, compiled=False)
-    optimality = measure_optimality(problem, controller, run, compiled=False)
-    assert optimality is not None
-    assert -1e-6 < optimality.worst < 1e-2
-    assert lyapunov_view(problem, fp.Predicted(fp.ComputedTorque(TRACK), inputs=2e-3), run) is None
 
 
 def test_optimisers_vary_inside_wrappers():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ import pytest
 import fpirhc as fp
 from fpirhc import errors
 from fpirhc.errors import InvalidField, InvalidName
-from fpirhc.members import FAMILIES, FORMER, examples, member_classes, member_modules
+from fpirhc.members import FAMILIES, examples, member_classes, member_modules
 
 
 def imported(path: Path) -> set[str]:
@@ -73,15 +72,6 @@ def test_modules_of_the_review_are_found_beside_its_function(first):
         "assert callable(fp.review); assert fp.review.__name__ == 'review'"
     )
     subprocess.run([sys.executable, "-c", f"import sys; {code}"], check=True, timeout=60)
-
-
-@pytest.mark.parametrize("name", FORMER)
-def test_a_former_name_leads_to_the_present_one(name):
-    """The message has the name that took its place, which exists."""
-    *module, member = FORMER[name].split(".")
-    assert hasattr(importlib.import_module(".".join(["fpirhc", *module])), member)
-    with pytest.raises(InvalidName, match=f"^fpirhc.{name} is called fpirhc.{FORMER[name]} now.$"):
-        getattr(fp, name)
 
 
 PLANT: Any = fp.Plant

@@ -93,10 +93,7 @@ def around(member: Any, family: str, order: int) -> Controller:
     return fp.Estimating(fp.ComputedTorque(TRACK), member)
 
 
-LEARNERS = (
-    fp.RecursiveLeastSquares({"m": UNCERTAIN}, noise={"y": 0.1}, time=1.0),
-    fp.MovingHorizon({"m": UNCERTAIN}, noise={"y": 0.1}, window=10, time=1.0),
-)
+LEARNERS = (fp.RecursiveLeastSquares({"m": UNCERTAIN}, noise={"y": 0.1}, time=1.0),)
 MEMBERS: dict[str, Callable[[int], Controller]] = dict(CONTROLLERS)
 OF_CLASS: dict[str, list[str]] = {name: [name] for name in CONTROLLERS}  # the examples of each member
 for family, found in (

@@ -21,10 +21,7 @@ from fpirhc.symbolic.expression import Signals
 PERIOD = 0.01
 TRACK = fp.ComputedTorque(fp.Exponential(rate=2.0))
 LEARNED = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
-LEARNERS = {
-    "RLS": fp.RecursiveLeastSquares(LEARNED, {"y": 0.1}, 5.0),
-    "MHE": fp.MovingHorizon(LEARNED, {"y": 0.1}, 20, 5.0),
-}
+LEARNERS = {"RLS": fp.RecursiveLeastSquares(LEARNED, {"y": 0.1}, 5.0)}
 LATE = {
     "input": fp.DeadTime(inputs={"u": 0.05}),
     "fraction": fp.DeadTime(inputs={"u": 0.033}),
@@ -266,11 +263,7 @@ def test_a_new_estimate_changes_the_command_between_plans():
     np.testing.assert_allclose(held["command"], held["planned"], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "replanning",
-    [fp.FromMeasurement(), fp.FromMeasurementTracked(fp.Exponential(rate=5.0)), fp.FromPlan(fp.Exponential(rate=5.0))],
-    ids=str,
-)
+@pytest.mark.parametrize("replanning", [fp.FromMeasurement(), fp.FromPlan(fp.Exponential(rate=5.0))], ids=str)
 def test_acting_in_every_cycle_rejects_a_disturbance_better(replanning):
     """A push that changes within a plan's time: less error at the rate of the deformation than at that of the plans."""
     problem = spring(plant=linear(1.0, 1.0), disturbances={"y": fp.Sine(2.0, 4.0)}, measure_from=1.0)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any, cast
 
 import casadi as ca
@@ -16,15 +14,12 @@ import tasks
 from forms import FORMS
 
 import fpirhc as fp
-from fpirhc.cli.main import main
 from fpirhc.conformance.laws import check_live
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import CompileError, InvalidName, InvalidValue, NotContractive, NotSupported
 from fpirhc.problem_files.problem_file import with_numbers_of_all
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.simulate import simulator
-from fpirhc.studies.scenarios.bench import Bench, Conditions
-from fpirhc.studies.scenarios.draws import TUNING
 from fpirhc.studies.tune import tune
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.live import live_number
@@ -192,57 +187,6 @@ def test_a_stepper_refuses_numbers_and_keeps_the_old_ones():
         stepper.change({"deformation.gian": -0.3})
 
 
-def test_the_command_line_sets_numbers(tmp_path, monkeypatch, capsys):
-    """A live setting and an interval; wrong texts exit with a sentence."""
-    monkeypatch.chdir(tmp_path)
-    line = (
-        "import fpirhc as fp\n"
-        "plant = fp.Plant({'q': 'm'}, {'u': 'N'}, {'m': fp.Parameter(1.2, 1.0, 'kg')}, lambda q, v, u, p: {'q': u.u / p.m}, 2)\n"
-        "problem = fp.Problem(plant, fp.Trajectory(lambda t: {'q': 0 * t + 1}), {'q': 0.0}, 1e-2, 0.5,\n"
-        "    limits=fp.Limits(inputs={'u': (-50.0, 50.0)}))\n"
-        "controllers = {'C': fp.ComputedTorque(fp.Exponential(rate=4.0), fp.Affine(gain=-0.5))}\n"
-    )
-    (tmp_path / "line.py").write_text(line)
-    settings = ["--set", "deformation.gain=-0.7", "--set", "limits.inputs.u=-5,3", "--no-compile"]
-    assert main(["run", "line.py", "C", *settings]) == 0
-    assert "settings from 0 s: deformation.gain = -0.7, limits.inputs.u.0 = -5, limits.inputs.u.1 = 3" in " ".join(
-        capsys.readouterr().out.split()
-    )
-    run = fp.load_run(tmp_path / "results" / "line" / "C.npz")
-    assert run["command"].max() == 3.0
-    for text, words in (
-        ("deformation.gian=1", "gain"),
-        ("deformation.gain=x", "PATH=NUMBER"),
-        ("deformation.gain=2", "sign"),
-    ):
-        assert main(["run", "line.py", "C", "--set", text]) == 2
-        assert words in capsys.readouterr().err
-    check_numbers_of_the_problem(capsys)
-
-
-def check_numbers_of_the_problem(capsys):
-    """Parameters, the start and the duration are the problem's, in one run and in a comparison of all controllers."""
-    own = ["--set", "m.exact=1.6", "--set", "start.q=0.2", "--set", "duration=0.3", "--no-compile"]
-    assert main(["run", "line.py", "C", "--set", "deformation.gain=-0.7", *own]) == 0
-    task = fp.load_problem("line.py")
-    problem = replace(task.problem.with_exact(np.array([1.6])), start={"q": 0.2}, duration=0.3)
-    controller = task.controllers["C"].with_deformation(fp.Affine(gain=-0.7))
-    expected = fp.simulate(problem, controller, seed=0, compiled=False)
-    np.testing.assert_array_equal(fp.load_run(Path("results/line/C.npz"))["state"], expected["state"])
-    assert main(["compare", "line.py", "--set", "deformation.gain=-0.7", *own]) == 0
-    [row] = json.loads(Path("results/line/results.json").read_text())["controllers"].values()
-    assert row["rms_error"]["q"] == pytest.approx(fp.measure(problem, expected).rms_error["q"], rel=1e-12)
-    capsys.readouterr()
-    for words, why in (
-        (["run", "line.py", "C", "--set", "exact.mm=1"], "there is no 'mm'. Did you mean 'm'?"),
-        (["compare", "line.py", "--set", "deformation.gian=1"], "gain"),
-        (["compare", "two_mass", "--controllers", "CTC", "--set", "deformation.gain=-1"], "(Identity) has no 'gain'"),
-        (["compare", "line.py", "--set", "start.q=1", "--scenarios", "2"], "--set cannot be combined with --scenarios"),
-    ):
-        assert main(words) == 2
-        assert why in capsys.readouterr().err
-
-
 def test_a_number_that_a_controller_has_itself_is_its_own_in_a_comparison():
     """The others follow the problem's, as each would in a run; where all have their own the problem's stays."""
     own = cast(Any, replace)(by_plan(), cost=brief().cost)
@@ -291,21 +235,6 @@ def test_gains_scales_weights_and_limits_change_without_a_jump(name, numbers):
     """The command changes by a usual cycle's change times the factor of a gain; without a rule an integral changes it by 100."""
     jump, usual, _ = jumps(tasks.two_mass.controllers[name], numbers, "command")
     assert np.abs(jump).max() <= 4 * usual
-
-
-@pytest.mark.parametrize("name", ["CTC+FPI (eq 6)", "RHC+FPI"])
-def test_a_search_finds_the_same_with_one_compiled_loop(name, tmp_path):
-    """Every trial costs what a loop costs that is built for it, to 1e-9, so the best settings are the same."""
-    task = replace(tasks.two_mass, problem=brief())
-    tuned = tune(task, trials=4, seed=3, folder=tmp_path, controllers=[name])
-    records = [json.loads(line) for line in (tmp_path / "trials.jsonl").read_text().splitlines()][1:]
-    conditions = Conditions(3, TUNING, 0.0, compiled=False)
-    costs = []
-    for record in records:
-        built = replace(task, controllers={name: fp.with_settings(task.controllers[name], record["settings"])})
-        costs.append(Bench(built, conditions).record(0, name)["error"])
-        assert record["cost"] == pytest.approx(costs[-1], rel=1e-9)
-    assert tuned.entries[0].settings == records[int(np.argmin(costs))]["settings"]
 
 
 def test_a_search_among_whole_numbers_builds_a_loop_for_each(tmp_path):

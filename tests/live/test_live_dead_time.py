@@ -14,8 +14,6 @@ import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.simulation.simulate import simulator
-from fpirhc.studies.scenarios.bench import Bench, Conditions
-from fpirhc.studies.scenarios.draws import COMPARING
 from fpirhc.task.dead_time import DeadTime
 
 LONGEST = {"Q1": 0.012, "Q2": 0.02, "measurement": 0.008}  # s; cycles of 1 ms
@@ -229,23 +227,3 @@ def test_a_device_keeps_its_belief_where_another_is_refused():
     assert not stepper.change({"deformation.cycles": -1.0})
     assert stepper.refused == 2
     assert stepper.numbers == {"deformation.cycles": 7.5}
-
-
-def test_scenarios_share_one_loop_for_all_dead_times():
-    """What a scenario costs does not depend on whether its dead time was set or built."""
-    problem = replace(tasks.delayed_mass.problem, duration=0.1, measure_from=0.0)
-    names = ("CTC+FPI paired", "CTC+FPI increment")
-    task = replace(
-        tasks.delayed_mass, problem=problem, controllers={name: tasks.delayed_mass.controllers[name] for name in names}
-    )
-    conditions = Conditions(3, COMPARING, 20.0, compiled=False)
-    shared, apart = Bench(task, conditions), Bench(task, conditions)
-    apart._shared = {(name, None): None for name in names}
-    for name in names:
-        records = [shared.record(number, name) for number in range(6)]
-        assert records == [apart.record(number, name) for number in range(6)]
-    assert {type(one).__name__ for one in shared._simulators.values()} == {"Simulator"}
-    for name in names:
-        of_name = [id(one) for (owner, _), one in shared._simulators.items() if owner == name]
-        assert len(of_name) > 1
-        assert len(set(of_name)) == 1

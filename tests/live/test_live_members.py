@@ -140,23 +140,6 @@ def test_the_switch_of_slots_may_be_live():
     assert all(t.factor for t in tried), tried
 
 
-def test_schedules_of_slots_are_live():
-    """Durations, dwells, weights: the cycles in which slots begin follow them."""
-    task = fp.load_problem("mass_spring_slots")
-    problem, slotted = replace(task.problem, measure_from=0.0), cast(Any, task.controllers["slots"])
-    first, second = (slot.coordinate for slot in slotted.slots)
-    state = problem.plant.state.elements
-    schedules = {
-        fp.Periodic({second: 0.04, first: 0.06}): [f"durations.{second}", f"durations.{first}"],
-        fp.ByError({first: 1.0, second: 2.0}, dwell=0.05): ["dwell", "hysteresis", f"weights.{first}"],
-        fp.ByLookAhead(dict.fromkeys(state, 1.0), dwell=0.05): ["dwell", "hysteresis", f"weights.{state[0]}"],
-    }
-    for schedule, names in schedules.items():
-        controller = replace(slotted, schedule=schedule)
-        tried = check_live(problem, controller, paths=[f"schedule.{name}" for name in names], cycles=200)
-        assert all(t.factor for t in tried), tried
-
-
 def noisy() -> Problem:
     """Two masses with a noisy, coarse sensor that loses samples, and a noisy force."""
     problem = two_masses()

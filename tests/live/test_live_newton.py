@@ -11,7 +11,6 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance.laws import check_live
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.receding_horizon import StopRun
 from fpirhc.symbolic.live import nan_where
 
 MAP = fp.Sigmoid(gain=-0.3, scale=50.0)
@@ -73,13 +72,6 @@ def test_every_setting_is_live_and_changed_equals_rebuilt(plant, name):
     controller, paths = CONTROLLERS[name]
     tried = check_live(task(plant()), controller, paths=paths, cycles=20)
     assert [one.path for one in tried if one.refused or one.factor is None] == []
-
-
-def test_a_policy_that_stops_keeps_its_settings_live():
-    """`StopRun` ends a run by NaN, which is no lost setting."""
-    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), MAP, on_failure=StopRun())
-    tried = check_live(task(cubic()), plan, paths=["deformation.gain"], cycles=10)
-    assert tried[0].factor is not None
 
 
 def test_an_input_that_newton_does_not_find_is_still_nan():

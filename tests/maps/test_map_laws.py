@@ -216,10 +216,7 @@ def test_the_reference_model_of_a_map_has_its_pole_in_the_cycle() -> None:
     assert deviation == pytest.approx(deviation[0] * 0.7 ** np.arange(40), rel=1e-9)
 
 
-LEARNERS = {
-    "least squares": fp.RecursiveLeastSquares(GROWTH, {"stock": 0.01}, 5.0),
-    "moving horizon": fp.MovingHorizon(GROWTH, {"stock": 0.01}, 5, time=1.0),
-}
+LEARNERS = {"least squares": fp.RecursiveLeastSquares(GROWTH, {"stock": 0.01}, 5.0)}
 
 
 @pytest.mark.parametrize("name", LEARNERS)

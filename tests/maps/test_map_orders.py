@@ -164,19 +164,6 @@ def believed(observer: Any) -> dict[str, Any]:
     return {"sensing": fp.Sensing(estimator=fp.StepDifference(), measured=("y",), observer=observer)}
 
 
-@pytest.mark.parametrize("order", [2, 3])
-def test_states_behind_an_output_of_several_steps_are_believed(order: int) -> None:
-    """By the exact model the run is that of measured states; the output's next values follow from the believed ones."""
-    law = fp.ComputedTorque(fp.Exponential(rate=0.5 / T), fp.ModelReferenced(fp.Affine(gain=-0.5)))
-    runs = [
-        fp.simulate(task(chain(order), **settings), law, seed=0, compiled=False)
-        for settings in ({}, believed(fp.ModelStates()))
-    ]
-    np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], atol=1e-12)
-    np.testing.assert_allclose(runs[1]["output"], runs[0]["output"], atol=1e-12)
-    assert np.ptp(runs[0]["command"]) > 0.1
-
-
 def test_believed_states_of_a_wrong_map_are_corrected() -> None:
     """A fifth of the wrong model's error is left with a filter of the output, and no more than with measured states."""
     measured = task(chain(2, 0.95))

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
-from scipy.signal import cont2discrete, ss2tf
 
 import fpirhc as fp
 from fpirhc.review.grid import review_grid
 from fpirhc.review.loops import loops_along
-from fpirhc.review.questions.convergence import zero_dynamics_rate
 
 T = 10.0  # s, one step
 ITERATION = fp.ModelReferenced(fp.Affine(gain=-1.0))
@@ -97,32 +94,6 @@ def test_questions_about_time_are_not_asked() -> None:
     assert null.evidence.startswith(
         ("predicted rms response error on a right model 0 ", "predicted rms response error on a right model 0,")
     )
-
-
-def test_zero_dynamics_have_the_zeros_of_the_sampled_plant() -> None:
-    """A double integrator with friction, its command held: the zero near -1 is that of scipy's transfer function."""
-    period = 0.1
-    matrices = (np.array(m) for m in ([[0.0, 1.0], [0.0, -2.0]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]]))
-    a, b, c, d, _ = cont2discrete(tuple(matrices), period)
-
-    def later(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        after = ca.DM(a) @ ca.vertcat(x.y, x.v) + ca.DM(b) * p.effect * u.force
-        return {"y": after[0], "v": after[1]}
-
-    plant = fp.Plant.discrete(
-        states={"y": "m", "v": "m/s"},
-        inputs={"force": "N"},
-        parameters={"effect": fp.Parameter(1.0, 1.0, "1")},
-        next=later,
-        step=period,
-        outputs={"y": fp.Output("m", lambda x, _: x.y)},
-    )
-    problem = fp.Problem(plant, fp.Trajectory(lambda t: {"y": 0 * t}), {"y": 0.0, "v": 0.0}, period, 5.0)
-    numerator = ss2tf(a, b, c, d)[0][0]
-    zero = -numerator[2] / numerator[1]
-    rate = zero_dynamics_rate(review_grid(problem, mismatch=0.0, seed=0))
-    assert rate == pytest.approx(np.log(abs(zero)) / period, rel=1e-9)
-    assert -1 < zero < -0.9
 
 
 def test_the_loop_of_a_map_of_the_second_order_has_the_poles_of_its_law() -> None:

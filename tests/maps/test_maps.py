@@ -286,30 +286,6 @@ def test_a_map_outside_is_the_map() -> None:
     assert np.abs(outside["command"] - simulated(task(), controller)["command"]).max() < 1e-12
 
 
-def test_a_state_of_a_map_that_nobody_measures_is_believed() -> None:
-    """With an exact model the observer is the state; a filter's covariance is that of the map's own matrices."""
-    plant = fp.Plant.discrete(
-        states={"a": "1", "b": "1"},
-        inputs={"u": "1"},
-        parameters={},
-        next=lambda x, u, p: {"a": 0.8 * x.a + 0.1 * x.b + u.u, "b": 0.6 * x.b + 0.1 * x.a},
-        step=1.0,
-        controlled=("a",),
-    )
-    observers = fp.ModelStates(), fp.KalmanFilter(measured={"a": 1e-3}, noise={"a": 1e-3, "b": 1e-3})
-    for observer in observers:
-        problem = fp.Problem(
-            plant,
-            fp.Trajectory(lambda t: {"a": ca.sin(0.05 * t), "b": 0 * t}),
-            {"a": 0.0, "b": 0.3},
-            1.0,
-            60.0,
-            sensing=fp.Sensing(measured=["a"], observer=observer),
-        )
-        run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.3)))
-        assert np.abs(run["state.b"] - run["plant_state.b"]).max() < 1e-14
-
-
 def test_a_cascade_on_a_map_iterates_on_its_target() -> None:
     """The pairing's lag is stated; one that is not stated is that of the map's slowest mode z, -T / log|z|."""
     settling = fishery(next=lambda x, u, p: {"stock": 0.8 * x.stock - u.catch})

@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 import pytest
-from loops_in_c import in_lanes, pair, within_its_arrays
+from loops_in_c import pair, within_its_arrays
 
 import fpirhc as fp
 from fpirhc.status import Status
@@ -143,32 +143,3 @@ def test_no_loop_leaves_its_arrays(stepping):
         for scale in (0.0, 0.3, 0.3, np.nan)
     )
     assert within_its_arrays(stepping, calls)
-
-
-@pytest.mark.parametrize("kind", ["step", "converging"])
-def test_plans_side_by_side_are_those_one_after_the_other(kind):
-    """Plans, counts, statuses and memories: of calls that accept and that draw in, with one that overflows, one without a box, and
-    ones that converge sooner than their neighbours. A sine of vectors rounds otherwise.
-    """
-    loops, random = pair(kind, fp.FixedPoint(iterations=3, tolerance=1e-7)), np.random.default_rng(5)
-    far, empty, lost = 5, 11, 17
-    calls = []
-    for k, bounds in enumerate([WIDE, NARROW] * 12):
-        first = (0.02, 0.3, 1.0, 3.0)[k // 2 % 4] * random.normal(size=3)
-        memory = 0.2 * random.normal(size=loops.size) * (k % 3)
-        memory[-2:] = (1e-3, 0.1, 10.0)[k % 3], (1.0, 0.3, 1e-6)[k // 3 % 3]
-        calls.append([first, loops.data, *bounds, memory])
-    calls[far][0] = np.full(3, 1e160)
-    calls[empty][3] = calls[empty][2] - 1.0
-    calls[lost][4] = np.full(loops.size, np.nan)
-    statuses, counts = set(), set()
-    for k, (call, (plan, numbers, memory)) in enumerate(zip(calls, in_lanes(loops.graph, calls), strict=True)):
-        alone = [np.ravel(v.full(), order="F") for v in loops.loops(*call)]
-        assert numbers[4] == alone[1][4], k
-        if k != empty:  # no box, and so no plan to compare
-            close = 1e-6 if kind == "converging" else 1e-8
-            same([plan, numbers[:4], memory[-2:]], [alone[0], alone[1][:4], alone[2][-2:]], close)
-        statuses.add(int(numbers[4]))
-        counts.add(int(numbers[3]))
-    assert statuses > {Status.NON_FINITE, Status.INFEASIBLE}
-    assert len(counts) > 3 or kind == "step"

@@ -13,7 +13,6 @@ from test_outputs import OPTIMISER, hill, planned, sedated
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive, NotSupported
-from fpirhc.studies.comparison.changes import Outcome
 from fpirhc.task.set_point import Setpoint
 
 STATIC = fp.FeedforwardOnly()
@@ -267,16 +266,6 @@ def test_a_review_has_the_linear_loop_of_a_cascade():
     assert radius(1.0, 0.999 * limit) < 1 < radius(1.0, 1.001 * limit)
     assert radius(0.6, 1.001 * limit) < 1
     assert "Do the eigenvalues of the response Jacobian have one sign?" not in answers
-
-
-def test_a_comparison_judges_a_cascade_beside_its_inner_controller():
-    """The inner controller alone is the cascade without adaptation; a null test belongs to the pair."""
-    comparison = fp.compare(tasks.heat_exchanger, seed=0, controllers=["static inverse", "Cascade"], compiled=False)
-    assert comparison.findings[0].pair == ("static inverse", "Cascade")
-    assert comparison.findings[0].outcome is Outcome.BETTER
-    assert "Cascade lowers the rms error of outlet from 0.688 to 0.0573 K" in comparison.findings[0].text
-    assert comparison.null is not None
-    assert comparison.null.pair == ("static inverse", "Cascade")
 
 
 # A cascade on outputs that are expressions of the state, and its way back from a limit

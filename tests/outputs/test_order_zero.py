@@ -292,20 +292,6 @@ def test_a_plan_on_an_output_of_order_zero_is_the_minimum_by_hand() -> None:
         assert run["command.u"][k] == pytest.approx(by_hand, abs=1e-6)
 
 
-def test_plans_on_a_wrong_static_map_are_made_up_for() -> None:
-    """The inverse alone leaves 91 W. Distances of the outputs, a deformation or a law take it back, each of them once."""
-    ways = {
-        "distance": fp.RecedingHorizon(OPTIMISER),
-        "deformation": fp.RecedingHorizon(OPTIMISER, fp.ModelReferenced(affine(0.5))),
-        "own plan": fp.RecedingHorizon(OPTIMISER, replanning=fp.FromPlan(fp.Exponential(rate=3.0, bumpless=False))),
-        "tracked": fp.RecedingHorizon(OPTIMISER, replanning=fp.FromMeasurementTracked(fp.Exponential(rate=3.0))),
-    }
-    problem = planned_power(measure_from=5.0)
-    errors = {name: rms(problem, controller) for name, controller in ways.items()}
-    assert rms(problem, STATIC) > 80
-    assert max(errors.values()) < 6, errors
-
-
 def test_plans_hold_the_emission_of_a_freeway() -> None:
     """On the settled map of a wrong model, the mainstream's swing unknown: no worse than a gentle iteration on targets."""
     task = fp.load_problem("freeway")

@@ -20,8 +20,7 @@ from plants import simulated
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError, InvalidProblem, NotInvertible, NotSupported
-from fpirhc.review.review import predict
+from fpirhc.errors import FpirhcError, InvalidProblem, NotInvertible
 from fpirhc.simulation.loop import close_loop
 
 TRACK = fp.Exponential(rate=6.0)
@@ -342,11 +341,6 @@ def test_a_gain_that_vanishes_on_the_way_is_named_for_several_inputs_too() -> No
         circle(arm(), radius=-0.2)
 
 
-def test_a_policy_that_does_not_cover_outputs_says_so() -> None:
-    with pytest.raises(NotSupported, match="Feedforward needs references"):
-        simulated(planned(), fp.RecedingHorizon(OPTIMISER, on_failure=fp.Feedforward()))
-
-
 def test_a_stepper_is_given_the_outputs_and_does_what_the_loop_does() -> None:
     problem, controller = (
         replace(sedated(hill(5.5)), duration=1.0, measure_from=0.0),
@@ -421,12 +415,3 @@ def test_the_patients_kinetics_conserve_the_drug() -> None:
 
 
 # Reviews
-
-
-@pytest.mark.parametrize(("gain", "verdict"), [(-1.5, "yes"), (-6.0, "no")])
-def test_the_verdict_on_an_output_is_what_a_run_does(gain: float, verdict: str) -> None:
-    problem = sedated(hill(5.5))
-    controller = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.BeyondLimit(fp.Affine(gain)))
-    assert str(predict(problem, controller).verdict) == verdict
-    chatter = np.ptp(np.diff(simulated(problem, controller)["command.u"][600:]))
-    assert (chatter > 1.0) == (verdict == "no")

@@ -21,7 +21,6 @@ import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.horizon.nominal import consistent_state
 from fpirhc.plant.disturbed import disturbed
-from fpirhc.studies.comparison.entry import information
 
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0))
 STATES = {"C": 0.01, "E": 0.01}
@@ -121,36 +120,12 @@ def test_a_plan_does_not_see_a_disturbance_of_the_response_and_the_inverse_does(
     assert abs(run["estimate"][k][0]) > 0.01
 
 
-def test_a_comparison_says_that_the_newest_estimate_acts() -> None:
-    from fpirhc.simulation.loop import close_loop
-
-    problem = planned()
-    for estimator, words in ((ANSWER, "its newest estimate acts"), (SHIFT, "in which a new estimate takes effect")):
-        controller = fp.Estimating(PLAN, estimator)
-        told = information(problem, controller, close_loop(problem, controller), 15)
-        assert words in told.rate
-        assert "depth" in told.uses
-
-
 def test_the_mass_of_an_arm_is_found_from_the_acceleration_of_its_hand() -> None:
     """Recursive least squares by name; the response is that of the outputs, linear in 1 / m."""
     problem = replace(circle(arm()), duration=1.5, measure_from=0.5)
     learner = fp.RecursiveLeastSquares({"m": fp.Uncertain(0.3, 3.0, 0.5)}, {"x": 0.1, "y": 0.1}, 5.0)
     run = simulated(problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), learner))
     assert run["estimate.m"][-1] == pytest.approx(1.0, abs=3e-3)
-
-
-def test_late_samples_give_the_pairs_that_belong_together() -> None:
-    """Behind a dead time the mass is found as well; with pairs that ignore it, it is not."""
-    late = fp.DeadTime(inputs={"A": 6e-3, "B": 6e-3}, measurement=4e-3)
-    problem = replace(circle(arm(), dead_time=late), duration=1.5, measure_from=0.5)
-    learner = fp.MovingHorizon({"m": fp.Uncertain(0.3, 3.0, 0.5)}, {"x": 0.1, "y": 0.1}, 20, 5.0)
-    masses = [
-        simulated(problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), learner, dead_time=believed))["estimate.m"][-1]
-        for believed in (None, fp.DeadTime())
-    ]  # fmt: skip
-    assert masses[0] == pytest.approx(1.0, abs=2e-3)
-    assert abs(masses[1] - 1.0) > 5 * abs(masses[0] - 1.0)
 
 
 def test_a_disturbance_reaches_a_model_with_algebraic_states() -> None:

@@ -192,11 +192,7 @@ def agree(states: fp.Problem, coordinates: fp.Problem, controller: Controller) -
     return run
 
 
-REPLANNING = {
-    "measured": fp.FromMeasurement(),
-    "tracked": fp.FromMeasurementTracked(fp.Exponential(rate=4.0)),
-    "own": fp.FromPlan(fp.Exponential(rate=4.0)),
-}
+REPLANNING = {"measured": fp.FromMeasurement(), "own": fp.FromPlan(fp.Exponential(rate=4.0))}
 
 
 @pytest.mark.parametrize("way", slow_but(REPLANNING, "own"))

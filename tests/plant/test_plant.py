@@ -11,7 +11,6 @@ from plants import chain, linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, NotInvertible
-from fpirhc.members import FORMER_MEMBERS
 from fpirhc.plant.plant import structural_order
 
 TWO = {"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(3.0, 2.0, "N/m")}
@@ -198,12 +197,3 @@ def test_mistakes_are_named(message):
 def test_all_mistakes_come_at_once():
     with pytest.raises(InvalidProblem, match=r"(?s)2 mistakes.*approximate.*unit"):
         fp.Plant({"y": "m"}, {"u": "N"}, {"m": fp.Parameter(float("inf"), 1.0, "")}, lambda q, v, u, p: {"y": u.u})
-
-
-@pytest.mark.parametrize("name", [key for key in FORMER_MEMBERS if key.startswith("Plant.") and key != "Plant.of_map"])
-def test_the_error_of_an_earlier_member_says_the_new_one_which_is_there(name: str) -> None:
-    """The Functions of a plant are those of its equations."""
-    plant, old, now = fp.load_problem("two_mass").problem.plant, name.removeprefix("Plant."), FORMER_MEMBERS[name]
-    with pytest.raises(AttributeError, match=f"Plant has no attribute '{old}'; it is called '{now}' now"):
-        getattr(plant, old)
-    assert now.removeprefix("equations.") in dir(plant.equations)

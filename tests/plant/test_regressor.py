@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import chain, pendulum
+from plants import pendulum
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidValue, NotSupported
+from fpirhc.errors import InvalidName, InvalidValue
 from fpirhc.plant.motion import places
-from fpirhc.plant.regressor import Combination, Regressor, linear_parameters
+from fpirhc.plant.regressor import Combination, Regressor
 
 INERTIAS = {
     "a1": Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
@@ -141,29 +141,6 @@ def test_more_combinations_than_parameters():
         Regressor(plant, ("inertia",), combinations)
 
 
-def test_linear_parameters_are_found():
-    """Linear jointly with all others; a Stribeck level is one only where its velocity is not learned."""
-    assert linear_parameters(pendulum()) == ()
-    result = linear_parameters(fp.load_problem("planar_arm").problem.plant)
-    assert result == ("J1", "k1", "m2", "I2", "load", "b1", "b2", "c1", "c2")
-    assert linear_parameters(fp.load_problem("two_link_arm").problem.plant) == ("I1", "Ie", "b")
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
-def test_the_unit_of_force_changes_no_verdict(unit):
-    """A pendulum whose torque counts in this unit: its mass enters linearly, its length does not."""
-    plant = fp.Plant(
-        coordinates={"a": "rad"},
-        inputs={"torque": "N m"},
-        response=lambda q, v, u, p: {"a": (unit * u.torque - p.m * 9.81 * p.l * ca.sin(q.a)) / (p.m * p.l**2)},
-        parameters={"m": fp.Parameter(1.0, 1.5, "kg"), "l": fp.Parameter(0.5, 0.6, "m")},
-    )
-    assert Regressor(plant, ("m",)).names == ("m",)
-    assert linear_parameters(plant) == ()
-    with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly"):
-        Regressor(plant, ("l",))
-
-
 def test_parameters_that_enter_nonlinearly_are_refused_by_name():
     with pytest.raises(InvalidValue, match=r"'l' enter\(s\) nonlinearly; in products: 'm' with 'l'.*Combination"):
         Regressor(pendulum(), ("m", "l"))
@@ -175,15 +152,3 @@ def test_parameters_that_enter_nonlinearly_are_refused_by_name():
     double = {"twice": Combination(lambda p: 2 * p.load, "kg")}
     with pytest.raises(InvalidValue, match="depend on each other"):
         Regressor(plant, ("load", "twice"), double)
-
-
-def test_plants_without_a_regressor_are_refused():
-    """Fewer inputs than coordinates; an inverse that only a root finder has."""
-    with pytest.raises(NotSupported, match="fully actuated"):
-        Regressor(fp.load_problem("cart_pole").problem.plant, ("m",))
-    nonlinear = fp.Plant(
-        {"y": "m"}, {"u": "N"}, {"m": fp.Parameter(1, 1, "kg")}, lambda q, v, u, p: {"y": ca.sinh(u.u) / p.m}
-    )
-    with pytest.raises(NotSupported, match="root finder"):
-        Regressor(nonlinear, ("m",))
-    assert linear_parameters(chain(1)) == ("m",)

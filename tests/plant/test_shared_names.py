@@ -17,8 +17,6 @@ from fpirhc.errors import FpirhcError, InvalidProblem, NotContractive
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.members import examples
 from fpirhc.probing.recording import read_recording
-from fpirhc.review.grid import review_grid
-from fpirhc.review.questions.slew import effect
 from fpirhc.simulation.run import Run
 from fpirhc.task.external_plant import Body
 
@@ -217,13 +215,6 @@ def test_a_recording_names_the_commands(tmp_path: Path):
 def test_a_box_of_a_plant_has_both():
     """Points are drawn from the interval of the joint and of its motor."""
     check_plant(SHARED.plant, seed=0, box={"elbow": (-0.5, 0.5), "input elbow": (2.0, 3.0)})
-
-
-def test_a_review_weighs_both_disturbances():
-    """A unit of torque changes the responses by 1 / m, one of the response by 1."""
-    grid = review_grid(SHARED, mismatch=10.0, seed=0)
-    assert effect(grid, "coordinate shoulder") == 1.0
-    assert effect(grid, "input shoulder") == pytest.approx(1 / 1.3)
 
 
 def test_a_review_is_that_of_other_names():

@@ -126,27 +126,6 @@ def test_a_projection_learns_as_much_from_a_response_in_another_unit(size):
     assert learned == pytest.approx(0.5 if size else 0.0)
 
 
-def test_a_dead_time_is_found_in_small_requests_too():
-    size = 1e-9
-    plant = fp.Plant(
-        coordinates={"x": "m"},
-        inputs={"f": "N"},
-        order=1,
-        response=lambda q, u, p: {"x": p.a * u.f * size - q.x},
-        parameters={"a": fp.Parameter(1.3, 1.0, "1")},
-    )
-    problem = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"x": size * (ca.sin(20 * t) + ca.sin(31 * t))}),
-        start={"x": 0.0},
-        period=0.01,
-        duration=10.0,
-        dead_time=fp.DeadTime(inputs={"f": 0.03}),
-    )
-    law = fp.ComputedTorque(fp.Exponential(rate=2.0, integral=False), fp.SelfPaired(fp.Affine(gain=-0.6), most=8))
-    assert fp.simulate(problem, law, seed=0, compiled=False)["paired_cycles"][-1] == 3.0
-
-
 @pytest.mark.parametrize("level", [1.0, 1e-9])
 def test_a_wrong_pair_of_unit_functions_of_a_cascade_is_refused_in_any_unit(level):
     plant = fp.Plant(

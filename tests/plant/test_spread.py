@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import abroad
 import casadi as ca
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.plant.parameter import EXAMPLES, TAILS
 from fpirhc.plant.plant import exact_ranges
-from fpirhc.review.grid import review_grid
-from fpirhc.studies.scenarios.draws import COMPARING, draw
 
 
 def plant(**parameters: fp.Parameter) -> fp.Plant:
@@ -61,22 +58,6 @@ def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
     assert ranges["a"] == (298.0, 302.0)
     assert ranges["k"] == pytest.approx((-5.0 * 1.2, -5.0 / 1.2))
     assert ranges["b"] == (0.5, 1.5)
-
-
-def test_a_review_covers_what_scenarios_draw():
-    """Draws fill the box of the review and never leave it; the stream of one parameter does not depend on another's spread."""
-    task = abroad.load("cstr", "wrong")
-    box = exact_ranges(task.problem.plant, 100.0)
-    assert box["alpha"] == pytest.approx((0.95, 1.05))
-    assert box["beta"] == pytest.approx((0.9, 1.1))
-    both = plant(a=parameter(2.0, fp.Normal(absolute=0.1)))
-    rows = np.array([draw(both, seed=1, use=COMPARING, number=k, percent=40.0).exact for k in range(400)])
-    low, high = np.array(list(exact_ranges(both, 40.0).values())).T
-    assert ((rows >= low) & (rows <= high)).all()
-    assert np.ptp(rows, axis=0) == pytest.approx(high - low, rel=0.05)
-    other = plant(a=parameter(2.0, fp.Uniform(relative=0.5)))
-    again = np.array([draw(other, seed=1, use=COMPARING, number=k, percent=40.0).exact for k in range(20)])
-    np.testing.assert_array_equal(again[:, 0], rows[:20, 0])
 
 
 def test_the_whole_spread_needs_spreads_everywhere():
@@ -142,18 +123,6 @@ def test_the_range_by_value(problem):
     assert ranges["b"] == pytest.approx((1.28, 1.92))
     assert ranges["k"] == pytest.approx((-6.0, -4.0))
     assert ranges["zero"] == (0.0, 0.0)
-
-
-def test_review_and_scenarios_mean_the_same_range(problem):
-    """The box of a review is the range, its corners are met, and draws of scenarios fill it without leaving it."""
-    ranges = exact_ranges(problem.plant, 20.0)
-    least, largest = (np.array([r[k] for r in ranges.values()]) for k in (0, 1))
-    reviewed = review_grid(problem, 20.0, 0).draws
-    drawn = np.array([draw(problem.plant, seed=0, use=COMPARING, number=k, percent=20.0).exact for k in range(400)])
-    for rows in (reviewed, drawn):
-        assert np.all(rows >= least - 1e-12)
-        assert np.all(rows <= largest + 1e-12)
-        assert np.ptp(rows, axis=0) == pytest.approx(largest - least, rel=0.02, abs=1e-12)
 
 
 def test_a_review_refuses_what_scenarios_refuse(problem):

@@ -12,8 +12,6 @@ import pytest
 import tasks
 
 import fpirhc as fp
-from fpirhc.cli.main import main
-from fpirhc.cli.verb import ExitCode
 from fpirhc.probing.recording import replay
 
 
@@ -125,18 +123,6 @@ def test_a_response_without_a_column_is_a_difference(tmp_path):
     assert np.isfinite(answer.commands).all()
 
 
-def test_the_command_prints_and_writes(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    recorded(tmp_path / "run.csv", name="RHC")
-    assert main(["replay", "two_mass", "RHC+FPI", "run.csv", "--out", "commands.csv"]) == ExitCode.FINISHED
-    shown = capsys.readouterr().out
-    assert "60 cycles" in shown
-    assert "rms difference" in shown
-    head, *rows = list(csv.reader(Path("commands.csv").read_text().splitlines()))
-    assert head == ["time", *tasks.two_mass.problem.plant.inputs]
-    assert len(rows) == 60
-
-
 TIMES = np.arange(5) * 1e-3  # the period of two_mass
 GOOD = {n: np.zeros(5) for n in ("q1", "q2", "q1'", "q2'", "q1''", "q2''")}
 INPUT = "Q1"
@@ -179,10 +165,3 @@ def test_a_file_that_is_no_table_is_named(tmp_path, text, words):
     with pytest.raises(fp.FpirhcError) as error:
         replay(tasks.two_mass.problem, tasks.two_mass.controllers["RHC"], tmp_path / "run.csv")
     assert words in str(error.value)
-
-
-def test_an_unknown_controller_is_named(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    recorded(tmp_path / "run.csv", name="RHC", rows=5)
-    assert main(["replay", "two_mass", "RHC+FPY", "run.csv"]) == ExitCode.BAD_INPUT
-    assert "RHC+FPI" in capsys.readouterr().err

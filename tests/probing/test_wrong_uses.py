@@ -83,10 +83,6 @@ WRONG: dict[str, tuple[Any, str]] = {
         "ExternalPlant.measures: expected {name: a text} or (a text, ...), got the text \"q, q'\"; write {'NAME': \"q, q'\"} "
         "with the name of what it belongs to, or write ('q', \"q'\")",
     ),
-    "an adapter at the top level": (
-        lambda: fp.as_env(PROBLEM),  # type: ignore[attr-defined]
-        "fpirhc.as_env is in the module of its adapter; write: from fpirhc.adapters.environment import as_env",
-    ),
     "another unit": (
         lambda: outside(measures=MEASURES | {"q": "mm"}),
         "problem: reality: it measures q in mm, the model has it in m; write both in one unit",

@@ -13,11 +13,9 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.baselines.baseline import baseline_path, problems_here
-from fpirhc.controllers.contract import innermost
 from fpirhc.plant.motion import followed_units
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.shipped import missing
-from fpirhc.studies.comparison.entry import plan_every
 
 ROOT = Path(__file__).parents[2] / "problems"
 FILES = sorted([*ROOT.glob("*.py"), *(ROOT / "gallery").glob("*.py"), *(ROOT / "outside").glob("*.py")])
@@ -68,25 +66,6 @@ def has_the_numbers_of_its_runs(task: Task, path: Path) -> None:
         error = errors(task, path, controller)
         for name, number in zip(names, numbers, strict=True):
             assert float(number) == pytest.approx(error[name], rel=0.05), (controller, name)
-
-
-@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
-def test_a_description_is_what_runs_give(path):
-    """Every measured number stands in its table, and what is compared first plans at one rate.
-
-    No error, and no result of tuning, is told outside a table, where nobody would notice that it is no longer so. Both of the
-    pair plan or neither does, and as often, so that no rate of plans is taken for an effect of adaptation.
-    """
-    task = loaded(path)
-    if baseline_path(path).exists():
-        has_the_numbers_of_its_runs(task, path)
-    assert task.headline
-    pair = [task.controllers[name] for name in task.headline]
-    assert len({innermost(one).planner is None for one in pair}) == 1
-    assert len({plan_every(task.problem, one) for one in pair}) == 1
-    assert "easured (" not in task.description
-    assert "fpirhc tune" not in task.description
-    assert task.description.lower().count("rms error") == 1
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import threading
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 from unittest.mock import DEFAULT, Mock
 
@@ -15,11 +14,9 @@ from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
-from fpirhc.problem_files.problem_file import Task
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.path import moving
 from fpirhc.simulation.simulate import Patch, run_cycles, simulator
-from fpirhc.studies.scenarios.draws import COMPARING, RandomScenarios
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
 
@@ -139,19 +136,6 @@ def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
     inside, outside_ = run(problem, controller), run(own, controller)
     for signal in ("plant_state", "command"):
         assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
-
-
-def test_scenarios_of_a_body_have_its_own_dead_time():
-    """It is not simulated, so that no other one can be drawn; its parameters are."""
-    body = fp.ExternalPlant(
-        measures=MEASURES,
-        make=lambda parameters, seed: Late(task()),
-        parameters={"k": fp.Parameter(1.0, 1.0, "1")},
-        dead_time={"u": 0.002},
-    )
-    drawn = RandomScenarios(replace(task(), reality=body), seed=0, use=COMPARING, percent=40.0)
-    assert {drawn[k].problem.dead_time.inputs["u"] for k in range(6)} == {0.002}
-    assert len({drawn[k].problem.moved.parameters["k"].exact for k in range(6)}) == 6
 
 
 def test_a_dead_time_is_stated_once_and_by_name():
@@ -450,26 +434,6 @@ def made(problem: fp.Problem, seeds: list[int] | None = None, **settings) -> fp.
         return Driven(problem, parameters["b"])
 
     return replace(problem, reality=fp.ExternalPlant(make=make, parameters=GAIN, measures=MEASURES, **settings))
-
-
-def test_scenarios_around_a_made_body_are_those_of_the_plant_itself(tmp_path):
-    """The same draws, the same mismatch, the same errors and the same pairs as where the equations are known."""
-    inside = task(duration=0.1)
-    loops = {"plain": CONTROLLERS["computed torque"], "adapted": CONTROLLERS["plain form"]}
-    studies = []
-    for name, problem in {
-        "inside": replace(inside, plant=replace(inside.plant, parameters=GAIN)),
-        "made": made(inside),
-    }.items():
-        whole = Task("gain", Path(__file__), "", "", problem, loops)
-        settings: dict[str, Any] = {"count": 6, "percent": 40.0, "seed": 2, "compiled": False}
-        studies.append(fp.compare_scenarios(whole, folder=tmp_path / name, **settings))
-    for name in loops:
-        one, other = (study[name] for study in studies)
-        assert np.array_equal(other.mismatch, one.mismatch)
-        assert other.errors == pytest.approx(one.errors, rel=1e-9)
-        assert len(set(other.errors)) == 6
-        assert (other.better, other.outcomes) == (one.better, one.outcomes)
 
 
 def test_a_made_body_is_new_in_every_run_and_has_its_seed():

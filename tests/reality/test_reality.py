@@ -16,8 +16,6 @@ from fpirhc.controllers.check import checked
 from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
 from fpirhc.sensing.base import response_names
-from fpirhc.studies.comparison.entry import has_exact_model
-from fpirhc.studies.scenarios.draws import COMPARING, draw
 
 TRACK = fp.Exponential(rate=6.0)
 PERIOD = 1e-3  # s
@@ -158,24 +156,6 @@ def test_slow_sensor_is_seen_and_the_true_coordinate_is_judged():
     assert np.array_equal(result["true_error.y"], result["reference.y"] - y)
 
 
-def test_slow_sensor_is_seen_in_place_of_an_output():
-    """A model of states whose output is y gives the commands of the model of coordinates, to the last bit."""
-    states = fp.Plant.of_states(
-        states={"a": "m", "w": "m/s"},
-        inputs={"u": "N"},
-        parameters=linear(2.0, 1.0).parameters,
-        rates=lambda x, u, p: {"a": x.w, "w": p.b * u.u},
-        outputs={"y": fp.Output("m", lambda x, p: x.a)},
-    )
-    reality = fp.Reality(slow_sensor(), start={"y": 0.1, "y'": 0.0, "s": 0.1}, seen={"y": "s"})
-    shared: dict[str, Any] = {"reality": reality, "horizon": None, "cost": None}
-    believed = fp.Sensing(estimator=fp.PositionDifference(), measured=("y",), observer=fp.ModelStates())
-    one = run(task(**shared, sensing=fp.Sensing(estimator=fp.PositionDifference())))
-    other = run(task(**shared, plant=states, start={"a": 0.1, "w": 0.0}, sensing=believed))
-    for name in ("command", "true_error", "reality_state"):
-        assert np.array_equal(one[name], other[name]), name
-
-
 @pytest.mark.parametrize("sensing", [fp.Sensing(), fp.Sensing(estimator=fp.PositionDifference())])
 def test_a_sensor_in_place_of_an_output_stands_beside_the_model_s_own_state(sensing):
     """State, output and response are all shown: the state as it is, the other two as the sensor has them."""
@@ -220,49 +200,6 @@ def test_disturbance_of_a_state_that_the_model_does_not_have():
 
 
 # What "exact" means
-
-
-def test_draws_are_those_of_the_reality():
-    """Scenarios vary the reality's parameters; the mismatch counts those that the model has too."""
-    problem = task(reality=fp.Reality(lagged()))
-    scenario = draw(problem.real_plant, seed=1, use=COMPARING, number=0, percent=20.0, model=problem.plant)
-    variant = problem.with_exact(scenario.exact)
-    assert np.array_equal(variant.real_plant.exact, scenario.exact)
-    assert scenario.exact.size == 2
-    assert scenario.mismatch == pytest.approx(abs(1 - scenario.exact[0]) / max(1.0, scenario.exact[0]))
-    assert np.array_equal(variant.plant.exact, problem.plant.exact)
-
-
-RUBBED = fp.Plant(
-    coordinates={"y": "m"},
-    inputs={"u": "N"},
-    parameters={"gain": fp.Parameter(2.0, 2.5, "1/kg"), "friction": fp.Parameter(1.0, 3.0, "N s/m")},
-    response=lambda q, v, u, p: {"y": p.gain * (u.u - p.friction * ca.tanh(v.y))},
-)
-
-
-def test_exact_model_is_the_reality():
-    """A reality with another friction and other parameters is the model of the exact controller, which then needs no adaptation."""
-    problem = task(reality=fp.Reality(RUBBED), start={"y": 0.0, "y'": 3.0}, duration=0.5)
-    bare = CONTROLLERS["computed torque"]
-    errors = [np.abs(run(problem, one)["error.y"]).max() for one in (bare, fp.ExactModel(bare))]
-    assert errors[1] < 0.02 * errors[0]
-    assert has_exact_model(problem, fp.ExactModel(bare))
-    assert not has_exact_model(problem, bare)
-
-
-def test_comparison_with_the_reality_as_exact_model():
-    """Plans of the exact model are judged by the reality's equations: none is above the optimum of its own horizon."""
-    problem = task(reality=fp.Reality(RUBBED))
-    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6))
-    file = replace(fp.load_problem("two_mass"), problem=problem, headline=None)
-    comparison = fp.compare(replace(file, controllers={"RHC": plan, "RHC exact": fp.ExactModel(plan)}), seed=0)
-    assert [entry.exact for entry in comparison.entries] == [False, True]
-    for entry in comparison.entries:
-        assert entry.optimality is not None
-        assert abs(entry.optimality.worst) < 1e-6
-    with pytest.raises(NotSupported, match=r"problem\.of_model"):
-        fp.predict_response(problem, CONTROLLERS["plain form"])
 
 
 def test_exact_model_is_refused_where_the_reality_has_other_coordinates():

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.deformation.base import Iteration
 from fpirhc.errors import InvalidProblem
-from fpirhc.review.grid import review_grid
-from fpirhc.review.questions.reality import LOOP, RESONANCE, extra_modes, real_loops, real_points
 
 K, R, L, MOTOR, LOAD, C, B = 0.05, 1.0, 5e-4, 5e-4, 5e-4, 20.0, 5e-3  # N m/A, ohm, H, kg m^2 twice, N m/rad, N m s
 NAMES = ("motor", "motor_speed", "angle", "load_speed", "current")
@@ -60,58 +57,8 @@ def servo(start: float = 0.0) -> fp.Problem:
     )
 
 
-@pytest.fixture(scope="module")
-def grid() -> Any:
-    return review_grid(servo(), 0.0, 0)
-
-
 def law(gain: float) -> fp.ComputedTorque:
     return fp.ComputedTorque(fp.Exponential(rate=10.0), fp.Sigmoid(gain=gain, scale=1e9) if gain else fp.Identity())
-
-
-def test_the_motor_turns_with_its_load(grid: Any) -> None:
-    """At every point the speeds agree to a thousandth, and the spring has the torque of the load."""
-    points = real_points(grid)
-    assert len(points) == 5
-    for point in points:
-        motor, motor_speed, angle, load_speed, _ = point.real
-        assert [angle, load_speed] == pytest.approx(grid.states[point.place], abs=1e-9)
-        assert motor_speed == pytest.approx(load_speed, abs=1e-3)
-        torque = C * (motor - angle) + B * (motor_speed - load_speed)
-        assert torque == pytest.approx(LOAD * grid.responses[point.place, 0], abs=1e-9)
-
-
-def test_modes_beyond_the_rigid_motor_are_those_of_shaft_and_current(grid: Any) -> None:
-    poles = np.sort_complex(extra_modes(grid, real_points(grid)[0], grid.problem.plant.approximate, Iteration()).poles)
-    every = np.linalg.eigvals(MATRIX)
-    assert poles == pytest.approx(np.sort_complex(every[np.abs(every) > 100]), rel=1e-6)
-
-
-@pytest.mark.parametrize("gain", [0.0, -2.29])
-def test_growth_of_the_real_pair_is_that_of_a_run(grid: Any, gain: float) -> None:
-    """Two runs from starts that differ by a hair: their difference grows by the largest pole per cycle."""
-    radius = max(one.radius for one in real_loops(grid, law(gain)))
-    assert radius > 1
-    first, cycles = (1000, 900) if gain == 0.0 else (20, 30)  # 30 cycles are a whole beat of the fast mode
-    one, other = (fp.simulate(servo(start), law(gain), seed=0, compiled=False) for start in (0.0, 1e-9))
-    sizes = np.linalg.norm(other["reality_state"] - one["reality_state"], axis=1)
-    growth = (sizes[first + cycles] / sizes[first]) ** (1 / cycles)
-    assert growth == pytest.approx(radius, abs=3e-3 if gain else 2e-4)
-
-
-def test_a_gain_that_only_the_rigid_model_bears_is_refused_by_the_review() -> None:
-    """Before, the review knew no point at which this reality settles, and recommended -2.29 without a word about the shaft."""
-    answers = fp.review(servo(), {"it": law(-2.29)}, mismatch=0.0, seed=0).controllers["it"]
-    by_question = {a.question: a for a in answers}
-    assert str(by_question[LOOP].verdict) == "no"
-    assert str(by_question[RESONANCE].verdict) == "no"
-
-
-def test_a_law_that_excites_the_shaft_is_refused_without_adaptation_too() -> None:
-    """The rigid model's loop has wide margins; the growth of the real pair is that of the runs above."""
-    answers = {a.question: a for a in fp.review(servo(), {"it": law(0.0)}, mismatch=0.0, seed=0).controllers["it"]}
-    assert str(answers[LOOP].verdict) == "no"
-    assert answers[LOOP].numbers["radius"] == pytest.approx(1.00526, abs=1e-4)
 
 
 # A reality may show a coordinate of the model as an output: a load's angle of a servo whose states have other names

@@ -16,8 +16,6 @@ import fpirhc as fp
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
-from fpirhc.review.questions.dead_time import UNSTATED
-from fpirhc.studies.operating_limits import _latency
 
 PERIOD, LATE, LAG = 1e-2, 3, 0.05
 
@@ -130,23 +128,6 @@ def test_review_judges_the_stated_lag():
     assert answers[12.0].verdict == "no"
     assert answers[12.0].numbers["room"] == pytest.approx(2 * 12 * LAG)
     assert answers[1.0].verdict != "no"
-
-
-@pytest.mark.parametrize("facts", [{}, {"lag": {"u": 0.01}}], ids=["nothing", "a lag"])
-def test_latency_of_a_body_is_advised_to_be_stated_where_it_is_not_simulated(facts):
-    """Stated in the problem it would be added to what the body has."""
-    controllers = {"c": law(fp.Affine(gain=-0.9))}
-    answers = fp.review(problem(**facts), controllers, mismatch=0.0, seed=0).answers
-    advice = [a.change for a in answers if a.question == UNSTATED]
-    assert advice
-    assert all("state it, ExternalPlant(dead_time=...)" in one for one in advice)
-
-
-def test_a_search_for_the_latency_that_is_borne_adds_to_that_of_the_body():
-    """The body keeps its own, and what is tried is simulated before it."""
-    late = _latency(problem(dead_time={"u": LATE * PERIOD})).at(2 * PERIOD).dead_time
-    assert late.inputs == {"u": pytest.approx((LATE + 2) * PERIOD)}
-    assert late.simulated.inputs == {"u": pytest.approx(2 * PERIOD)}
 
 
 def test_a_review_does_not_say_that_a_stated_latency_is_unknown():

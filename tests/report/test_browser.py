@@ -15,21 +15,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, linear
 
 import fpirhc as fp
-from fpirhc.cli.main import main
 from fpirhc.export.lab.lab import Lab, lab_of, make_lab, write_lab
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import write_report, write_scenarios
+from fpirhc.report.html import write_report
 from fpirhc.studies.comparison.compare import compare
-from fpirhc.studies.scenarios.scenario_study import compare_scenarios
 
 pytestmark = pytest.mark.browser
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-BOXES = Path(__file__).parents[1].joinpath("browser_boxes.js").read_text(encoding="utf-8")
-SCREENS = ((1280, "light"), (1280, "dark"), (390, "light"), (390, "dark"))
 
 
 @pytest.fixture(scope="session")
@@ -117,181 +112,6 @@ def task(plant: fp.Plant, adaptive: int) -> Task:
     )
     controllers = {"plain": fp.ComputedTorque(track), **maps}
     return Task("case", Path(__file__), "A plant with a wrong model", "Its description.", problem, controllers)
-
-
-@pytest.fixture(scope="session")
-def reports(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Pages by name: ten controllers, two controllers on a plant of order one, scenarios."""
-    del browser  # pages are made only where there is one
-    folder = tmp_path_factory.mktemp("reports")
-    many, few = task(linear(1.6, 1.0), 9), task(chain(1), 1)
-    paths = {name: folder / f"{name}.html" for name in ("many", "order_one", "scenarios")}
-    write_report(compare(many, seed=0, compiled=False), paths["many"])
-    write_report(compare(few, seed=0, compiled=False), paths["order_one"])
-    study = compare_scenarios(few, count=3, percent=10.0, seed=0, folder=folder, compiled=False)
-    write_scenarios(study, paths["scenarios"])
-    return paths
-
-
-@pytest.mark.parametrize("name", ["many", "order_one", "scenarios"])
-@pytest.mark.parametrize(("width", "scheme"), SCREENS)
-def test_a_page_lies_well_at_first_load(name, width, scheme, reports, visit, pictures):
-    """No two boxes overlap, no chart sticks out of its box, the page is no wider than the window, the console is silent."""
-    one = visit(reports[name], width, scheme)
-    one.page.screenshot(path=pictures / f"{name}-{width}-{scheme}.png")
-    one.page.screenshot(path=pictures / f"{name}-{width}-{scheme}-whole.png", full_page=True)
-    boxes = one.page.evaluate(BOXES)
-    assert boxes["count"] > 8
-    assert (boxes["charts"] > 2) == (name != "scenarios")
-    assert boxes["overlaps"] == []
-    assert boxes["outside"] == []
-    assert one.page.evaluate("document.documentElement.scrollWidth") <= width
-    sizes = one.page.evaluate("[...document.querySelectorAll('figure img')].map((e) => e.clientWidth)")
-    assert (
-        all(size == 640 for size in sizes) or width > 560
-    )  # pictures scroll in their boxes, and their words stay readable
-    assert one.complaints == []
-
-
-def test_charts_lie_side_by_side_on_a_desktop_and_below_each_other_on_a_telephone(reports, visit):
-    """Every shown chart is as wide as its box, two in a row at 1280 px and one at 390 px."""
-    lefts = "[...new Set([...document.querySelectorAll('.chart:not([hidden])')].map((e) => e.getBoundingClientRect().left))]"
-    for width, columns in ((1280, 2), (390, 1)):
-        page = visit(reports["many"], width).page
-        assert len(page.evaluate(lefts)) == columns
-        widths = page.evaluate("plots.filter((p) => !p.box.hidden).map((p) => p.chart.width - p.box.clientWidth)")
-        assert widths
-        assert set(widths) == {0}
-
-
-def test_a_wide_window_is_used(reports, visit):
-    """At 1900 px tables, charts and pairs are as wide as the window but for a margin, and lines of text stay readable."""
-    page = visit(reports["many"], 1900).page
-    widths = page.evaluate(
-        "['#charts', '.scroll', '.pictures', '.wide img'].map((s) => document.querySelector(s).getBoundingClientRect().width)"
-    )
-    assert min(widths) > 1800
-    assert page.evaluate("document.querySelector('.headline').getBoundingClientRect().width") <= 1860
-    assert (
-        max(page.evaluate("[...document.querySelectorAll('p.about, li')].map((e) => e.getBoundingClientRect().width)"))
-        < 1500
-    )
-    lefts = (
-        "[...new Set([...document.querySelectorAll('.pictures figure')].map((e) => e.getBoundingClientRect().left))]"
-    )
-    assert len(page.evaluate(lefts)) == 2
-
-
-def test_a_chart_that_was_hidden_fits_when_it_is_shown(reports, visit):
-    """Charts of one controller's responses are hidden while three are shown; meanwhile the window has become smaller."""
-    one = visit(reports["many"])
-    hidden = "document.querySelectorAll('.chart[hidden]').length"
-    before = one.page.evaluate(hidden)
-    third = one.page.query_selector("#controllers input:not(:checked)")
-    third.click()
-    assert one.page.evaluate(hidden) > before
-    one.page.set_viewport_size({"width": 800, "height": 800})
-    third.click()
-    settle(one.page)
-    settle(one.page)
-    assert one.page.evaluate(hidden) == before
-    assert one.page.evaluate("plots.every((p) => p.box.hidden || p.chart.width === p.box.clientWidth)")
-    assert one.page.evaluate(BOXES)["overlaps"] == []
-    assert one.complaints == []
-
-
-def test_axes_of_charts_name_time_and_its_unit(reports, visit):
-    """The label is part of the axis, so that a picture of a chart says what is drawn."""
-    page = visit(reports["many"]).page
-    assert page.evaluate("[...new Set(plots.map((p) => p.chart.axes[0].label))]") == ["t [s]"]
-
-
-def test_ticks_of_any_size_differ_and_what_a_run_reached_at_last_hides_nothing(reports, visit):
-    """Digits tell ticks apart, in every language of the browser; the range is 20 times the usual size, and whole after a zoom."""
-    page = visit(reports["order_one"]).page
-    ticks = [
-        ([0, 5e-10, 1e-9], ["0", "5e-10", "1.0e-9"]),
-        ([-5e5, 0, 5e5, 1e6], ["-5e5", "0", "5e5", "1.0e6"]),
-        ([1000, 1002.5, 1005], ["1000.0", "1002.5", "1005.0"]),
-        ([0, 20000, 40000], ["0", "20000", "40000"]),
-        ([-1e20, 0, 1e20], ["-1e20", "0", "1e20"]),
-    ]
-    for numbers, texts in ticks:
-        assert page.evaluate("(numbers) => tickTexts(numbers)", numbers) == texts
-    chart = "{ data: [[0, 1, 2, 3, 4], [1, 2, 3, 1e6, 1e20]], series: [{}, { show: true }], scales: { x: { min: null, max: %s } } }"
-    first, whole, zoomed = (
-        page.evaluate(f"rangeOfValues(() => true)({chart % most}, 1, 1e20)") for most in ("null", 4, 3)
-    )
-    assert first == whole
-    assert whole[1] < 100
-    assert zoomed[1] >= 1e20
-
-
-def test_a_table_that_is_cut_says_so(reports, visit):
-    """The hint is there where the table is wider than the window, and only there; at its end the shade is gone."""
-    page = visit(reports["many"], 800).page
-    assert page.is_visible(".more")
-    assert page.evaluate("document.querySelector('.scroll').classList.contains('cut')")
-    page.evaluate("document.querySelector('.scroll').scrollLeft = 1e6")
-    page.wait_for_function("!document.querySelector('.scroll').classList.contains('cut')")
-    page.add_style_tag(content="th:nth-child(n+5), td:nth-child(n+5) { display: none }")
-    page.wait_for_selector(".more", state="hidden")
-    narrow = visit(reports["many"], 390).page
-    assert narrow.is_visible(".more")
-    heads = narrow.evaluate(
-        "[...document.querySelectorAll('.scroll tbody th')].map((e) => e.getBoundingClientRect().right)"
-    )
-    assert max(heads) < 200  # so that numbers stand beside the names
-
-
-def test_the_tenth_colour_is_seen_on_dark_paper(reports, visit):
-    """No swatch has the colour of the page; the palette's last colour is black."""
-    page = visit(reports["many"], 1280, "dark").page
-    background = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    swatches = page.evaluate(
-        "[...document.querySelectorAll('.swatch')].map((e) => getComputedStyle(e).backgroundColor)"
-    )
-    assert len(swatches) == 10
-    assert min(abs(luminance(s) - luminance(background)) for s in swatches) > 0.04
-
-
-def luminance(colour: str) -> float:
-    """Relative luminance of 'rgb(r, g, b)', between 0 and 1 (WCAG 2.1)."""
-    shares = [int(v) / 255 for v in colour.removeprefix("rgb(").removesuffix(")").split(",")]
-    linear_shares = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
-    return sum(w * s for w, s in zip((0.2126, 0.7152, 0.0722), linear_shares, strict=True))
-
-
-PROBES = {
-    "a picture from elsewhere": "const e = document.createElement('img'); e.src = 'https://example.invalid/x.png';",
-    "a script from elsewhere": "const e = document.createElement('script'); e.src = 'https://example.invalid/x.js';",
-    "a script in the page": "const e = document.createElement('script'); e.textContent = 'window.intruder = 1';",
-    "a style from elsewhere": (
-        "const e = document.createElement('link'); e.rel = 'stylesheet'; e.href = 'https://example.invalid/x.css';"
-    ),
-    "a frame": "const e = document.createElement('iframe'); e.src = 'https://example.invalid/';",
-}
-
-
-@pytest.mark.parametrize("name", ["many", "scenarios"])
-def test_nothing_is_loaded_from_anywhere(name, reports, visit):
-    """The page asks for itself alone; whatever gets into it is refused by the page's own policy."""
-    one: Any = visit(reports[name])
-    assert [r for r in one.requests if not r.startswith("data:")] == [reports[name].as_uri()]
-    for what, probe in PROBES.items():
-        refused = one.page.evaluate(
-            """(probe) => new Promise((done) => {
-                document.addEventListener('securitypolicyviolation', (e) => done(e.effectiveDirective), { once: true });
-                const make = new Function(probe + 'document.body.append(e)');
-                make();
-                setTimeout(() => done(''), 2000);
-            })""",
-            probe,
-        )
-        assert refused, what
-    assert one.page.evaluate("window.intruder") is None
-    elsewhere = [r for r in one.requests if not r.startswith("file:")]
-    assert {one.refusals[r] for r in elsewhere} == {"csp"}  # a network that fails would say so in other words
 
 
 def until(page: Any, condition: str) -> None:
@@ -420,17 +240,4 @@ def test_the_curves_of_a_lab_are_those_of_its_python(name, path, factor, visit, 
     first = str(opened.page.inner_text("#sentence"))
     assert move(opened.page, path, factor) != first
     compare_curves(opened.page, lab)
-    assert not opened.complaints
-
-
-def test_a_report_has_a_button_to_the_lab_beside_it(visit, tmp_path):
-    """`compare --lab` writes both files; the button leads from one to the other, and neither page complains."""
-    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
-    words = ["two_mass", "--controllers", "CTC", "CTC+FPI (eq 6)", "--lab", "--no-compile", "--out", str(tmp_path)]
-    assert main(["compare", *words]) == 0
-    opened = visit(tmp_path / "report.html")
-    opened.page.click("text=Move sliders in the lab")
-    assert opened.page.url.endswith("/lab.html")
-    until(opened.page, "window.shownNumber")
-    assert "CTC+FPI (eq 6) lowers the rms error" in opened.page.inner_text("#sentence")
     assert not opened.complaints

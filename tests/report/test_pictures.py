@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from matplotlib.figure import Figure
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
-from fpirhc.report.html import own_pictures, render, render_scenarios
+from fpirhc.report.html import own_pictures, render
 from fpirhc.simulation.pictures.base import Kept, averaged, extremes
 from fpirhc.simulation.pictures.lines import passages
 
@@ -265,32 +264,6 @@ def test_wrong_edges_of_a_grid_are_told():
         fp.Grid("g", what="state.q", low=(110, 90, 70, 50), high=(110, 180))
     with pytest.raises(InvalidValue, match=r"beyond=0.5\): expected a share from 0 to below 0.5"):
         fp.Grid("g", what="state.q", low=(110, 90, 70, 50), high=(110, 180, 300, 400), beyond=0.5)
-
-
-def test_pictures_of_cases_are_drawn_from_what_was_kept(tmp_path, monkeypatch):
-    """A band of both cases; one that does not fit its runs says why; a picture of single runs is left out. Nothing is run again."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    path = tmp_path / "spring.py"
-    pictures = (
-        "fp.Band('good', what='state.q'), fp.Band('bad', what='state.p'), fp.OverTime('single', panels=('state.q',))"
-    )
-    path.write_text(
-        FILE % pictures + "cases = fp.Cases({'light': {'exact.mass': 0.9}, 'heavy': {'exact.mass': 1.1}})\n"
-    )
-    task = fp.load_problem(str(path))
-    study = partial(fp.compare_scenarios, task, cases=["all"], seed=0, folder=tmp_path / "out", compiled=False)
-    page = render_scenarios(study()).partition("Pictures of this problem")[2].partition("</section>")[0]
-    assert page.count("<img") == 1
-    assert "alt='good: CTC'" in page
-    assert "bad is not drawn: " in page
-    assert "single" not in page
-    again = study()
-    assert render_scenarios(again).partition("Pictures of this problem")[2].partition("</section>")[0] == page
-    [first, second] = [record["pictures"]["good"]["values"] for record in again.records["CTC"]]
-    assert task.cases is not None
-    run = fp.simulate(task.cases.problem("light", task.problem), task.controllers["CTC"], seed=0, compiled=False)
-    np.testing.assert_allclose(first, run["state.q"], atol=1e-12)
-    assert first != second
 
 
 def cart(q, p):

@@ -4,78 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from test_review_laws import RATE, answer, moving, steps_in_a_run
 
 import fpirhc as fp
-from fpirhc.optimisers.base import Optimiser
-from fpirhc.review.questions.horizon import ITERATIONS as TEXT
-from fpirhc.review.questions.horizon import MANY
-from fpirhc.status import Status
-
-
-def pendulum() -> fp.Problem:
-    """A pendulum that is planned far from its rest: the quadratic model of a sweep is far from the cost."""
-    plant = fp.Plant(
-        coordinates={"angle": "rad"},
-        inputs={"torque": "N m"},
-        response=lambda q, v, u, p: {"angle": u.torque / p.m - 30 * ca.sin(q.angle)},
-        parameters={"m": fp.Parameter(1.0, 1.0, "kg m^2")},
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"angle": 3.0 * ca.sin(3 * t)}),
-        start={"angle": 0.0, "angle'": 9.0},
-        period=0.02,
-        duration=4.0,
-        horizon=fp.Horizon(stages=25, step=0.04),
-        cost=fp.Quadratic(states={"angle": 10.0}, effort={"torque": 1e-2}),
-    )
-
-
-def asked(problem: fp.Problem, optimiser: Optimiser) -> fp.Answer:
-    answers = fp.review(problem, {"it": fp.RecedingHorizon(optimiser)}, mismatch=0.0, seed=0).controllers["it"]
-    [answer] = [a for a in answers if a.question == TEXT]
-    return answer
-
-
-def share(problem: fp.Problem, optimiser: Optimiser) -> float:
-    run = fp.simulate(problem, fp.RecedingHorizon(optimiser), seed=0, compiled=False)
-    return float(np.mean(run["status"] == Status.NOT_CONVERGED))
-
-
-@pytest.mark.slow
-def test_too_few_iterations_are_found_and_the_named_number_suffices():
-    """A tolerance of 1e-6 N m: the run agrees with the answer, before the advice and after it."""
-    problem, few = pendulum(), fp.FixedPoint(iterations=1, tolerance=1e-6)
-    answer = asked(problem, few)
-    assert answer.verdict == "no"
-    assert answer.numbers["unsolved"] == pytest.approx(share(problem, few), abs=1e-12)
-    times = int(answer.change.partition("Give the optimiser ")[2].partition(" times")[0])
-    changed = (
-        f"FixedPoint(iterations={times}, tolerance=1e-6, most_iterations={100 * times})"  # no other setting is printed
-    )
-    assert answer.change == f"Give the optimiser {times} times the iterations: {changed}."
-    mended = replace(few, iterations=times)
-    assert share(problem, mended) < MANY
-    assert asked(problem, mended).verdict == "yes"
-    assert asked(problem, replace(few, iterations=times // 2)).verdict != "yes"
-
-
-def test_one_iteration_is_enough_for_a_tolerance_that_matters():
-    """The intended setting: one step per cycle follows the moving optimum. What the start alone needs is unknown."""
-    assert asked(pendulum(), fp.FixedPoint(iterations=1, tolerance=1.0)).verdict == "yes"
-    start = asked(pendulum(), fp.FixedPoint(iterations=1, tolerance=5.0))
-    assert (start.verdict, start.numbers["unsolved_later"]) == ("caution", 0.0)
-
-
-def test_a_controller_without_plans_is_not_asked():
-    answers = fp.review(pendulum(), {"it": fp.ComputedTorque(fp.Exponential(6.0))}, mismatch=0.0, seed=0).controllers[
-        "it"
-    ]
-    assert not [a for a in answers if a.question == TEXT]
 
 
 def test_an_optimiser_says_whether_it_has_iterations():

@@ -7,24 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chains import chain, coupled, errors_after_request, linear_loop, linear_pair
-from sampled import edge, lag, poles, resonance
+from chains import chain, linear_loop
+from sampled import edge, lag, poles
 
 import fpirhc as fp
-from fpirhc.contraction.delayed import (
-    basin_of_plain_form,
-    bearable_lag,
-    damped_product,
-    least_product,
-    resonant_limit,
-    slowest_iteration,
-    step_for_basin,
-    two_cycle_amplitudes,
-    two_cycle_limit,
-)
+from fpirhc.contraction.delayed import least_product, slowest_iteration
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation import Deformation
-from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.errors import InvalidValue
 
 PERIOD = 1e-3  # s
 
@@ -77,39 +67,6 @@ def test_least_product_refuses_what_is_no_loop(arguments):
 # The basin of the plain form
 
 
-@pytest.mark.parametrize(
-    ("order", "eigenvalue", "rate", "inside"),
-    [(2, 1.5, 80.0, 0.85), (2, 1.5, 17.0, 0.85), (2, 1.5, 6.0, 0.85), (3, 1.2, 10.0, 0.85), (1, 1.0, 17.0, 0.7)],
-)
-def test_basin_ends_between_its_share_and_the_formula(order, eigenvalue, rate, inside):
-    """A request that is wrong by so much that |f - d| is a share of the formula: settles below, grows or cycles above it.
-
-    With two poles the threshold is at 0.72, with more between 0.85 and 1.
-    """
-    sigmoid, problem = fp.Sigmoid(gain=-0.5, scale=2.0), chain(order, eigenvalue)
-    basin = basin_of_plain_form(sigmoid.largest_step(), order + 1, rate, PERIOD, eigenvalue=eigenvalue)
-    requests = [[share * basin / eigenvalue] for share in (inside, 1.0)]
-    errors = errors_after_request(problem, torque(rate, sigmoid), requests, int(60 / (rate * PERIOD)))
-    settled, grown = np.abs(errors[-200:, 0]).max(axis=0)
-    assert settled < 1e-3 * basin
-    assert grown > 0.1 * basin
-
-
-def test_basin_scales_with_the_map():
-    """Twice the scale, twice the basin; the rule for the step is its inverse with a spare factor."""
-    basins = [basin_of_plain_form(fp.Sigmoid(gain=-0.5, scale=s).largest_step(), 3, 6.0, PERIOD) for s in (1.0, 2.0)]
-    assert basins[1] == pytest.approx(2 * basins[0], rel=1e-12)
-    step = step_for_basin(30.0, 3, 6.0, PERIOD)
-    assert basin_of_plain_form(step, 3, 6.0, PERIOD) == pytest.approx(1.25 * 30.0, rel=1e-12)
-    assert step / fp.Sigmoid(gain=-0.5, scale=1.0).largest_step() == pytest.approx(
-        1.55 * least_product(3, 6.0, PERIOD) * 30.0, rel=5e-3
-    )
-    assert basin_of_plain_form(1.0, 1, 6.0, PERIOD) == math.inf
-    for call in (lambda: step_for_basin(-1.0, 3, 6.0, PERIOD), lambda: basin_of_plain_form(0.0, 3, 6.0, PERIOD)):
-        with pytest.raises(InvalidValue, match="expected"):
-            call()
-
-
 def test_automatic_scale_covers_the_basin():
     """A load that the model takes for half of what it is, at rest: the reference's slew asks for S = 1, which diverges."""
     plant = fp.Plant(
@@ -133,69 +90,6 @@ def test_automatic_scale_covers_the_basin():
 
 
 # Two-cycles
-
-
-def cycle_limit(problem: fp.Problem, rate: float) -> float:
-    low, high = linear_pair(problem, torque(rate, fp.Affine(gain=-1.0)), (0.3, 0.6))
-    return two_cycle_limit(low, high, (0.3, 0.6))
-
-
-def with_secant(share: float, scale: float = 5.0) -> fp.Sigmoid:
-    """A sigmoid with that secant gain."""
-    sigmoid = fp.Sigmoid(gain=-1.0, scale=scale)
-    return sigmoid.with_effective_gain(share * sigmoid.effective_gain() / sigmoid.secant_gain())
-
-
-@pytest.mark.parametrize("eigenvalue", [1.0, 1.5])
-@pytest.mark.parametrize("rate", [6.0, 17.0, 80.0])
-def test_two_cycle_limit_counts_the_tracking_law(eigenvalue, rate):
-    """Relative order 2: |L(-1)| = (lambda / 2)(1 + 3/2 Lambda T), and not lambda / 2, which the inner iteration alone has."""
-    expected = 2 / (eigenvalue * (1 + 1.5 * rate * PERIOD))
-    assert cycle_limit(chain(2, eigenvalue), rate) == pytest.approx(expected, rel=1e-9)
-
-
-@pytest.mark.parametrize(("problem", "rate"), [(chain(2, 1.5), 6.0), (chain(2, 1.5), 17.0), (coupled(), 6.0)])
-def test_two_cycles_begin_at_the_limit(problem, rate):
-    """Twelve first requests: all settle at 0.99 of the limit; at 1.01 some end in the cycle of the predicted size."""
-    limit, random = cycle_limit(problem, rate), np.random.default_rng(0)
-    requests = random.uniform(-10, 10, size=(12, len(problem.plant.names)))
-    below, above = (
-        errors_after_request(problem, torque(rate, with_secant(share * limit)), requests, 6000)[-50:]
-        for share in (0.99, 1.01)
-    )
-    assert np.abs(below).max() < 1e-9
-    sizes = np.linalg.norm(above, axis=1).max(axis=0)
-    cycling = sizes > 0.1
-    assert 0 < cycling.sum() < 12
-    amplitudes = two_cycle_amplitudes(with_secant(1.01 * limit), limit, size=1.0)
-    assert len(amplitudes) == 2
-    np.testing.assert_allclose(sizes[cycling], amplitudes[1], rtol=1e-6)
-
-
-def test_no_two_cycle_below_the_limit():
-    """No amplitude where the secant is nowhere as steep; one where the linear loop itself is unstable."""
-    assert two_cycle_amplitudes(with_secant(0.99), 1.0, size=1.0) == ()
-    assert len(two_cycle_amplitudes(fp.Sigmoid(gain=-1.0, scale=1.0).with_effective_gain(1.2), 1.0, size=1.0)) == 1
-    assert two_cycle_amplitudes(fp.Affine(gain=-1.0), 1.0, size=1.0) == ()
-
-
-def test_two_cycle_limit_of_a_gain_of_the_other_sign():
-    """A model with the wrong sign and a map with a negative gain make the same loop."""
-    low, high = linear_pair(chain(2, 1.5), torque(6.0, fp.Affine(gain=-1.0)), (0.3, 0.6))
-    assert two_cycle_limit(low, high, (-0.3, -0.6)) == pytest.approx(two_cycle_limit(low, high, (0.3, 0.6)))
-    assert two_cycle_limit(np.eye(2), np.eye(2), (0.3, 0.6)) == math.inf
-
-
-def test_two_cycles_refuse_bad_input():
-    """Matrices that do not match, equal gains, a map with memory, no limit."""
-    with pytest.raises(InvalidShape, match="square"):
-        two_cycle_limit(np.eye(2), np.eye(3), (0.3, 0.6))
-    with pytest.raises(InvalidValue, match="two different"):
-        two_cycle_limit(np.eye(2), np.eye(2), (0.3, 0.3))
-    with pytest.raises(InvalidValue, match="without memory"):
-        two_cycle_amplitudes(fp.Filtered(fp.Affine(gain=-1.0), pole=0.5), 1.0, size=1.0)
-    with pytest.raises(InvalidValue, match="limit: expected a number above 0"):
-        two_cycle_amplitudes(fp.Affine(gain=-1.0), 0.0, size=1.0)
 
 
 # A lag between request and response
@@ -226,27 +120,6 @@ def test_fast_iterations_bear_a_lag_up_to_one_over_its_poles(order, plain):
     assert edge(stable, 0.5 * limit, 2 * limit) == pytest.approx(limit, rel=0.03)
 
 
-@pytest.mark.parametrize("damping", [0.3, 0.5])
-@pytest.mark.parametrize("share", [0.05, 0.1, 0.2])
-def test_damped_product_keeps_its_damping(damping, share):
-    """Increment form, rate x lag up to 0.2: at the product of the rule the fast pair is damped as asked, to 15 %."""
-    tau = 0.02
-    rate = share / tau
-    gain = damped_product(PERIOD, tau, rate, 3, damping=damping)
-    modes = np.log(poles(lag(tau), 2, rate, PERIOD, gain, plain=False).astype(complex)) / PERIOD
-    fast = modes[(np.abs(modes) > 1.5 * rate) & (modes.imag > 1.0) & (modes.real > -0.9 / PERIOD)]
-    least = (-fast.real / np.abs(fast)).min()
-    assert 0.85 * damping < least < 1.1 * damping
-
-
-@pytest.mark.parametrize("product", [0.05, 0.3, 1.0])
-def test_bearable_lag_inverts_the_damped_product(product):
-    """At the lag that is returned the rule allows exactly this product; a slow tracking law bears T / (4 zeta^2 g)."""
-    longest = bearable_lag(product, PERIOD, 6.0, 3, damping=0.3)
-    assert damped_product(PERIOD, longest, 6.0, 3, damping=0.3) == pytest.approx(product, rel=1e-9)
-    assert bearable_lag(product, PERIOD, 0.0, 3, damping=0.3) == pytest.approx(PERIOD / 0.36 / product, rel=1e-9)
-
-
 def test_pairing_through_the_lag():
     """1000 random loops: (z - 1 + a)(z - rho) + a (1 - rho)(lambda - 1) z is stable exactly below the closed form."""
     random = np.random.default_rng(5)
@@ -259,19 +132,6 @@ def test_pairing_through_the_lag():
             continue
         polynomial = np.polyadd(np.poly([1 - gain, left]), [gain * (1 - left) * (eigenvalue - 1), 0.0])
         assert (np.abs(np.roots(polynomial)).max() < 1) == (eigenvalue < limit)
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: damped_product(PERIOD, 0.01, 1.0, 3, damping=0.0),
-        lambda: bearable_lag(0.0, PERIOD, 6.0, 3, damping=0.3),
-        lambda: resonant_limit(PERIOD, 6.0, 3, frequency=-1.0, damping=0.1),
-    ],
-)
-def test_lags_and_resonances_refuse_bad_input(call):
-    with pytest.raises(InvalidValue, match="expected"):
-        call()
 
 
 def test_the_condition_of_a_pairing_is_sufficient():
@@ -301,21 +161,3 @@ def test_the_condition_of_a_pairing_is_sufficient():
 
 
 # A resonance between request and response
-
-
-def test_resonances_bear_the_gain_of_the_rule():
-    """Twenty random flexible joints: the edge of the gain within 10 % of the rule where its margin is not small."""
-    random, worst = np.random.default_rng(6), 0.0
-    for _ in range(20):
-        frequency, damping = random.uniform(100, 400), random.uniform(0.05, 0.2)
-        rate, eigenvalue = random.uniform(0.005, 0.03) * frequency, random.uniform(0.6, 1.6)
-        period = 0.02 / frequency
-        rate = min(rate, 0.25 * 2 * damping * frequency / (3 * eigenvalue))
-        limit = resonant_limit(period, rate, 3, frequency=frequency, damping=damping, eigenvalue=eigenvalue)
-
-        def stable(gain: float, at=(frequency, damping, rate, eigenvalue, period)) -> bool:
-            response = resonance(at[0], at[1], at[3])
-            return np.abs(poles(response, 2, at[2], at[4], gain, plain=False)).max() < 1
-
-        worst = max(worst, abs(edge(stable, 0.3 * limit, 3 * limit) / limit - 1))
-    assert worst < 0.1

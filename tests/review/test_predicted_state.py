@@ -12,8 +12,6 @@ import fpirhc as fp
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.wrappers.predicted import Predictor
 from fpirhc.deformation import Deformation
-from fpirhc.review.questions.dead_time import KNOWS
-from fpirhc.review.review import review
 
 RATE, PERIOD, FORCE = 3.0, 0.01, 1.0  # 1/s, s, m/s^2
 KP, KD = RATE**2, 2 * RATE
@@ -84,26 +82,3 @@ def test_errors_of_a_body_outside_are_those_of_now():
     run = fp.simulate(problem, law(0.08, by=fp.ByDesired()), seed=0, compiled=False)
     np.testing.assert_allclose(run["true_error.q"], np.sin(run.time) - run["state.q"], atol=1e-12)
     assert np.abs(run["reference.q"] - np.sin(run.time + 0.08)).max() < 1e-12
-
-
-def test_review_names_a_prediction_that_knows_it():
-    late = 0.08
-    [answer] = about(KNOWS, mass(late), law(late, FORM))
-    assert answer.verdict == "caution"
-    assert answer.change == "Predict with what acts: Predicted(..., by=ByModel(residual_time=0.08))."
-    assert answer.numbers["error with ByModel(residual_time=0.08)"] < 0.01 * answer.numbers["error"]
-
-
-@pytest.mark.slow
-def test_review_keeps_a_prediction_that_is_right():
-    late = 0.08
-    right = mass(late).with_exact(np.zeros(1))
-    [answer] = about(KNOWS, right, law(late, FORM))
-    assert answer.verdict == "yes"
-    assert not about(KNOWS, mass(late), law(late, FORM, fp.ByDesired()))
-
-
-def about(question: str, problem: fp.Problem, controller: Controller):
-    """The answers to a question."""
-    answers = review(problem, {"law": controller}, mismatch=0.0, seed=0).controllers["law"]
-    return [one for one in answers if one.question == question]

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 from plants import heavy
-from reviewed import answer
 
 import fpirhc as fp
 from fpirhc.review.grid import inner_motion, inner_places, review_grid
-from fpirhc.review.questions.convergence import rates_inside, zero_dynamics
-from fpirhc.review.questions.margins import SLOWER
 from fpirhc.review.review import review
 
 PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-3))
@@ -41,101 +37,6 @@ def companion(rate: float, *, weigh: bool = False, **settings: Any) -> fp.Proble
         "cost": fp.Quadratic(states={"y": 1.0} | ({"z": 1.0} if weigh else {}), deviation={"u": 1e-3}),
     }
     return fp.Problem(plant=plant, **(usual | settings))
-
-
-@pytest.mark.parametrize(
-    ("rate", "controller", "verdict", "begin"),
-    [
-        (-32.9, LAW, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
-        (309.0, LAW, "no", "unstable: while the reference is followed they grow at up to 309 1/s"),
-        (-32.9, PLAN, "yes", "stable: while the reference is followed they decay at 32.9 1/s"),
-        (19.0, PLAN, "no", "unstable: while the reference is followed they grow at up to 19 1/s"),
-        (0.0, LAW, "yes", "the slowest of them neither grows nor decays"),
-        (0.0, PLAN, "yes", "the slowest of them neither grows nor decays"),
-    ],
-)
-def test_zero_dynamics_have_a_rate_and_a_sign(rate, controller, verdict, begin):
-    """The rate is an eigenvalue by construction; a neutral one that nothing reads is no fault."""
-    one = answer(companion(rate), controller, "zero dynamics")
-    assert (one.verdict, one.evidence[: len(begin)]) == (verdict, begin)
-    assert one.numbers["rate"] == pytest.approx(rate, abs=1e-9)
-
-
-def test_unstable_zero_dynamics_that_a_plan_holds_are_told_as_both():
-    """The answer is yes, and its evidence does not begin with the opposite."""
-    held: Any = SimpleNamespace(loops=(None,), radii=np.array([0.99]), learns=False)
-    one = zero_dynamics(companion(19.0), 19.0, True, held)
-    assert one.verdict == "yes"
-    assert one.evidence == (
-        "unstable by themselves and held by the plan: while the reference is followed they grow at up to 19 1/s; the slowest mode "
-        "of the linear loop is multiplied by 0.99 per cycle"
-    )
-
-
-@pytest.mark.parametrize(
-    ("rate", "planned", "radius", "learns", "verdict"),
-    [
-        (19.0, True, 0.999, False, "yes"),  # the plan holds them
-        (19.0, True, 1 + 1e-9, False, "caution"),  # a mode that neither grows nor decays
-        (19.0, True, 1.0003, False, "caution"),  # growth of 8 % over the 250 cycles of the run does not show
-        (19.0, True, 1.01, False, "no"),
-        # By themselves they grow by 5 % in the run, and no plan needs to hold them.
-        (0.01, True, 1.01, False, "caution"),
-        (19.0, True, 1.01, True, "unknown"),  # what learns changes the loop
-        (1e-6, False, 1.01, False, "caution"),  # neutral
-        (19.0, False, 0.9, False, "no"),  # a law that does not see them holds none
-        (0.01, False, 1.01, False, "unknown"),
-        (-1.0, True, 1.01, False, "yes"),
-    ],
-)
-def test_zero_dynamics_that_grow_are_a_no_where_nothing_holds_them_and_the_run_shows_it(
-    rate, planned, radius, learns, verdict
-):
-    found: Any = SimpleNamespace(loops=(None,), radii=np.array([0.9, radius]), learns=learns)
-    assert zero_dynamics(companion(rate), rate, planned, found).verdict == verdict
-
-
-@pytest.mark.parametrize(
-    ("rate", "radius", "verdict", "change"),
-    [
-        (-32.9, 0.999, "yes", ""),
-        (-32.9, 1.0 + 1e-9, "caution", "A mode neither grows nor decays"),
-        (-32.9, 1.2, "no", "Lower the rate, or shorten the period."),
-        (19.0, 1.4, "caution", "It is the mode of the zero dynamics"),  # e^(19 x .02) = 1.46
-        (19.0, 1.6, "no", "Lower the rate, or shorten the period."),
-    ],
-)
-def test_the_ideal_loop_says_whether_the_sampling_is_fast_enough(rate, radius, verdict, change):
-    """A mode that grows faster than the zero dynamics is the law's, and a slower one theirs."""
-    loops: Any = SimpleNamespace(ideal=SimpleNamespace(radius=radius), reason="")
-    one = rates_inside(review_grid(companion(rate), 0.0, 0), LAW, loops)
-    assert (one.verdict, one.change[: len(change)]) == (verdict, change)
-    assert (one.numbers["ideal_radius"], one.numbers["rate_period"]) == pytest.approx((radius, 0.04))
-    assert bool(one.change) == bool(change)
-
-
-@pytest.mark.parametrize("rate", [19.0, -32.9])
-def test_a_plan_that_is_tracked_has_the_sign_too(rate):
-    """A plan that is restarted and tracked holds no state that its cost does not weigh: stable is yes, unstable is no."""
-    tracked = replace(PLAN, replanning=fp.FromMeasurementTracked(fp.Exponential(rate=2.0)))
-    one = answer(companion(rate), tracked, "zero dynamics")
-    assert one.verdict == ("yes" if rate < 0 else "no")
-    assert f"{abs(rate):.3g} 1/s" in one.evidence
-
-
-@pytest.mark.parametrize("controller", [LAW, PLAN])
-@pytest.mark.parametrize("words", ["sampling fast enough", "margin"])
-def test_an_integral_that_nobody_judges_is_no_fault(controller, words):
-    """It stays where it is put, and no judged coordinate shows it; the horizon is not said to diverge either."""
-    one = answer(companion(0.0), controller, words)
-    assert one.verdict == "yes", one
-    assert answer(companion(0.0), controller, "horizon long").verdict == "yes"
-
-
-def test_an_integral_that_is_judged_is_not_called_stable():
-    """The same integral among the judged coordinates: its error stays, which is no yes."""
-    assert answer(companion(0.0, judged=("y", "z")), LAW, "zero dynamics").verdict == "caution"
-    assert answer(companion(0.0, judged=("y", "z")), LAW, "margin").verdict == "caution"
 
 
 def test_times_have_the_unit_of_the_problem():
@@ -171,29 +72,6 @@ def tissue(invented: float, **settings: Any) -> fp.Problem:
         "duration": 12.0,
     }
     return fp.Problem(plant=plant, **(usual | settings))
-
-
-def in_tissue(t: np.ndarray, k: float) -> np.ndarray:
-    """Solution of z' = k (2 + sin t - z), z(0) = 0."""
-    particular = 2 + k * (k * np.sin(t) - np.cos(t)) / (k**2 + 1)
-    return np.asarray(particular - (2 - k / (k**2 + 1)) * np.exp(-k * t))
-
-
-@pytest.mark.parametrize("invented", [0.0, 40.0])
-def test_states_without_a_task_are_where_the_plant_takes_them(invented):
-    """The tissue fills by its own equation whatever its reference is, and the commands are those of this motion."""
-    grid = review_grid(tissue(invented), 20.0, 0)
-    assert grid.inner == (1,)
-    for k, states, commands in zip(grid.draws[:, 1], grid.drawn_states, grid.commands, strict=True):
-        assert states[:, 1] == pytest.approx(in_tissue(grid.times, k), abs=1e-5)
-        assert np.isfinite(commands).all()
-    y, t = 2 + np.sin(grid.times), grid.times
-    assert grid.commands[0, :, 0] == pytest.approx(np.cos(t) + y - in_tissue(t, 0.5), abs=1e-5)
-    assert grid.states_at(np.array([3.3]))[0] == pytest.approx(
-        [2 + np.sin(3.3), float(in_tissue(np.array(3.3), 0.5))], abs=1e-4
-    )
-    well = answer(tissue(invented), None, "well posed")
-    assert well.evidence.endswith("z has no task and is simulated")
 
 
 @pytest.mark.parametrize(
@@ -243,15 +121,6 @@ def test_currents_of_the_nerve_cell_are_those_of_a_run():
     assert (needed.min(), needed.max()) == pytest.approx((-43.6, 71.4), abs=0.2)
 
 
-@pytest.mark.parametrize(("name", "most"), [("stick_slip", 0.7), ("turbojet", 0.8)])
-def test_parameters_of_a_plant_stay_together(name, most):
-    """Bristles and the friction that they carry are wrong together: the box needs little more than the plant itself."""
-    task = fp.load_problem(f"problems/gallery/{name}.py")
-    one = answer(task.problem, None, "commands")
-    assert one.verdict == "yes"
-    assert one.numbers["share_over_box"] < most
-
-
 def test_draws_are_between_the_range_and_the_model():
     """Every draw is a mean of a point of the range and the approximate parameters, with one weight for all parameters."""
     problem = tissue(0.0)
@@ -284,33 +153,6 @@ def test_a_filter_is_refused_for_a_state_that_is_judged_or_grows(rate, settings)
     every = fp.review(companion(rate, **settings), {"free": free}, mismatch=0.0, seed=0).answers
     [refused] = [a for a in every if "fit the problem" in a.question]
     assert refused.verdict == "no"
-
-
-def unstable_inverse(target: Any) -> fp.Problem:
-    """Y = x1 - x2 of two lags with 1 and 3 1/s: the zero is at +1 1/s, so no input holds y that stays finite."""
-    plant = fp.Plant.of_states(
-        states={"x1": "m", "x2": "m"},
-        inputs={"u": "m"},
-        rates=lambda x, u, p: {"x1": p.k * u.u - x.x1, "x2": 2 * 3 * p.k * u.u - 3 * x.x2},
-        outputs={"y": fp.Output("m", lambda x, p: x.x2 - x.x1 * 3)},
-        parameters={"k": fp.Parameter(1.1, 1.0, "1/s")},
-    )
-    return fp.Problem(
-        plant=plant, reference=fp.Trajectory(target), start={"x1": 0.1, "x2": 0.0}, period=0.02, duration=200.0
-    )
-
-
-def test_a_held_reference_has_a_rest_where_its_inverse_runs_away():
-    """At rest x1 = k u, x2 = 2 k u and y = -k u; the draws have their own inputs, and a moving reference has no rest."""
-    times = np.linspace(0.0, 200.0, 5)
-    held = unstable_inverse(lambda t: {"y": 2.0 + 0 * t})
-    for gain, states in zip((1.0, 0.5), inner_motion(held, (0, 1), np.array([[1.0], [0.5]]), times), strict=True):
-        assert states is not None, gain
-        np.testing.assert_allclose(states, np.tile([-2.0, -4.0], (5, 1)), rtol=1e-9)
-    moving = unstable_inverse(lambda t: {"y": 2.0 + ca.sin(t)})
-    [one] = inner_motion(moving, (0, 1), np.array([[1.0]]), times)
-    assert one is None or np.abs(one).max() > 1e9
-    assert "x1, x2 are where the plant rests on the reference" in answer(held, PLAN, "well posed").evidence
 
 
 # A filter that estimates what the model lacks is judged with the loop: it is the iteration, and has its limit
@@ -366,11 +208,3 @@ def test_a_filter_of_responses_alone_is_the_model_referenced_form_of_its_gain(ga
     form = fp.ComputedTorque(COMPUTED.tracking, fp.ModelReferenced(fp.Affine(-2 * filtered[2, 0])))
     one, other = (fp.simulate(problem, c, seed=0, compiled=False) for c in (alone, form))
     assert np.abs(one["command"] - other["command"]).max() < 1e-12 * np.abs(one["command"]).max()
-
-
-def test_a_filter_with_little_margin_is_told_to_learn_more_slowly():
-    """Its margin is that of the gain L; the rate of the law around it is not the cause."""
-    answers = review(cart(1.7), {"filter": FILTER}, mismatch=0.0, seed=0).controllers["filter"]
-    [margin] = [one for one in answers if "gain_margin" in one.numbers]
-    assert margin.verdict == "caution"
-    assert margin.change == SLOWER

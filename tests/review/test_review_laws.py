@@ -16,10 +16,6 @@ import fpirhc as fp
 from fpirhc.contraction.delayed import least_product
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation import Deformation
-from fpirhc.review.question import ControllerQuestion, ProblemQuestion, known_questions
-from fpirhc.review.questions.convergence import BOX, CONVERGES
-from fpirhc.review.questions.gain import GAIN, ONE_SIGN, TWO_CYCLES
-from fpirhc.review.questions.right_model import NULL_TEST
 from fpirhc.simulation.model_as_plant import shortened
 
 RATE, PERIOD = 20.0, 1e-3  # 1/s, s
@@ -127,29 +123,6 @@ def test_the_basin_is_asked_of_laws_with_two_poles_and_compared_with_jumps():
     assert answer(pushed, sigmoid, "come back").numbers["error"] == pytest.approx(40.0 * gain)
 
 
-def test_questions_that_are_asked_of_a_map_on_targets_ask_its_loop():
-    """Whatever is about a response Jacobian is not asked; its loop, its gain and its dead time are."""
-    of_targets = {q.text for q in known_questions(ControllerQuestion) if q.of_targets}
-    assert {CONVERGES, BOX, GAIN, NULL_TEST} < of_targets
-    assert not {ONE_SIGN, TWO_CYCLES} & of_targets
-
-
-def test_a_no_about_the_way_speaks_against_the_verdict():
-    """A singular inverse, commands and requests out of range, and two-cycles: whatever the poles of the loop say."""
-    every = *known_questions(ControllerQuestion), *known_questions(ProblemQuestion)
-    doubts = {q.text for q in every if q.doubts}
-    assert doubts == {
-        "Is the problem well posed?",
-        "Does the inverse exist along the reference?",
-        "Are the commands that the reference needs inside the limits?",
-        "Is the map fast enough for reference and disturbances?",
-        "Is the map's range large enough for the requests?",
-        "Is it free of bounded two-cycles?",
-        "Does it come back from the largest response error?",
-        "Does the loop with the reality converge?",
-    }
-
-
 @pytest.mark.parametrize(("period", "harmful"), [(PERIOD, False), (0.02, True)])
 def test_half_of_the_limit_of_two_cycles_is_proposed_after_a_run(period, harmful):
     """A model that is 2 % wrong: in a long period the plain form at half of the limit loses what the tracking law holds."""
@@ -202,20 +175,6 @@ def steps_in_a_run(problem: fp.Problem, controller: Controller) -> float:
     rest = replace(problem, reference=fp.Trajectory(lambda t: {"y": 0 * t}), start={"y": 0.0}, duration=10.0)
     steps = np.diff(fp.simulate(rest, controller, seed=0, compiled=False)["command"][2000:, 0])
     return float(np.sqrt(np.mean(steps**2)))
-
-
-def test_chatter_is_told_and_what_to_do():
-    """A noisy accelerometer: the step of the command is that of `suggest` but for the tracking law; without limits it is small."""
-    noisy = moving(sensing=fp.Sensing({"y''": fp.Sensor(noise=fp.Noise(1.0))}))
-    loud = answer(replace(noisy, limits=fp.Limits(inputs={"u": (-20.0, 20.0)})), fp.Affine(gain=-1.0), "chatter")
-    assert loud.verdict == "caution"
-    assert "suggest" in loud.change
-    controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Affine(gain=-0.1))
-    same = fp.suggest(noisy, controller, chatter=loud.numbers["step_u"], ringing=0.0)
-    assert same.gain == pytest.approx(-1.0, rel=0.05)
-    quiet = answer(noisy, fp.Filtered(fp.Affine(gain=-1.0), pole=0.9), "chatter")
-    assert quiet.verdict == "yes"
-    assert quiet.numbers["step_u"] < 0.3 * loud.numbers["step_u"]
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,10 @@
 import fpirhc as fp
 from fpirhc.controllers import replanning
 from fpirhc.describe import describe, identity
-from fpirhc.review.prediction import NominalRuns
 from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linearisation import Linearisation
 from fpirhc.simulation.linearise.slopes import Step
-from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.trials import Trials
 from fpirhc.symbolic import block
 
@@ -49,15 +47,6 @@ def test_only_steps_that_are_called_are_written_out_as_scalar_code(monkeypatch):
     written = counted(monkeypatch, block, "scalar_code")
     assert loop.close_loop(task.problem, task.controllers["CTC"]).function.is_a("SXFunction")
     assert len(written) == 2
-
-
-def test_what_differs_in_nothing_is_the_same_problem():
-    task = fp.load_problem("two_mass")
-    problem, controller = task.problem, task.controllers["RHC+FPI"]
-    assert shortened(problem, 100) is shortened(problem, 100)
-    models = NominalRuns(problem).model
-    assert models.of(controller) is models.of(task.controllers["RHC"])
-    assert models.of(fp.ExactModel(controller)) is not models.of(controller)
 
 
 def test_runs_where_errors_count_are_made_once():

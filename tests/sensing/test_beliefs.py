@@ -16,7 +16,6 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.sensing.base import StateObserver, unobservable
 from fpirhc.simulation.step_arguments import raw_measurements
@@ -31,14 +30,6 @@ def infusion(observer: StateObserver, **changes: Any) -> fp.Problem:
     sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["C1"], observer=observer)
     settings: dict[str, Any] = {"duration": 30.0, "measure_from": 5.0, "sensing": sensing}
     return replace(abroad.load("drug_infusion").problem, **(settings | changes))
-
-
-def tanks(observer: StateObserver, **changes: Any) -> fp.Problem:
-    """Four tanks whose lower levels are measured."""
-    problem = abroad.load("quadruple_tank").problem
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["h1", "h2"], observer=observer)
-    settings: dict[str, Any] = {"duration": 60 * problem.period, "measure_from": 0.0, "sensing": sensing}
-    return replace(problem, **(settings | changes))
 
 
 def servo(observer: StateObserver, **changes: Any) -> fp.Problem:
@@ -76,29 +67,7 @@ def run(problem: fp.Problem, controller: Controller, seed: int = 0, compiled: bo
 # The model alone
 
 
-@pytest.mark.parametrize(
-    ("make", "controller"), [(infusion, CTC), (tanks, None), (servo, CTC)], ids=["infusion", "tanks", "servo"]
-)
-@pytest.mark.parametrize("corrected", [True, False])
-def test_a_right_model_believes_what_is(make, controller, corrected):
-    """With exact parameters the believed states are the plant's, as late as the measurement is, to rounding."""
-    problem = make(fp.ModelStates(corrected))
-    if make is servo:  # a difference of angles would be half a cycle late
-        sensing = replace(problem.sensing, estimator=fp.VelocityDifference(), measured=["motor", "motor'"])
-        problem = replace(problem, sensing=sensing)
-    result = run(problem, fp.ExactModel(controller or abroad.load("quadruple_tank").controllers["RHC"]))
-    late = round(problem.dead_time.measurement / problem.period)
-    assert result.stop is None
-    places = [result.layout["state"].elements.index(e) for e in problem.sensing.believed(problem.plant)]
-    believed, true = result["state"][:, places], result["plant_state"][:, places]
-    assert places
-    assert np.ptp(true, axis=0).min() > 0
-    if late:
-        assert np.array_equal(believed[: late + 1], np.tile(true[0], (late + 1, 1)))
-    np.testing.assert_allclose(believed[late:], true[: len(true) - late], atol=1e-11 * (1 + np.abs(true).max()))
-
-
-@pytest.mark.parametrize("observer", [fp.ModelStates(), fp.ModelStates(corrected=False), KALMAN], ids=str)
+@pytest.mark.parametrize("observer", [KALMAN], ids=str)
 def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(observer):
     """Commands 1.25 and samples 2.4 cycles late: every believed state is interpolated as the measured one is, to rounding."""
     dead_time = fp.DeadTime(inputs={"u": 1.25 / 6}, measurement=2.4 / 6, before={"u": 9.0})
@@ -108,50 +77,6 @@ def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model(observe
     np.testing.assert_allclose(result["state"][3:], expected, atol=1e-11)
     assert np.array_equal(result["state"][:3], np.tile(true[0], (3, 1)))
     assert np.ptp(expected, axis=0).min() > 0.1
-
-
-def test_on_a_curved_motion_a_fraction_costs_an_error_of_second_order():
-    """The pendulum by itself, 1.5 cycles late: half the period, a quarter of the difference to the interpolated angle."""
-    observer, errors = fp.ModelStates(corrected=False), []
-    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["angle'"], observer=observer)
-    for period in (0.02, 0.01):
-        late = fp.DeadTime(measurement=1.5 * period)
-        result = run(
-            swing(observer, period=period, dead_time=late, sensing=sensing, duration=1.0), fp.ExactModel(TRACK)
-        )
-        true = result["plant_state.angle"]
-        errors.append(np.abs(result["state.angle"][2:] - (true[1:-1] + true[:-2]) / 2).max())
-    assert errors[1] == pytest.approx(errors[0] / 4, rel=0.2)
-
-
-def test_a_wrong_model_drifts_no_further_than_its_bound():
-    """C2' = k21 (C1 - C2) with C1 measured: |e| <= max|(k21 - k21^)(C1 - C2)| / k21^, from e' = -k21^ e + (k21 - k21^)(C1 - C2)."""
-    problem = infusion(fp.ModelStates(), duration=120.0)
-    result = run(problem, CTC)
-    parameters = problem.plant.parameters["k21"]
-    error = np.abs(result["state.C2"] - result["plant_state.C2"])
-    drive = np.abs((parameters.exact - parameters.approximate) * (result["plant_state.C1"] - result["plant_state.C2"]))
-    bound = drive.max() / parameters.approximate
-    assert 0.1 * bound < error.max() <= bound * (1 + 1e-2)  # the command is held, C1 moves within a cycle
-
-
-def test_a_model_that_runs_by_itself_drifts_without_bound():
-    """Y'' = b u, only y' measured and b wrong by 20 %: y is off by the integral of (b^ - b) u exactly, however long."""
-    problem = fp.Problem(
-        plant=linear(1.2, 1.0),
-        reference=fp.Trajectory(lambda t: {"y": 0.5 * t**2}),
-        start={"y": 0.0},
-        period=0.01,
-        duration=4.0,
-        sensing=fp.Sensing({}, fp.VelocityDifference(), measured=["y'"], observer=fp.ModelStates(corrected=False)),
-    )
-    result = run(problem, TRACK)
-    command, period = result["command"][:-1, 0], problem.period
-    speed = np.concatenate([[0.0], np.cumsum(-0.2 * command * period)])
-    expected = np.concatenate([[0.0], np.cumsum(speed[:-1] * period - 0.2 * command * period**2 / 2)])
-    np.testing.assert_allclose((result["state.y"] - result["plant_state.y"]), expected, atol=1e-10)
-    assert abs(expected[-1]) > 0.5
-    assert not unobservable_errors(problem).decays
 
 
 # Kalman's filter
@@ -243,7 +168,7 @@ def test_an_accelerometer_may_correct_it():
     assert errors[0] < errors[1]
 
 
-@pytest.mark.parametrize("observer", [fp.ModelStates(), KALMAN], ids=lambda b: type(b).__name__)
+@pytest.mark.parametrize("observer", [KALMAN], ids=lambda b: type(b).__name__)
 def test_adaptation_works_on_believed_states(observer):
     """The patient is another one than the model's: with FPI the plasma errs a tenth, though three compartments are believed."""
     errors = {}
@@ -251,15 +176,6 @@ def test_adaptation_works_on_believed_states(observer):
         problem = infusion(observer, duration=60.0, measure_from=20.0)
         errors[name] = fp.measure(problem, run(problem, controller)).rms_error["C1"]
     assert errors["with"] < 0.1 * errors["without"]
-
-
-def test_a_model_referenced_form_passes_the_null_test_on_believed_states():
-    """With an exact model it changes nothing: the twin's response passes the same estimator."""
-    problem = tanks(fp.ModelStates())
-    referenced = fp.ComputedTorque(fp.Exponential(rate=0.05), fp.ModelReferenced(fp.Affine(gain=-0.5)))
-    plain = fp.ComputedTorque(fp.Exponential(rate=0.05))
-    first, second = (run(problem, fp.ExactModel(c)) for c in (plain, referenced))
-    np.testing.assert_allclose(first["state"], second["state"], atol=1e-9)
 
 
 # What cannot be known is named
@@ -290,14 +206,6 @@ def test_motion_can_show_what_rest_hides():
     assert unobservable([first, second], [c, c]).shape[1] == 0
 
 
-def test_errors_that_decay_are_allowed_and_known():
-    """The effect site follows the plasma and shows nowhere; its error decays with ke0 of the model, 0.26 / min."""
-    free = unobservable_errors(infusion(KALMAN))
-    assert free.states == ("Ce",)
-    assert free.pole == pytest.approx(-0.26, rel=1e-9)
-    assert unobservable_errors(infusion(fp.ModelStates())).states == ("C2", "C3", "Ce")
-
-
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():
     """From the load's speed nobody knows the angles: a turn of the whole servo shows nowhere and stays."""
     observer = fp.KalmanFilter(measured={"load'": 0.1}, noise={"motor": 1.0})
@@ -307,17 +215,6 @@ def test_a_state_that_cannot_be_observed_is_named_before_the_run():
         match=r"KalmanFilter: load and motor cannot be observed along the reference from load'.*measure load",
     ):
         run(problem, CTC)
-
-
-def test_a_review_says_whether_believed_states_become_right():
-    """Yes with the time constant of the slowest error, no where it stays."""
-    texts = {}
-    for name, problem in (("infusion", infusion(fp.ModelStates())), ("servo", servo(fp.ModelStates()))):
-        answers = fp.review(problem, {"CTC": CTC}, mismatch=0.0, seed=0).problem
-        [texts[name]] = [a for a in answers if a.question == "Are the believed states right after a while?"]
-    assert texts["infusion"].verdict == "yes"
-    assert "time constant of 303 min" in texts["infusion"].evidence
-    assert texts["servo"].verdict in ("yes", "no")
 
 
 def shown(*measured: str, observer: StateObserver | None = None, **sensors: fp.Sensor) -> fp.Problem:
@@ -331,16 +228,10 @@ BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         InvalidProblem,
         "measured: quantity 'c1'.*Did you mean 'C1'",
     ),
-    "nothing measured": (lambda: shown(observer=fp.ModelStates()), InvalidProblem, "name at least one quantity"),
     "no observer": (
         lambda: shown("C1"),
         InvalidProblem,
         "VelocityDifference also needs C2, C3, Ce; measure it, or state how it is believed",
-    ),
-    "observer without need": (
-        lambda: infusion(KALMAN, sensing=fp.Sensing({}, fp.PositionDifference(), observer=fp.ModelStates())),
-        InvalidProblem,
-        r"everything that PositionDifference needs is measured; name what sensors show: Sensing\(measured=\['C1'",
     ),
     "filter of what is not measured": (
         lambda: infusion(replace(KALMAN, measured={"C2": 0.1})),
@@ -352,17 +243,7 @@ BAD: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
         InvalidProblem,
         "noise: coordinate 'C22'.*Did you mean 'C2'",
     ),
-    "sensor of a believed state": (
-        lambda: shown("C1", observer=fp.ModelStates(), C2=fp.Sensor(quantum=0.1)),
-        InvalidProblem,
-        "'C2' is estimated by ModelStates, not measured; sensors are those of C1",
-    ),
     "no noise": (lambda: fp.KalmanFilter(measured={"C1": 0.1}, noise={}), InvalidValue, "name at least one"),
-    "response of the model": (
-        lambda: run(shown("Ce", observer=fp.ModelStates()), FPI),
-        NotSupported,
-        "the response that Affine compares needs C1, which no sensor shows.*nothing can be learned",
-    ),
 }
 
 
@@ -371,10 +252,3 @@ def test_mistakes_are_named(what):
     make, kind, message = BAD[what]
     with pytest.raises(kind, match=f"(?s){message}"):
         make()
-
-
-def test_a_controller_that_does_not_adapt_may_believe_its_response():
-    """Control of the plasma from the effect site alone: the response is the model's, and nobody learns from it."""
-    sensing = fp.Sensing({}, fp.VelocityDifference(), measured=["Ce"], observer=fp.ModelStates())
-    result = run(infusion(KALMAN, sensing=sensing), fp.ExactModel(CTC))
-    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-11)

@@ -24,7 +24,6 @@ NOISES: dict[str, Any] = {
     "start": {"young": 0.1, "adult": 0.1},
 }
 FILTER = fp.KalmanFilter(**NOISES)
-HORIZON = fp.MovingHorizonStates(**NOISES, window=4)
 
 
 def run(problem: fp.Problem, controller: Any = TRACK, seed: int = 0) -> fp.Run:
@@ -55,7 +54,7 @@ def fishery(observer: StateObserver, birth: float = 2.5, noise: float = 0.0, **c
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("observer", [fp.ModelStates(), FILTER, HORIZON], ids=lambda b: type(b).__name__)
+@pytest.mark.parametrize("observer", [FILTER], ids=lambda b: type(b).__name__)
 def test_the_right_map_believes_what_is(observer: StateObserver) -> None:
     result = run(fishery(observer))
     np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-12)
@@ -117,11 +116,7 @@ def drained(algebraic: bool, observer: StateObserver) -> fp.Problem:
 LEVELS: dict[str, Any] = {"measured": {"h1": 1e-3}, "noise": {"h1": 0.02, "h2": 0.05}}
 
 
-@pytest.mark.parametrize(
-    "observer",
-    [fp.ModelStates(), fp.KalmanFilter(**LEVELS), fp.MovingHorizonStates(**LEVELS, window=4)],
-    ids=lambda b: type(b).__name__,
-)
+@pytest.mark.parametrize("observer", [fp.KalmanFilter(**LEVELS)], ids=lambda b: type(b).__name__)
 def test_algebraic_states_are_believed_as_those_that_are_solved_by_hand(observer: StateObserver) -> None:
     """Newton's flow and its derivatives are those of the root: the wrong pipe is corrected alike."""
     one, other = (
@@ -132,41 +127,6 @@ def test_algebraic_states_are_believed_as_those_that_are_solved_by_hand(observer
 
 
 # Outputs that the command moves at once
-
-
-def test_an_output_of_order_zero_shows_what_is_believed() -> None:
-    """The power of a heating element is measured; its temperature, started 20 K too low, follows from the resistance."""
-
-    def resistance(x: Any) -> Any:
-        return 14.0 * (1 + 4e-3 * x.theta)
-
-    plant = fp.Plant.of_states(
-        states={"theta": "K"},
-        inputs={"u": "V"},
-        parameters={},
-        rates=lambda x, u, p: {"theta": (u.u**2 / resistance(x) - 2.0 * x.theta) / 50.0},
-        outputs={"power": fp.Output("W", lambda x, u, p: u.u**2 / resistance(x))},
-        inverse=lambda x, r, p: {"u": ca.sqrt(r.power * resistance(x))},
-    )
-    observer = fp.KalmanFilter(measured={"power": 1.0}, noise={"theta": 0.1}, start={"theta": 20.0})
-    problem = fp.Problem(
-        plant=plant,
-        reality=fp.Reality(plant, start={"theta": 30.0}),
-        reference=fp.Trajectory(lambda t: {"power": 200 + 60 * ca.sin(t / 5)}),
-        start={"theta": 10.0},
-        input_before={"u": 60.0},
-        period=0.1,
-        duration=10.0,
-        sensing=fp.Sensing(
-            {"power": fp.Sensor(noise=fp.Noise(1.0))}, fp.Measured(), measured=["power"], observer=observer
-        ),
-    )
-    errors = {}
-    for name, one in (("filter", observer), ("model", fp.ModelStates())):
-        result = run(replace(problem, sensing=replace(problem.sensing, observer=one)), fp.FeedforwardOnly())
-        errors[name] = np.abs(result["state.theta"] - result["plant_state.theta"])[50:].max()
-    assert errors["filter"] < 1.5
-    assert errors["model"] > 10
 
 
 # Signals from outside
@@ -201,11 +161,7 @@ ROOM: dict[str, Any] = {"measured": {"felt": 0.1}, "noise": {"air": 0.1, "walls"
 
 @pytest.mark.parametrize(
     ("observer", "late"),
-    [
-        *((fp.ModelStates(), late) for late in (0, 3, 0.5, 2.4)),
-        (fp.KalmanFilter(**ROOM), 2),
-        (fp.MovingHorizonStates(**ROOM, window=5), 2),
-    ],
+    [(fp.KalmanFilter(**ROOM), 2)],
     ids=lambda v: type(v).__name__ if isinstance(v, StateObserver) else str(v),
 )
 def test_a_right_model_in_known_weather_believes_what_is(observer: StateObserver, late: float) -> None:
@@ -244,16 +200,6 @@ def test_noises_of_a_filter_are_live_bit_by_bit() -> None:
     problem = double(fp.KalmanFilter(**HALF))
     live = {one.path: one.refused for one in check_live(problem, TRACK, paths=paths, cycles=12)}
     assert [path for path in paths if not live[path]] == paths[:3]
-
-
-NOT_LIVE = ("measured.y", "noise.y", "start.y", "bounds.y.0", "window", "iterations", "barrier")
-
-
-@pytest.mark.parametrize("name", NOT_LIVE)
-def test_settings_of_a_moving_horizon_are_not_live(name: str) -> None:
-    observer = fp.MovingHorizonStates(**HALF, window=3, bounds={"y": (-1.0, 1.0)})
-    with pytest.raises(NotSupported, match=f"'sensing.observer.{name}'.* cannot be live"):
-        fp.simulator(double(observer), TRACK, compiled=False, live=[f"sensing.observer.{name.removesuffix('.0')}"])
 
 
 def test_a_late_measurement_is_not_live_beside_a_observer() -> None:

@@ -18,7 +18,6 @@ from filters import extended_filter, runge_kutta
 from plants import simulated as run
 
 import fpirhc as fp
-from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 from fpirhc.sensing.base import StateObserver
 
@@ -68,7 +67,7 @@ def sedated(observer: StateObserver | None, believed: float = 4.0, **changes: An
 
 
 @pytest.mark.parametrize("late", [0.0, 2 / 12], ids=["at once", "two cycles late"])
-@pytest.mark.parametrize("observer", [fp.ModelStates(), fp.ModelStates(corrected=False), FILTER], ids=str)
+@pytest.mark.parametrize("observer", [FILTER], ids=str)
 def test_a_right_model_believes_what_is(observer: StateObserver, late: float) -> None:
     """With exact parameters the states are the plant's, as late as the measurement is; the outputs are estimated."""
     problem = sedated(observer, dead_time=fp.DeadTime(inputs={"u": 1.5 / 12}, measurement=late), duration=6.0)
@@ -97,55 +96,12 @@ def test_a_filter_of_an_output_is_that_of_the_books() -> None:
     assert np.abs(result["state"] - result["plant_state"]).max() > 0.3
 
 
-def test_a_measured_state_beside_the_output_corrects_what_is_believed() -> None:
-    """A blood sample in every cycle: the plasma is known, and the wrong curve moves the other states less."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], observer=fp.ModelStates())
-    problem = sedated(None, believed=5.0, sensing=sensing, disturbances={"u": fp.Step(at=2.0, size=0.5)})
-    result = run(problem, PLAIN)
-    alone = run(replace(problem, sensing=replace(sensing, measured=["depth"])), PLAIN)
-    assert sensing.known(problem.plant) == ("C",)
-    assert np.array_equal(result["state.C"], result["plant_state.C"])
-    errors = [np.abs(r["state.E"] - r["plant_state.E"]).max() for r in (result, alone)]
-    assert errors[0] < 0.05 * errors[1]
-
-
-def test_a_late_measured_state_begins_where_the_reality_does() -> None:
-    """A blood sample that is late by three cycles shows the real start until it shows the motion; the observer began elsewhere."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"], observer=fp.ModelStates())
-    real, late = fp.Reality(drug(), start={"C": 2.5, "R": 0.5, "E": 2.5}), fp.DeadTime(measurement=3 / 12)
-    result = run(sedated(None, sensing=sensing, reality=real, dead_time=late, duration=4.0), PLAIN)
-    assert np.array_equal(result["state.C"][:4], np.full(4, 2.5))
-    assert np.array_equal(result["state.C"][4:], result["plant_state.C"][1:-3])
-    assert result["state.R"][0] == 1.5
-
-
-def test_a_reality_shows_its_output_and_starts_elsewhere_than_the_observer() -> None:
-    """The real patient starts with other levels; the filter finds them from the depth, the model alone does not."""
-    first = {"C": 2.5, "R": 0.5, "E": 2.5}
-    real = fp.Reality(drug(), start=first)
-    start = replace(FILTER, start={"C": 1.0, "R": 1.0, "E": 1.0})
-    errors = []
-    for observer in (start, fp.ModelStates()):
-        result = run(sedated(observer, reality=real, duration=12.0), PLAIN)
-        assert tuple(result["plant_state"][0]) == tuple(first.values())
-        assert result["state.E"][0] != first["E"]
-        errors.append(np.abs(result["state"] - result["plant_state"])[-1].max())
-    assert errors[0] < 0.1 * errors[1]
-
-
 COMPARTMENTS = fp.KalmanFilter(
     measured={"bis": 0.5},
     noise={"C1": 0.3, "C2": 0.02, "C3": 0.02, "Ce": 0.1},
     start={"C1": 0.3, "C2": 0.1, "C3": 0.1, "Ce": 0.3},
 )
-WINDOW = fp.MovingHorizonStates(
-    measured=COMPARTMENTS.measured,
-    noise=COMPARTMENTS.noise,
-    start=COMPARTMENTS.start,
-    window=12,
-    bounds=dict.fromkeys(COMPARTMENTS.noise, (0.0, np.inf)),
-)
-BELIEFS: dict[str, Any] = {"known": None, "model": fp.ModelStates(), "filter": COMPARTMENTS, "window": WINDOW}
+BELIEFS: dict[str, Any] = {"known": None, "filter": COMPARTMENTS}
 NAMES = ("CTC", "CTC+FPI", "RHC", "RHC+FPI")
 
 
@@ -168,31 +124,6 @@ def test_adaptation_works_with_believed_compartments(bis_errors: dict[tuple[str,
     """The bis is measured and the compartments are those of a wrong patient: FPI helps as with known ones, .021 beside .022."""
     assert bis_errors[known, "CTC+FPI"] < 0.35 * bis_errors[known, "CTC"]
     assert bis_errors[known, "CTC+FPI"] < 1.02 * bis_errors["known", "CTC+FPI"]
-
-
-def test_an_exact_model_referenced_form_changes_nothing() -> None:
-    """Where the response is measured, the model's response is that at the believed state, and with an exact model the same."""
-    sensing = fp.Sensing({}, fp.Measured(), observer=fp.ModelStates())
-    problem, form = sedated(None, sensing=sensing, duration=5.0), fp.ModelReferenced(fp.Affine(-0.5))
-    plain, referenced = (run(problem, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
-    np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
-    behind = sedated(FILTER, duration=2.0, measure_from=0.0)  # behind differences, with a twin that the filter moves
-    plain, referenced = (run(behind, fp.ExactModel(fp.ComputedTorque(LAW, d))) for d in (fp.Identity(), form))
-    np.testing.assert_allclose(referenced["command"], plain["command"], atol=1e-9)
-    wrong = sedated(None, believed=5.0, sensing=sensing)
-    errors = [
-        fp.measure(wrong, run(wrong, fp.ComputedTorque(LAW, d))).rms_error["depth"] for d in (fp.Identity(), form)
-    ]
-    assert errors[1] < 0.6 * errors[0]
-
-
-def test_predictions_start_from_what_is_believed() -> None:
-    """Behind late commands and samples, with the right model: the commands are those with states that are given."""
-    late = fp.DeadTime(inputs={"u": 2 / 12}, measurement=1 / 12)
-    controller = fp.Predicted(PLAIN, inputs=2 / 12, measurement=1 / 12)
-    runs = [run(sedated(b, dead_time=late, duration=6.0), controller) for b in (None, fp.ModelStates())]
-    np.testing.assert_allclose(runs[1]["command"], runs[0]["command"], atol=1e-8)
-    assert np.ptp(runs[0]["command"]) > 1
 
 
 def test_a_comparison_says_what_is_measured_and_what_is_believed() -> None:
@@ -222,24 +153,6 @@ def test_figures_are_those_of_the_page(bis_errors: dict[tuple[str, str], float],
 # What is known before a run
 
 
-def test_a_review_says_what_cannot_be_observed() -> None:
-    """All levels show in the depth along the nominal run; a tissue that only drains does not, and decays."""
-
-    def answer(problem: fp.Problem) -> Any:
-        answers = fp.review(problem, {"CTC": PLAIN}, mismatch=0.0, seed=0).problem
-        return next(a for a in answers if a.question == "Are the believed states right after a while?")
-
-    assert unobservable_errors(sedated(FILTER)).states == ()
-    assert "show in depth" in answer(sedated(FILTER)).evidence
-    of_model = answer(sedated(fp.ModelStates()))
-    assert of_model.verdict == "yes"
-    slowest = np.linalg.eigvals([[-1.5, 0.5], [0.1, -0.1]]).max()
-    assert of_model.numbers["pole"] == pytest.approx(slowest, rel=1e-9)
-    stays = answer(replace(integrating("y"), sensing=replace(integrating("y").sensing, observer=fp.ModelStates())))
-    assert stays.verdict == "no"
-    assert stays.change == "Measure z, or a quantity that depends on it."
-
-
 def integrating(measured: str) -> fp.Problem:
     """Y' = u measured; the state z = the integral of y shows nowhere and stays."""
     plant = fp.Plant.of_states(
@@ -257,26 +170,14 @@ def integrating(measured: str) -> fp.Problem:
 
 
 WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
-    "output that nobody measures": (
-        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["C"], observer=fp.ModelStates())),
-        InvalidProblem,
-        "PositionDifference needs depth, and outputs that are controlled are measured or estimated, never believed",
-    ),
-    "derivative that nobody measures": (
-        lambda: sedated(None, sensing=fp.Sensing({}, fp.Measured(), measured=["depth"], observer=fp.ModelStates())),
-        InvalidProblem,
-        r"Measured needs depth', depth'', and outputs .* such as PositionDifference\(\)",
-    ),
+    
+    
     "state without an observer": (
         lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"])),
         InvalidProblem,
         "C is given as it is to controllers of a plant with outputs, unless an observer is stated",
     ),
-    "unknown quantity": (
-        lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["dept"], observer=fp.ModelStates())),
-        InvalidProblem,
-        "measured: quantity 'dept' is unknown. Did you mean 'depth'",
-    ),
+    
     "filter of what is not measured": (
         lambda: sedated(replace(FILTER, measured={"C": 0.1})),
         InvalidProblem,

@@ -25,7 +25,6 @@ ESTIMATORS = (
     fp.PositionDifference(),
     fp.SavitzkyGolay(window=7, degree=4),
     fp.SavitzkyGolay(window=11, degree=5),
-    fp.StateVariableFilter(bandwidth=300.0),
 )
 NOISE = fp.Sensor(noise=fp.Noise(1.0))
 GENTLE = fp.Exponential(rate=0.01, integral=False)
@@ -163,7 +162,7 @@ def test_order_of_sensor_dead_time_and_controller():
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4])
-@pytest.mark.parametrize("estimator", [*ESTIMATORS[1:-1], fp.StateVariableFilter(bandwidth=10.0)], ids=str)
+@pytest.mark.parametrize("estimator", [*ESTIMATORS[1:-1]], ids=str)
 def test_response_is_the_stated_average_of_requests(estimator, order):
     """On y^(n) = held requests the estimate is sum w_j r_{k-j}, the weights sum to one, and their centre is the delay."""
     period, plant = 0.1, chain(order)
@@ -274,23 +273,6 @@ def test_second_difference_of_position(gain):
         assert np.abs(expected).max() == pytest.approx(0.414, abs=1e-3)
         radii = [np.abs(np.roots([1, -(1 - a / 2), a / 2])).max() for a in np.linspace(0.05, 1.5, 30)]
         assert min(radii) >= 0.414 - 1e-3
-
-
-@pytest.mark.parametrize("pole", [0.0, 0.3, 0.8])
-@pytest.mark.parametrize("share", [0.1, 0.97, 1.03])
-def test_filtered_error(pole, share):
-    """z^2 - (1 + p - a (1 - p)) z + p, stable up to a = 2 (1 + p)/(1 - p)."""
-    limit = 2 * (1 + pole) / (1 - pole)
-    assert delayed_limit(np.ones(1), pole=pole) == pytest.approx(limit, rel=1e-4)
-    gain = share * limit
-    problem = resting(linear(1.0, 1.0), period=1e-4, duration=1e-2)
-    controller = fp.ComputedTorque(
-        fp.Exponential(rate=1.0), fp.BeyondLimit(fp.Filtered(fp.Affine(gain=-2 * gain), pole))
-    )
-    mode_values = modes(problem, controller)
-    for root in np.roots([1, -(1 + pole - gain * (1 - pole)), pole]):
-        assert np.abs(mode_values - root).min() < 2e-3
-    assert (np.abs(mode_values).max() > 1 + 1e-4) == (share > 1)
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS[2:], ids=str)
@@ -412,18 +394,3 @@ def test_all_mistakes_of_sensing_are_told_at_once():
 def test_wrong_values_are_refused(make, message):
     with pytest.raises(InvalidValue, match=message):
         make()
-
-
-def test_state_variable_filter_sees_constant_motions_as_they_are():
-    """On q = a t^2 / 2: velocity late by 2 / bandwidth, acceleration a."""
-    problem = fp.Problem(
-        chain(2),
-        fp.Trajectory(lambda t: {"y": 1.5 * t**2}),
-        {"y": 0.0},
-        period=1e-3,
-        duration=0.5,
-        sensing=fp.Sensing({}, fp.StateVariableFilter(bandwidth=100.0)),
-    )
-    result = run(problem, fp.ExactModel(fp.ComputedTorque(fp.Exponential(rate=5.0))))
-    assert result["realised"][450, 0] == pytest.approx(result["plant_realised"][450, 0], rel=1e-2)
-    assert result["state"][450, 1] == pytest.approx(result["plant_state"][430, 1], rel=1e-2)

@@ -15,9 +15,7 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.export.lab import lab
-from fpirhc.simulation import trials as harm_warning
 from fpirhc.simulation.trials import ErrorPair
-from fpirhc.studies.comparison.timing import stepper_to_time
 
 PROBLEM = fp.Problem(
     plant=linear(1.02, 1.0),
@@ -67,19 +65,6 @@ def test_the_model_referenced_form_is_not_warned_of(map_):
     assert told(PROBLEM, replace(GENTLE, deformation=map_)) == []
 
 
-def test_without_adaptation_nothing_runs(monkeypatch):
-    """Neither where there is nothing to judge nor where the warning is ignored, nor where a cycle is timed."""
-    monkeypatch.setattr(harm_warning, "_reasons", lambda *_: pytest.fail("it ran"))
-    assert told(PROBLEM, without_deformation(GENTLE)) == []
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.simplefilter("ignore", fp.HarmfulAdaptation)
-        fp.Stepper(PROBLEM, GENTLE, compiled=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        stepper_to_time(PROBLEM, GENTLE, compiled=False)
-
-
 @pytest.mark.parametrize(
     "build", [lambda *pair: fp.Stepper(*pair, compiled=False), lambda p, c: lab.make_lab("", "", "", p, {"CTC": c})]
 )
@@ -104,10 +89,3 @@ def test_where_the_plant_is_lost_anyway_adaptation_does_no_harm(without, adapted
     """It is harm to lose a run that finishes without adaptation; where both are lost nothing speaks for it or against it."""
     pair = ErrorPair({"y": without}, {"y": adapted}, {"y": 1.0}, {"y": "m"})
     assert (pair.passes, pair.fails, pair.sentence) == (passes, fails, sentence)
-
-
-def test_a_run_that_ends_early_is_harm():
-    """With a gain beyond its limit the adapted loop is lost where the other is not."""
-    wild = replace(GENTLE, deformation=fp.BeyondLimit(fp.Affine(gain=-60.0)))
-    [text] = told(PROBLEM, wild)
-    assert "without adaptation, a run that ends early with it" in text

@@ -14,8 +14,7 @@ import tasks
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import DeviceFailed, InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotInstalled
-from fpirhc.simulation.metrics.base import measured_errors
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue, NotInstalled
 from fpirhc.simulation.simulate import Simulator
 
 adaptive = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
@@ -111,39 +110,6 @@ def plants(ready: Simulator, count: int, share: float = 0.2) -> np.ndarray:
     return exact * (1 + share * np.random.default_rng(0).uniform(-1, 1, (count, exact.size)))
 
 
-def by_itself(ready: Simulator, exact: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, int], str | None]:
-    """Rms and largest error, cycles by status, and the end of the ordinary run."""
-    variant = ready.problem.with_exact(exact)
-    run = ready.run(seed=0, variant=variant)
-    errors = measured_errors(variant, run)
-    statuses = {
-        fp.Status(int(one)).name: int(count)
-        for one, count in zip(*np.unique(run["status"], return_counts=True), strict=True)
-    }
-    return np.sqrt(np.mean(errors**2, axis=0)), np.max(np.abs(errors), axis=0), statuses, run.stop
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_errors_are_those_of_the_ordinary_loop(name):
-    """To 1e-12, for a number of plants that fills no whole register; the functions of vectors round otherwise.
-
-    A quantum makes a whole one of a last place now and then, so behind coarse sensors it is 1e-9.
-    """
-    close = 1e-9 if name == "lost samples" else 1e-12
-    ready = fp.simulator(*CASES[name]())
-    exact = plants(ready, 11, 0.05)
-    many = ready.run_many(exact)
-    assert many.lanes > 1, many.why
-    assert not many.stops
-    for k in (0, 3, 10):
-        rms, largest, statuses, stop = by_itself(ready, exact[k])
-        assert stop is None
-        np.testing.assert_allclose([v[k] for v in many.rms_error.values()], rms, rtol=close)
-        np.testing.assert_allclose([v[k] for v in many.max_error.values()], largest, rtol=close)
-        counted = {status: int(count[k]) for status, count in many.statuses.items() if count[k]}
-        assert counted == statuses
-
-
 def some_device() -> str:
     """The name of an OpenCL device with double precision."""
     cl = pytest.importorskip("pyopencl", reason="pyopencl is not installed: pip install 'fpirhc[opencl]'")
@@ -183,72 +149,11 @@ def test_what_a_device_cannot_run_is_told():
         fp.simulator(*CASES["map"]()).run_many(plants(fp.simulator(*CASES["map"]()), 2), device="abacus")
 
 
-def test_a_device_that_fails_is_named(monkeypatch):
-    """What a driver says while it starts and while it runs is one sentence, with what to do."""
-    device = some_device()
-    cl = pytest.importorskip("pyopencl")
-
-    def exhausted(*_args):
-        raise cl.MemoryError("OUT_OF_RESOURCES\nand more")
-
-    short = replace(tasks.two_mass.problem, duration=0.5, measure_from=0.1)
-    for name, told in (
-        ("Context", r"does not start \(OUT_OF_RESOURCES\): end what else uses it, or leave the device out"),
-        (
-            "enqueue_copy",
-            r"failed with 2 plants \(OUT_OF_RESOURCES\): run fewer plants at once, or leave the device out",
-        ),
-    ):
-        with monkeypatch.context() as patched:
-            patched.setattr(cl, name, exhausted)
-            ready = fp.simulator(short, adaptive())
-            with pytest.raises(DeviceFailed, match=told):
-                ready.run_many(plants(ready, 2), device=device)
-
-
 def test_a_device_needs_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyopencl", None)
     ready = fp.simulator(tasks.two_mass.problem, adaptive(), compiled=False)
     with pytest.raises(NotInstalled, match=r"a device needs pyopencl, .*pip install 'fpirhc\[opencl\]'"):
         ready.run_many(plants(ready, 2), device="")
-
-
-def test_a_plant_that_runs_away_is_named_and_its_neighbours_do_not_notice():
-    """A twentieth of a mass makes the iteration diverge: its run ends as the ordinary one does."""
-    ready = fp.simulator(
-        replace(tasks.two_mass.problem, limits=fp.Limits()),
-        fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-1.5))),
-    )
-    exact = plants(ready, 8, 0.01)
-    place = tasks.two_mass.problem.plant.parameter.elements.index("m1")
-    calm = ready.run_many(exact)
-    exact[5, place] *= 0.05
-    many = ready.run_many(exact)
-    assert dict(many.stops) == {5: by_itself(ready, exact[5])[-1]}
-    assert np.isnan(many.rms_error["q1"][5])
-    kept = np.arange(8) != 5
-    for name in ("q1", "q2"):
-        np.testing.assert_array_equal(many.rms_error[name][kept], calm.rms_error[name][kept])
-
-
-@pytest.mark.parametrize(
-    ("controller", "compiler", "why"),
-    [
-        ("RHC", True, "the loop has a part that is not written for lanes: fpirhc_"),
-        ("CTC", False, "there is no C compiler"),
-    ],
-)
-def test_without_lanes_the_errors_are_the_same_and_it_says_why(controller, compiler, why, monkeypatch):
-    limits = fp.Limits(states={"q1": (-9.0, 9.0)} if compiler else {})
-    problem = replace(tasks.two_mass.problem, duration=0.5, measure_from=0.1, limits=limits)
-    ready = fp.simulator(problem, tasks.two_mass.controllers[controller], compiled=compiler)
-    if not compiler:
-        monkeypatch.setenv("FPIRHC_CC", "none")
-    exact = plants(ready, 2)
-    many = ready.run_many(exact)
-    assert many.lanes == 0
-    assert many.why.startswith(why)
-    np.testing.assert_array_equal([many.rms_error[n][1] for n in ("q1", "q2")], by_itself(ready, exact[1])[0])
 
 
 def test_wrong_parameters_are_named():
@@ -277,16 +182,6 @@ def drifting() -> Simulator:
     return fp.simulator(problem, fp.ComputedTorque(fp.Exponential(rate=2.0)))
 
 
-def test_plants_are_those_of_the_reality_and_each_starts_where_it_settles():
-    """Between two that are one and the same there may be another."""
-    ready, exact = drifting(), np.array([[1.0, 1.0], [1.0, 3.0], [1.0, 1.0]])
-    many = ready.run_many(exact)
-    for k, one in enumerate(exact):
-        rms, largest, *_ = by_itself(ready, one)
-        np.testing.assert_allclose(many.rms_error["y"][k], rms, rtol=1e-12)
-        np.testing.assert_allclose(many.max_error["y"][k], largest, rtol=1e-12)
-
-
 def test_a_plant_outside_its_bounds_is_named_wherever_it_stands():
     with pytest.raises(InvalidValue, match="plant 1: 'c' is 5, which is outside 0 to 4 m/s"):
         drifting().run_many(np.array([[1.0, 1.0], [1.0, 5.0], [1.0, 1.0]]))
@@ -296,33 +191,6 @@ def test_no_plants_have_no_errors():
     many = drifting().run_many(np.empty((0, 2)))
     assert many.rms_error["y"].shape == many.max_error["y"].shape == (0,)
     assert not many.stops
-
-
-def test_scenarios_have_settings_and_starts_of_their_own():
-    """A loop with plans keeps a first plan from its start, so every start composes it again; a setting serves all starts."""
-    for controller in ("CTC+FPI (eq 6)", "RHC+FPI"):
-        problem = replace(tasks.two_mass.problem, duration=1.0, measure_from=0.0)
-        ready = fp.simulator(problem, tasks.two_mass.controllers[controller], live=["deformation.gain"])
-        exact, gains, q1 = plants(ready, 3, 0.05), [-0.4, -0.5, -0.6], [1.9, 2.1, 2.1]
-        many = ready.run_many(exact, settings={"deformation.gain": gains}, starts={"q1": q1, "q2": 2.5})
-        assert many.lanes > 1, many.why
-        for k in range(3):
-            start = replace(problem, start={**problem.start, "q1": q1[k], "q2": 2.5})
-            other = fp.simulator(start, tasks.two_mass.controllers[controller], live=["deformation.gain"])
-            variant = start.with_exact(exact[k])
-            run = other.run(seed=0, variant=variant, settings={"deformation.gain": gains[k]})
-            errors = measured_errors(variant, run)
-            np.testing.assert_allclose(
-                [v[k] for v in many.rms_error.values()], np.sqrt(np.mean(errors**2, axis=0)), rtol=1e-12
-            )
-
-
-def test_scenarios_have_noise_of_their_own():
-    ready = fp.simulator(replace(noisy(), duration=0.5, measure_from=0.1), LAW)
-    many = ready.run_many(seed=[3, 1, 4])
-    assert many.lanes > 1, many.why
-    errors = measured_errors(ready.problem, ready.run(seed=4))
-    assert many.to_dataframe()["rms_error.q1"][2] == pytest.approx(np.sqrt(np.mean(errors[:, 0] ** 2)), rel=1e-9)
 
 
 def test_scenarios_that_disagree_are_named():

@@ -9,7 +9,6 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.errors import NoAnswer, NotSupported
-from fpirhc.review.questions.margins import margins
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.late_loop import Late, LateLoop
 from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
@@ -137,15 +136,3 @@ def test_entries_that_do_more_than_wait_are_refused():
     line = np.flatnonzero(["plan_inputs" in column and "Q1@" in column for column in loop.loop.memory.columns])
     with pytest.raises(NotSupported, match="do not only wait"):
         Linearisation(loop).late_at(loop.run(loop.start(), 50).memories[-1], [line])
-
-
-def test_gain_margin_of_a_long_period_is_that_of_the_learning():
-    """Learning a plant k times as strong as its model ends where gamma k is 2; here k = 1.65, gamma = 0.4."""
-    task = fp.load_problem("mrac_pendulum")
-    problem = replace(task.problem, disturbances={})
-    loop = AskedLoop(problem, task.controllers["repetitive control"])
-    linear = Linearisation(loop).at(loop.run(loop.start(), 200).memories[-1])
-    assert 0.999 < linear.radius < 1
-    gain = margins(linear, 0)[0]
-    assert gain == pytest.approx(2 / (0.4 * 1.65), rel=0.05)
-    assert gain < 2 / (0.4 * 1.65)  # the tracking law takes its share

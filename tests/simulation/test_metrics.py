@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import pickle
 from dataclasses import replace
@@ -15,7 +14,6 @@ from hand_made_runs import CYCLES, SOLVE, problem, run, step
 from plants import linear
 
 import fpirhc as fp
-from fpirhc.cli.main import main
 from fpirhc.errors import InvalidName, InvalidValue
 from fpirhc.simulation.metrics import base, known_metrics, with_own_metrics
 from fpirhc.simulation.metrics.base import columns
@@ -164,35 +162,6 @@ def test_contraction_of_an_exact_model_is_that_of_the_reality_that_it_is():
     for controller, gain in ((law, 1.25), (fp.ExactModel(law), 1.0)):
         metrics = fp.measure(task, fp.simulate(task, controller, seed=0, compiled=False))
         assert metrics["contraction.predicted"][""] == pytest.approx(abs(1 - gain * deformation.effective_gain()))
-
-
-def test_contraction_is_that_of_the_measured_cycles():
-    """Y'' = (1 + 2 exp(-4 t)) u in effect: the gain J falls from 3 to 1, so that a = 0.8 contracts from t = 0.0719 on.
-
-    1 - a J = -1 at J = 2.5, exp(-4 t) = 0.75.
-    """
-    plant = fp.Plant(
-        coordinates={"y": "m", "fading": "1"},
-        controlled=("y",),
-        order={"y": 2, "fading": 1},
-        inputs={"u": "N"},
-        response=lambda q, v, u, p: {"y": (1 + p.more * q.fading) * u.u, "fading": -4 * q.fading},
-        parameters={"more": fp.Parameter(approximate=0.0, exact=2.0, unit="1")},
-    )
-    task = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"y": 0 * t, "fading": 0 * t}),
-        start={"y": 0.0, "fading": 1.0},
-        period=1e-3,
-        duration=0.2,
-    )
-    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.BeyondLimit(fp.Affine(gain=-1.6)))
-    result = fp.simulate(task, controller, seed=0, compiled=False)
-    early, late = (fp.measure(replace(task, measure_from=t), result) for t in (0.0, 0.1))
-    assert early["contraction.predicted"][""] == pytest.approx(abs(1 - 0.8 * 3), abs=0.02)
-    assert early["contraction.growing"][""] == pytest.approx(-np.log(0.75) / 4 / 0.2, abs=0.01)
-    assert late["contraction.predicted"][""] == pytest.approx(abs(1 - 0.8 * (1 + 2 * np.exp(-0.4))), abs=1e-3)
-    assert late["contraction.growing"][""] == 0.0
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -369,28 +338,6 @@ def test_a_signal_that_is_not_there_breaks_its_figure_alone():
     assert "name one of them, such as 'state.y'" in metrics.broken["several"]
     assert "metric 'largest'" in metrics.broken["largest"]
     assert "Did you mean 'command.u'?" in metrics.broken["largest"]
-
-
-FILE = """
-import fpirhc as fp
-_task = fp.load_problem("two_mass")
-problem = _task.problem
-controllers = {name: _task.controllers[name] for name in ("CTC", "CTC+FPI (eq 3)")}
-metrics = (fp.figures.TimeOver("true_error.q1", 0.01), fp.figures.Largest("command.Q1", name="largest_force"))
-"""
-
-
-def test_figures_of_a_problem_file_stand_in_its_table(tmp_path, monkeypatch, capsys):
-    """A user's journey: two lines in the file, two columns in the table and two numbers in the results."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.py").write_text(FILE)
-    main(["compare", "mine.py", "--no-compile", "--out", "out"])
-    rows = capsys.readouterr().out
-    assert "over    force" in rows
-    assert rows.split("CTC+FPI (eq 3)  0.00346")[1].split("\n")[0].split()[-2:] == ["0", "86.6"]
-    results = json.loads((tmp_path / "out" / "results.json").read_text())["controllers"]
-    assert results["CTC"]["time_over"] == pytest.approx(3.93, abs=0.01)
-    assert results["CTC+FPI (eq 3)"]["largest_force"] == pytest.approx(86.63, abs=0.01)
 
 
 def test_metrics_come_from_other_processes():

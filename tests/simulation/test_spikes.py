@@ -42,11 +42,8 @@ MAPS: dict[str, Deformation] = {
     "filtered": fp.Filtered(SHAPE, pole=0.5),
     "filtered slowly": fp.Filtered(fp.Affine(gain=-0.5), pole=0.8),
     "tuned": fp.Tuned(SHAPE, largest_gain=1.0),
-    "damped": fp.Damped(SHAPE),
-    "guarded": fp.Guarded(SHAPE, largest_deformation=1e6),
     "increment": fp.Increment(SHAPE, cycles=2),
     "paired": fp.Paired(fp.Sigmoid(gain=-0.3, scale=50.0), cycles=0),
-    "self-paired": fp.SelfPaired(fp.Affine(gain=-0.1), most=4),
     "model-referenced": fp.ModelReferenced(SHAPE),
 }
 QUICK = (

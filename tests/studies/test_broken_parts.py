@@ -12,13 +12,8 @@ import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName
-from fpirhc.review import review as reviewing
-from fpirhc.review.question import Verdict, known_questions
-from fpirhc.review.questions.gain import GAIN
-from fpirhc.review.questions.reference import COMMANDS
 from fpirhc.simulation import simulate as simulating
 from fpirhc.studies.comparison import compare as comparing
-from fpirhc.studies.comparison import pairwise
 
 compared = cache(lambda: {name: tasks.two_mass.controllers[name] for name in ("CTC", "CTC+FPI (eq 6)")})
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0, horizon=None, cost=None))
@@ -82,14 +77,6 @@ def test_a_figure_that_no_run_has_is_refused():
         fp.compare(task(metrics=[fp.Metric("plans.done", lambda problem, run: None)]), headline="plans.done", seed=0)
 
 
-def test_a_null_test_that_breaks_loses_no_comparison(monkeypatch):
-    monkeypatch.setattr(pairwise, "null_test", breaks)
-    result = fp.compare(task(), seed=0, compiled=False)
-    assert result.null is None
-    assert any(s.startswith("the null test could not be computed (LinAlgError") for s in result.information)
-    assert len(result.entries) == 2
-
-
 def test_a_signal_that_breaks_after_the_run_does_not_lose_it(monkeypatch):
     """The run has its own signals, and says which one is missing."""
     monkeypatch.setattr(simulating, "_contraction", breaks)
@@ -98,53 +85,3 @@ def test_a_signal_that_breaks_after_the_run_does_not_lose_it(monkeypatch):
     assert "contraction" not in run.layout
     [sentence] = cast(list[str], run.settings["broken"])
     assert sentence.startswith("the signal 'contraction' could not be computed (LinAlgError")
-
-
-def answers(monkeypatch, *texts):
-    """Questions with their answers, of the problem and of the adaptive controller, where some questions break."""
-    known = known_questions
-    monkeypatch.setattr(
-        reviewing,
-        "known_questions",
-        lambda kind: tuple(replace(q, ask=breaks) if q.text in texts else q for q in known(kind)),
-    )
-    review = fp.review(brief(), compared(), mismatch=20.0, seed=0)
-    return {a.question: a for a in review.problem}, {a.question: a for a in review.controllers["CTC+FPI (eq 6)"]}
-
-
-def test_a_question_that_breaks_is_unknown_by_name(monkeypatch):
-    """All other questions keep their answers, bit by bit."""
-    with monkeypatch.context() as context:
-        whole, discrete = answers(context)
-    with monkeypatch.context() as context:
-        broken, of_broken = answers(context, COMMANDS, GAIN)
-    for before, after, name in ((whole, broken, COMMANDS), (discrete, of_broken, GAIN)):
-        assert after[name].verdict == Verdict.UNKNOWN
-        assert "LinAlgError: Array must not contain" in after[name].evidence
-        assert len(after) == len(before)
-        assert {q: a.verdict for q, a in after.items() if q != name}.items() <= {
-            q: a.verdict for q, a in before.items()
-        }.items()
-
-
-def test_a_linear_loop_that_is_not_finite_is_unknown(monkeypatch):
-    """The controllers have that answer, and the problem has its own ones."""
-    monkeypatch.setattr("fpirhc.review.question.loops_along", breaks)
-    whole, of_broken = answers(monkeypatch)
-    assert [(q, a.verdict) for q, a in of_broken.items()] == [
-        ("Is there a linear loop along the reference?", Verdict.UNKNOWN)
-    ]
-    assert len(whole) >= 4
-
-
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_parameter_of_two_to_the_63_is_reviewed():
-    """The steps of its integrator overflow, which ended with an error inside the library; they are a no."""
-    oscillator = fp.load_problem("van_der_pol")
-    plant = oscillator.problem.plant
-    stiff = replace(plant, parameters={**plant.parameters, "mu": replace(plant.parameters["mu"], exact=2**63)})
-    problem = replace(oscillator.problem, plant=stiff)
-    review = fp.review(problem, {"RHC": oscillator.controllers["RHC"]}, mismatch=20.0, seed=0)
-    [integrator] = [answer for answer in review.problem if "integrator follow" in answer.question]
-    assert integrator.verdict == Verdict.NO
-    assert len(review.controllers["RHC"]) >= 3

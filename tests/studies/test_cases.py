@@ -6,7 +6,6 @@ number is named by case and path, or by row and column.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,8 @@ import pytest
 from line import line_text
 
 import fpirhc as fp
-from fpirhc.cli.main import main
-from fpirhc.cli.verb import ExitCode
-from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidValue, ProblemFileError
+from fpirhc.errors import InvalidField, InvalidProblem, ProblemFileError
 from fpirhc.problem_files.problem_file import Task, in_case
-from fpirhc.simulation import simulate
-from fpirhc.studies.comparison.compare import check_gains
-from fpirhc.studies.scenarios.bench import Bench, Conditions, scenarios
-from fpirhc.studies.scenarios.draws import COMPARING
-from fpirhc.symbolic.native import find_compiler
 
 CASES = """
 cases = fp.Cases({
@@ -53,10 +45,6 @@ def task(tmp_path, monkeypatch) -> Task:
     return fp.load_problem("line.py")
 
 
-def compared(task: Task, *patterns: str, folder: str = "out", **settings: Any) -> Any:
-    return fp.compare_scenarios(task, cases=patterns, seed=3, folder=Path(folder), compiled=False, **settings)
-
-
 # --- What a case is ---------------------------------------------------------------------------------------------------
 
 
@@ -72,61 +60,6 @@ def test_a_case_changes_what_it_states_and_nothing_else(task):
     assert of["other way"].reference is not plain.reference
     assert np.array_equal(of["usual"].plant.exact, plain.plant.exact)
     assert plain.start_state.tolist() == [0.5, 0.0]
-
-
-def test_the_run_of_a_case_is_that_of_its_problem(task):
-    """Bit by bit, in every case and with every controller, whichever loop it shares with other cases."""
-    bench = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))
-    for number, name in enumerate(task.cases.names):
-        problem, seed = task.cases.problem(name, task.problem), bench._scenario(number).seed
-        for controller in task.controllers:
-            record = bench.record(number, controller)
-            run = fp.simulate(problem, task.controllers[controller], seed=seed, compiled=False)
-            assert record["metrics"]["rms_error"] == fp.measure(problem, run).values["rms_error"]
-    loops = {id(one) for (owner, _), one in bench._simulators.items() if owner == "CTC"}
-    # 'weak', 'stiff' and 'narrow' have the loop of 'usual': exact parameters and limits are data.
-    assert len(loops) == len(task.cases.names) - 3
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
-def test_a_loop_that_serves_one_case_is_compiled_where_its_run_is_long(task, monkeypatch):
-    """A compiler takes longer than a short run; the numbers are the same."""
-    bench = Bench(task, Conditions(3, COMPARING, 0.0, compiled=True, named=True))
-    interpreted = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))
-    for name, compiled in (("usual", True), ("known", False)):
-        number = task.cases.names.index(name)
-        assert bench._simulator("CTC", bench._scenario(number)).compiled == compiled
-        assert bench.record(number, "CTC")["metrics"] == interpreted.record(number, "CTC")["metrics"]
-    monkeypatch.setattr(simulate, "_SHORT_RUN", 0)
-    long = Bench(task, Conditions(3, COMPARING, 0.0, compiled=True, named=True))
-    assert long._simulator("CTC", long._scenario(task.cases.names.index("known"))).compiled
-
-
-def test_dead_times_are_data_where_the_longest_is_stated(task):
-    """'late' has the loop of 'usual' then, and the run of its problem."""
-    roomy = fp.DeadTime(measurement=0.0, longest={"measurement": 0.02})
-    task = replace(task, problem=replace(task.problem, dead_time=roomy))
-    bench = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))
-    records = {name: bench.record(task.cases.names.index(name), "CTC") for name in ("usual", "late")}
-    assert len({id(one) for one in bench._simulators.values()}) == 1
-    number = task.cases.names.index("late")
-    alone = fp.simulate(
-        task.cases.problem("late", task.problem),
-        task.controllers["CTC"],
-        seed=bench._scenario(number).seed,
-        compiled=False,
-    )
-    assert records["late"]["metrics"]["rms_error"] == fp.measure(task.problem, alone).values["rms_error"]
-    assert records["late"]["metrics"]["rms_error"] != records["usual"]["metrics"]["rms_error"]
-
-
-def test_the_seed_of_a_case_is_its_own_or_the_studys(task):
-    scenarios = Bench(task, Conditions(3, COMPARING, 0.0, compiled=False, named=True))._scenarios
-    seeds = [scenarios[k].seed for k in range(8)]
-    assert seeds[4] == 7
-    assert len(set(seeds)) == len(seeds)
-    other = Bench(task, Conditions(4, COMPARING, 0.0, compiled=False, named=True))._scenarios
-    assert [other[k].seed == seeds[k] for k in range(8)] == [k == 4 for k in range(8)]
 
 
 def test_exact_parameters_are_those_of_the_reality(task):
@@ -211,79 +144,6 @@ def test_patterns_name_cases_and_groups(task):
     assert matching(["*r*", "late"]) == ("far", "late", "narrow", "other way")
 
 
-def test_finished_cases_are_kept_whichever_are_asked_for_next(task):
-    """A ledger of some cases goes on to all of them; what was run stays and is not run again."""
-    compared(task, "heavy")
-    before = Path("out/scenarios.jsonl").read_text().splitlines()
-    everything = compared(task, "all")
-    after = Path("out/scenarios.jsonl").read_text().splitlines()
-    assert after[: len(before)] == before
-    assert len(after) - len(before) == 6 * len(task.controllers)
-    assert everything.count == 8
-    assert [r["name"] for r in everything.records["CTC"]] == list(task.cases.names)
-
-
-def test_processes_change_nothing(task):
-    alone, two = compared(task, "all", folder="one"), compared(task, "all", folder="two", processes=2)
-    assert alone.records == two.records
-
-
-def test_the_worst_case_has_its_name_everywhere(task):
-    """The case with the largest error is named in the verdict's table, in the facts and in the summary."""
-    comparison = compared(task, "all")
-    summary = comparison["CTC"]
-    errors = {r["name"]: r["error"] for r in comparison.records["CTC"]}
-    assert summary.worst_name == max(errors, key=lambda name: errors[name])
-    assert summary.worst == max(errors.values())
-    assert comparison.view.facts["controllers"]["CTC"]["worst_name"] == summary.worst_name
-    assert "of 8 cases" in comparison.verdict[0]
-    assert comparison.view.tables[0].title == "line: 8 cases"
-
-
-def test_the_command(task, capsys):
-    """`compare --cases` writes a report; `run --case` is one of its runs, to look into."""
-    assert main(["compare", "line.py", "--cases", "heavy", "far", "--no-compile", "--json"]) == ExitCode.FINISHED
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["scenarios"] == 3
-    assert Path("results/line/cases_seed0/report.html").is_file()
-    assert main(["run", "line.py", "CTC", "--case", "far", "--no-compile", "--seed", "7"]) == ExitCode.FINISHED
-    run = fp.load_run("results/line/CTC_far.npz")
-    error = fp.measure(task.cases.problem("far", task.problem), run).rms_error["y"]
-    record = next(r for r in compared(task, "far").records["CTC"])
-    assert record["metrics"]["rms_error"]["y"] == error
-
-
-def test_the_options_of_a_case_that_begins_as_an_option_does_run_it(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("line.py").write_text(LINE.replace('"far": {', '"-far": {'))
-    task = fp.load_problem("line.py")
-    assert task.cases
-    options = scenarios(task, Conditions(0, COMPARING, 0.0, compiled=False, named=True)).options(
-        task.cases.names.index("-far")
-    )
-    assert main(["run", "line.py", "CTC", "--no-compile", *options]) == ExitCode.FINISHED
-
-
-@pytest.mark.slow
-def test_patients_for_whom_the_gain_is_too_large():
-    """In 14 of the gallery's 44 the gain is beyond its limit, and there adaptation is worse; in 24 of the others it is better."""
-    task = fp.load_problem("anaesthesia")
-    assert task.cases is not None
-    bench = Bench(task, Conditions(0, COMPARING, 0.0, compiled=True, named=True))
-    beyond, better = [], []
-    for number, name in enumerate(task.cases.names):
-        one = in_case(task, name)
-        try:
-            check_gains(one, {"CTC+FPI": one.controllers["CTC+FPI"]})
-        except InvalidProblem:
-            beyond.append(name)
-        plain, adaptive = (bench.record(number, controller)["error"] for controller in ("CTC", "CTC+FPI"))
-        better += [name] if adaptive < plain else []
-    assert len(beyond) == 14
-    assert len(better) == 24
-    assert not set(beyond) & set(better)
-
-
 # --- The figure -------------------------------------------------------------------------------------------------------
 
 
@@ -294,36 +154,6 @@ def judged_by(task: Task, name: str) -> Task:
         fp.figures.Total("true_error.y"),
     )
     return replace(task, metrics=[*task.metrics, *figures], headline_metric=name)
-
-
-def test_a_comparison_speaks_of_the_headline_metric(task):
-    """By hand from the records: medians, the worst, and who is better; larger is better by the metric, not by the reader."""
-    task = judged_by(task, "nadir")
-    comparison = compared(task, "all")
-    nadirs = {c: np.array([r["metrics"]["nadir"][""] for r in rs]) for c, rs in comparison.records.items()}
-    plain, adaptive = comparison["CTC"], comparison["CTC+FPI"]
-    assert plain.median == -np.median(nadirs["CTC"])
-    assert plain.worst == -nadirs["CTC"].min()
-    assert plain.worst_name == comparison.records["CTC"][int(nadirs["CTC"].argmin())]["name"]
-    assert adaptive.better == np.sum(nadirs["CTC+FPI"] > nadirs["CTC"])
-    assert adaptive.difference is not None
-    assert adaptive.difference.median == pytest.approx(-np.median(nadirs["CTC+FPI"] - nadirs["CTC"]))
-    assert plain.worst_metrics["nadir"][""] == nadirs["CTC"].min()
-    table = comparison.view.tables[0]
-    shown = dict(zip((column.head for column in table.columns), table.rows[0].cells, strict=True))
-    assert shown["worst nadir"] == f"{nadirs['CTC'].min():.3g} m"
-    assert shown["median nadir"] == f"{np.median(nadirs['CTC']):.3g} m"
-    assert comparison.view.facts["headline"] == "nadir"
-
-
-def test_the_headline_needs_no_new_runs(task):
-    """Records hold every metric, so that another figure is another reading of them."""
-    task = judged_by(task, "nadir")
-    compared(task, "all")
-    before = Path("out/scenarios.jsonl").read_bytes()
-    again = compared(task, "all", headline="rms_error.y")
-    assert Path("out/scenarios.jsonl").read_bytes() == before
-    assert again["CTC"].median == np.median([r["metrics"]["rms_error"]["y"] for r in again.records["CTC"]])
 
 
 def test_the_verdict_of_one_run_speaks_of_it_first(task):
@@ -342,44 +172,6 @@ def test_the_verdict_of_one_run_speaks_of_it_first(task):
     assert first.outcome is not None
     assert first.outcome.value == better
     assert comparison.findings[1].text.startswith("CTC+FPI")
-
-
-def test_groups_are_comparisons_of_their_own(task):
-    everything, heavy = compared(task, "all"), compared(task, "heavy", folder="heavy")
-    assert list(everything.groups) == ["heavy", "light"]
-    for alone, one in zip(heavy.summaries, everything.groups["heavy"], strict=True):
-        assert (alone.median, alone.worst, alone.worst_name, alone.ratio) == (
-            one.median,
-            one.worst,
-            one.worst_name,
-            one.ratio,
-        )
-    assert len(everything.view.tables[1].rows) == 4
-
-
-def test_what_is_worst_stands_first(task):
-    """Whoever reads one column after the name reads the worst case, its name, and failures."""
-    heads = [column.head for column in compared(task, "all").view.tables[0].columns]
-    assert heads[:4] == ["controller", "worst error", "in case", "failures"]
-
-
-def test_tuning_on_some_cases_leaves_the_others(task):
-    """The cost is the mean over the cases that are named, and the result says which they are and how many there are."""
-    pytest.importorskip("optuna")
-    task = replace(task, tuning={"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}})
-    tuning = fp.tune(task, trials=2, seed=0, folder=Path("tuning"), cases=["heavy"], compiled=False)
-    assert tuning.conditions == "cases stiff, known: 2 of 8"
-    bench = Bench(task, Conditions(0, COMPARING, 0.0, compiled=False, named=True))
-    errors = [bench.record(k, "CTC+FPI")["error"] for k in (2, 3)]
-    assert tuning.entries[0].cost_before == pytest.approx(np.mean(errors), rel=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"), [("nadr", "Did you mean 'nadir'"), ("rms_error", r"give one: 'rms_error\.NAME'")]
-)
-def test_wrong_headlines(name, message, task):
-    with pytest.raises((InvalidName, InvalidValue), match=message):
-        compared(judged_by(task, name), "all")
 
 
 # --- Wrong uses -------------------------------------------------------------------------------------------------------
@@ -499,32 +291,6 @@ def test_all_mistakes_of_a_table_are_told_together(task):
         fp.Cases.from_csv(written(text).resolve()).check(task.problem)
     assert str(error.value).count("exact.c") == 1
     assert [f"row {k}" in str(error.value) for k in (2, 3, 4)] == [True, True, False]
-
-
-def test_wrong_requests(task):
-    with pytest.raises(InvalidName, match=r"no case matches 'hevy'\. Did you mean 'heavy'\?"):
-        compared(task, "hevy")
-    with pytest.raises(InvalidValue, match="give either cases, or a number of scenarios"):
-        compared(task, "all", count=3)
-    with pytest.raises(InvalidValue, match=r"problem 'line' has no cases; add to its file cases = fpirhc\.Cases"):
-        compared(replace(task, cases=None), "all")
-    Path("line.py").write_text(line_text(TASK, more='cases = {"weak": {}}\n'))
-    with pytest.raises(ProblemFileError, match=r"line \d+: expected cases = fpirhc\.Cases\("):
-        fp.load_problem("line.py")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--cases", "all", "--scenarios", "3"], "--cases and --scenarios are two comparisons"),
-        (["--cases", "all", "--mismatch", "3"], "--cases have the parameters that they state"),
-        (["--cases", "all", "--optimisers", "all"], "--optimisers cannot be combined with --cases"),
-        (["--cases", "nobody"], "no case matches 'nobody'"),
-    ],
-)
-def test_wrong_commands(options, message, task, capsys):
-    assert main(["compare", "line.py", *options]) == ExitCode.BAD_INPUT
-    assert message in capsys.readouterr().err
 
 
 # --- The shipped tables of people -------------------------------------------------------------------------------------

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import resource
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,26 +15,11 @@ import pytest
 from test_scenarios import LINE
 
 import fpirhc as fp
-from fpirhc.cli.main import main
-from fpirhc.cli.verb import ExitCode
 from fpirhc.contraction import spectrum
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import NotSupported
-from fpirhc.studies.scenarios.ledger import Ledger
 from fpirhc.symbolic.evaluate import Evaluator, attempted
 
-COMMAND = (
-    "compare",
-    "line.py",
-    "--scenarios",
-    "3",
-    "--mismatch",
-    "20",
-    "--no-compile",
-    "--controllers",
-    "CTC",
-    "CTC+FPI",
-)
 PLANNED = """measure_from=0.5,
     horizon=fp.Horizon(stages=30, step=5e-3),
     cost=fp.Quadratic(states={'y': 1.0}, deviation={'u': 1e-3}),"""
@@ -51,17 +34,6 @@ def folder(tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "line.py").write_text(LINE)
     return tmp_path
-
-
-@contextmanager
-def room(size: int) -> Iterator[None]:
-    """Files may grow to `size` bytes; the system cuts a longer write off and refuses the next, as a full disk does."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @contextmanager
@@ -80,46 +52,6 @@ def interrupted_once(begun: Callable[[], object], *, every: float = 0.05) -> Ite
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-
-
-def test_a_full_disk_is_one_line_and_the_same_command_continues_to_the_same_results(folder, capsys):
-    ledger = Path("out/scenarios.jsonl")
-    assert main([*COMMAND, "--out", "whole"]) == ExitCode.FINISHED
-    whole = Path("whole/scenarios.jsonl").read_bytes()
-    capsys.readouterr()
-    ends = [k for k, byte in enumerate(whole) if byte == ord("\n")]
-    with room(ends[2] + 40):  # the header, two records and a torn third
-        assert main([*COMMAND, "--out", "out"]) == ExitCode.NOT_WRITABLE
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    assert "cannot write to 'out/scenarios.jsonl'" in said[0]
-    assert "the same command continues from them" in said[0]
-    assert len(ledger.read_bytes()) == ends[2] + 40
-    assert main([*COMMAND, "--out", "out"]) == ExitCode.FINISHED
-    assert ledger.read_bytes() == whole
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda r: {k: v for k, v in r.items() if k != "scenario"}, "needs scenario"),
-        (lambda r: {k: v for k, v in r.items() if k != "metrics"}, "needs metrics"),
-        (lambda r: {**r, "scenario": "1"}, "scenario: expected a whole number of at least 0, got the text '1'"),
-        (lambda r: {**r, "error": [1]}, "error: expected a number or None"),
-    ],
-)
-def test_a_record_that_lacks_a_field_is_refused_by_name(change, message, folder, capsys):
-    assert main([*COMMAND, "--out", "out"]) == ExitCode.FINISHED
-    capsys.readouterr()
-    ledger = Path("out/scenarios.jsonl")
-    lines = ledger.read_text().splitlines()
-    lines[2] = json.dumps(change(json.loads(lines[2])))
-    ledger.write_text("\n".join(lines) + "\n")
-    assert main([*COMMAND, "--out", "out"]) == ExitCode.NOT_WRITABLE
-    said = " ".join(capsys.readouterr().err.split())
-    assert "scenarios.jsonl', line 3 is damaged" in said
-    assert message in said
-    assert "Traceback" not in said
 
 
 class _Interrupts(ca.Callback):
@@ -184,57 +116,6 @@ def test_an_interruption_of_a_stepper_is_no_failed_solver(folder, monkeypatch):
         with pytest.raises(expected):
             stepper.step(0.0, np.zeros(2), np.zeros(1), stepper.start())
         assert raising.called
-
-
-def test_ctrl_c_in_scenarios_keeps_what_is_finished(folder, capfd):
-    (folder / "long.py").write_text(LONG)
-    words = ["compare", "long.py", "--scenarios", "1000", "--mismatch", "20", "--no-compile", "--out", "out"]
-
-    def records() -> bool:
-        """Whether results are there to be kept, and a solver is at work."""
-        ledger = Path("out/scenarios.jsonl")
-        return ledger.exists() and ledger.read_bytes().count(b"\n") > 3
-
-    with interrupted_once(records):
-        assert main([*words, "--controllers", "CTC", "RHC"]) == ExitCode.INTERRUPTED
-    said = capfd.readouterr().err
-    assert "finished results are kept in out/scenarios.jsonl" in said
-    assert "Traceback" not in said
-    finished = Path("out/scenarios.jsonl").read_text().splitlines()
-    assert 4 <= len(finished) < 2000
-    assert all(json.loads(line)["controller"] in ("CTC", "RHC") for line in finished[1:])
-    assert main([*words[:3], "1", *words[4:], "--controllers", "CTC"]) == ExitCode.FINISHED
-    assert Path("out/scenarios.jsonl").read_text().splitlines()[: len(finished)] == finished
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("limits", "line.py", "--over", "mismatch", "lost"),
-        ("robust", "line.py", "--risk", "0.5", "--confidence", "0.9"),
-    ],
-    ids=lambda words: words[0],
-)
-def test_ctrl_c_in_a_search_keeps_what_is_finished(words, folder, capsys, monkeypatch):
-    """What was kept is not computed again, and the result is that of a search that was not interrupted."""
-    command, told, most = [*words, "--no-compile", "--controllers", "CTC", "CTC+FPI", "--out"], [], [1000]
-    append = Ledger.append
-
-    def appended(ledger: Ledger, record: dict[str, object]) -> None:
-        append(ledger, record)
-        told.append(record)
-        if len(told) == most[0]:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Ledger, "append", appended)
-    assert main([*command, "whole"]) == ExitCode.FINISHED
-    whole, most[0] = list(told), len(told) - 3
-    told.clear()
-    assert main([*command, "out"]) == ExitCode.INTERRUPTED
-    assert f"finished results are kept in out/{words[0]}.jsonl" in capsys.readouterr().err
-    assert main([*command, "out"]) == ExitCode.FINISHED
-    assert told == whole
-    assert (folder / "out/results.json").read_text() == (folder / "whole/results.json").read_text()
 
 
 class _Raising(ca.Callback):

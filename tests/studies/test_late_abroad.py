@@ -12,19 +12,9 @@ from scipy.linalg import expm
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidValue
-from fpirhc.review.question import Verdict
-from fpirhc.review.questions.convergence import CONVERGES
-from fpirhc.review.questions.right_model import NULL_TEST
-from fpirhc.studies.comparison.changes import Outcome
-from fpirhc.summary import written_out
 
 K, TAU, LAG, LATE, PERIOD, RATE, GAIN, POLE = 2.0, 10.0, 0.5, 10, 0.1, 0.2, 0.1, 0.95  # GAIN: half of the map's own
 K_MODEL, TAU_MODEL = 1.4, 14.0
-LAG_LEFT = "Does the tracking law leave room for the lag of the reality?"
-SLOW = (
-    "It converges, and takes 135 min for a factor of 100, more than the run has: a larger gain, or a leak with a smaller pole, "
-    "is quicker."
-)
 
 
 @pytest.fixture(scope="module")
@@ -68,31 +58,6 @@ def by_hand(*, adapts: bool) -> float:
 def test_dead_time_and_lag_are_those_of_an_independent_integration(tank, adapts):
     controller = tank.controllers["CTC+FPI" if adapts else "CTC"]
     assert rms(tank, controller) == pytest.approx(by_hand(adapts=adapts), rel=1e-3)
-
-
-def test_verdict_and_review_say_what_the_runs_say(tank):
-    """The sentence has the integration's digits; the review knows the dead time and the valve that the model lacks."""
-    comparison = fp.compare(tank, seed=0, controllers=["CTC", "CTC+FPI"], compiled=False)
-    plain, adapted = (written_out(by_hand(adapts=adapts)) for adapts in (False, True))
-    assert comparison.outcome is Outcome.BETTER
-    assert f"CTC+FPI lowers the rms error of T from {plain} to {adapted} K" in comparison.verdict[0]
-    answers = answered(tank, tank.controllers["CTC+FPI"])
-    assert {question: a.change for question, a in answers.items() if a.verdict != Verdict.YES} == {CONVERGES: SLOW}
-    assert "2 x 0.2 1/min x lag = 0.2, which must stay below 1" in answers[LAG_LEFT].evidence
-    assert answers[NULL_TEST].evidence == "run on its own model, rms error of T 0.201 K without adaptation and with it"
-
-
-def test_the_advice_of_a_slow_iteration_helps(tank):
-    """The recommended gain converges within the run, and lowers the error."""
-    adapted = tank.controllers["CTC+FPI"]
-    quicker = adapted.with_deformation(replace(adapted.deformation, map=fp.Affine(gain=-1.0)))
-    assert answered(tank, quicker)[CONVERGES].verdict == Verdict.YES
-    assert rms(tank, quicker) < rms(tank, adapted) / 1.5
-
-
-def answered(tank, controller):
-    answers = fp.review(tank.problem, {"x": controller}, seed=0, mismatch=0.0).controllers["x"]
-    return {a.question: a for a in answers}
 
 
 def test_an_uncertainty_is_checked_with_the_dead_time_that_the_problem_fills_in(tank):

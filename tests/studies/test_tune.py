@@ -12,11 +12,9 @@ import pytest
 from line import EXACT, line_text
 
 import fpirhc as fp
-from fpirhc.cli.main import main
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError, ProblemFileError
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError
 from fpirhc.problem_files.settings import current_setting, is_whole
 from fpirhc.studies.objective import PENALTY, objective
-from fpirhc.studies.tuned_file import read_tuned, with_tuned
 
 TUNING = """tuning = {
     "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},
@@ -96,67 +94,11 @@ def test_spans_are_checked(wrong):
         fp.LogSpan(-1.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('"deformation.gain"', '"deformation.gian"', "Did you mean 'gain'"),
-        ('    "CTC": {"tracking', '    "CCT": {"tracking', "Did you mean 'CTC'"),
-        ("fp.Span(2.0, 12.0)", "(2.0, 12.0)", "expected Span(low, high) or LogSpan(low, high)"),
-        ("tuning = {", "tuning = 1 or {", "expected {'controller'"),
-    ],
-)
-def test_mistakes_in_a_file_are_found_when_it_is_loaded(old, new, message, task, capsys):
-    assert old in LINE
-    Path("line.py").write_text(LINE.replace(old, new))
-    assert main(["compare", "line.py"]) == 2
-    assert message in capsys.readouterr().err
-
-
 # --- Tuning -----------------------------------------------------------------------------------------------------------
 
 
 def records(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()[1:]]
-
-
-def test_every_controller_gets_the_same_budget_and_none_gets_worse(task, tmp_path):
-    """As many trials each, besides the settings of the file; a gain of -0.1 is too timid and is found to be."""
-    tuned = fp.tune(task, trials=8, seed=1, folder=tmp_path / "t")
-    tried = records(tmp_path / "t")
-    assert {n: [r["trial"] for r in tried if r["controller"] == n] for n in ("CTC", "CTC+FPI")} == {
-        n: list(range(-1, 8)) for n in ("CTC", "CTC+FPI")
-    }
-    assert all(e.cost <= e.cost_before for e in tuned.entries)
-    adaptive = tuned.entries[1]
-    assert adaptive.cost < 0.5 * adaptive.cost_before
-    assert tuned.untouched == ("CTC exact",)
-    rows = tuned.to_dataframe().set_index("setting")
-    assert rows.loc["deformation.gain", "best"] == adaptive.settings["deformation.gain"]
-    assert rows.attrs["units"] == {}  # of the relative error
-    # The cost is what a comparison would report, of the settings as they were written down.
-    changed = with_tuned(task, {e.name: e.settings for e in tuned.entries})
-    run = fp.simulate(task.problem, changed.controllers["CTC+FPI"], seed=0, compiled=False)
-    error = fp.measure(task.problem, run).rms_error["y"]
-    # Over 1.5 s the reference sin(2 t) moves between 0 and 1, so the relative error is the error itself.
-    assert adaptive.cost == pytest.approx(error, rel=1e-5)
-
-
-def test_any_metric_with_a_direction_may_be_tuned_by(task, tmp_path):
-    """The cost is the number itself; where larger is better it has the opposite sign, and the best is the largest."""
-    largest = fp.Metric(
-        "share_inside", lambda problem, run: float((abs(run["true_error"]) < 1e-2).mean()), better="larger"
-    )
-    own = replace(task, metrics=(*task.metrics, largest))
-    for name, sign in (("max_error.y", 1), ("share_inside", -1)):
-        tuned = fp.tune(own, trials=4, seed=0, folder=tmp_path / name, controllers=["CTC+FPI"], metric=name)
-        changed = with_tuned(task, {e.name: e.settings for e in tuned.entries}).controllers["CTC+FPI"]
-        metrics = fp.measure(own.problem, fp.simulate(own.problem, changed, seed=0, compiled=False), own.metrics)
-        metric, _, element = name.partition(".")
-        assert tuned.entries[0].cost == pytest.approx(sign * metrics[metric][element])
-        assert tuned.entries[0].cost < tuned.entries[0].cost_before
-        assert tuned.facts()["metric"] == name
-    with pytest.raises(OutputError, match="metric was"):
-        fp.tune(own, trials=4, seed=0, folder=tmp_path / "max_error.y", controllers=["CTC+FPI"], metric="share_inside")
 
 
 @pytest.mark.parametrize(
@@ -235,37 +177,6 @@ def test_a_generation_that_was_interrupted_goes_on_as_it_would_have_done(task, t
         )  # the header, the settings as they are
         fp.tune(task, trials=20, folder=folder, **facts)
         assert lines(folder.name) == lines("whole")
-
-
-def test_command_line_journey(task, capsys):
-    """Tune, paste the lines into the file, and compare with the file of tuned settings: all three agree."""
-    assert main(["tune", "line.py", "--trials", "6", "--out", "t"]) == 0
-    printed = capsys.readouterr().out
-    assert "not tuned: CTC exact" in printed
-    lines = [line for line in printed.splitlines() if line.startswith("controllers[")]
-    assert len(lines) == 2
-    Path("pasted.py").write_text(LINE + "\n".join(lines) + "\n")
-    tuned = read_tuned("t/tuning.json", task)
-    assert dict(fp.load_problem("pasted.py").controllers) == dict(with_tuned(task, tuned.values).controllers)
-    command = ["compare", "line.py", "--no-compile", "--tuned", "t/tuning.json", "--out", "c"]
-    assert main([*command, "--controllers", "CTC", "CTC exact"]) == 0
-    page = Path("c/report.html").read_text()
-    assert "tuned (<span class='number'>6 trials</span>, seed <span class='number'>0</span>" in page
-    assert "not tuned: settings of the problem file" in page
-    assert main([*command, "--scenarios", "3", "--mismatch", "10", "--controllers", "CTC", "CTC+FPI"]) == 0
-    assert "tuned (<span class='number'>6 trials</span>" in Path("c/report.html").read_text()
-
-
-def test_a_file_of_another_problem_is_refused(task):
-    facts = {"format": 1, "problem": "arm", "controllers": {}, "trials": 1, "seed": 0, "conditions": ""}
-    Path("t.json").write_text(json.dumps(facts))
-    with pytest.raises(ProblemFileError, match="of problem 'arm', not of 'line'"):
-        read_tuned("t.json", task)
-    Path("t.json").write_text("[1, 2]")
-    with pytest.raises(ProblemFileError, match="not a file that 'fpirhc tune' wrote"):
-        read_tuned("t.json", task)
-    with pytest.raises(ProblemFileError, match="cannot read"):
-        read_tuned("nowhere.json", task)
 
 
 def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):

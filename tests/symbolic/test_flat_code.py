@@ -8,10 +8,8 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from fpirhc.symbolic.dataflow import call_sites
-from fpirhc.symbolic.driver import renamed
 from fpirhc.symbolic.native import find_compiler, native
-from fpirhc.symbolic.program import _Leaves, generate
+from fpirhc.symbolic.program import generate
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 MX = ca.MX
@@ -94,14 +92,6 @@ def test_an_operation_that_is_not_known_is_left_to_casadi():
     np.testing.assert_array_equal(native(whole, required=True).function(*values).full(), whole(*values).full())
 
 
-def test_what_is_called_in_one_place_is_no_function_of_its_own():
-    symbols = MX.sym("x", 3), MX.sym("y", 4), MX.sym("c")
-    function = ca.Function("fpirhc_called", [*symbols], called(*symbols))
-    assert sorted(call_sites(function).values()) == [1, 2, 3]
-    names = re.findall(r"^/\* (fpirhc_\w+) \*/$", generate(function)[0], re.MULTILINE)
-    assert names == ["fpirhc_many", "fpirhc_called"]
-
-
 @needs_compiler
 def test_scalar_code_in_its_caller_has_the_bits_of_its_own_function():
     """Every operation that is written there, and results that nobody reads."""
@@ -134,15 +124,3 @@ def test_scalar_code_in_its_caller_has_the_bits_of_its_own_function():
         at = first, np.array([5.0, second])
         for one, other in zip(native(whole, required=True).function(*at), whole(*at), strict=True):
             np.testing.assert_array_equal(one.full(), other.full())
-
-
-def test_a_function_that_is_renamed_has_the_room_of_its_wrapper():
-    """Two Functions of one name that CasADi writes: the second gets a wrapper, which needs rows and work of its own."""
-    x = MX.sym("x", 3, 3)
-    first, second = (ca.Function("fpirhc_twin", [x], [ca.inv(x + k), ca.det(x)]) for k in (1, 2))
-    leaves = _Leaves()
-    leaves.callee(first)
-    callee = leaves.callee(second)
-    wrapper = renamed(second, "fpirhc_twin_1")
-    assert wrapper.sz_w() > second.sz_w()
-    assert (callee.room, callee.pointers) == (wrapper.sz_w(), (wrapper.sz_arg(), wrapper.sz_res()))

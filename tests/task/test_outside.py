@@ -325,15 +325,6 @@ def test_scenarios_do_not_draw_signals():
     assert ranges["loss"] == pytest.approx((0.24, 0.36))
 
 
-def test_a_null_test_has_the_weather_that_the_model_believes():
-    """Unknown weather must not count as harm of the deformation: the null world is the model's."""
-    from fpirhc.review.prediction import NominalRuns
-
-    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Unknown(FRONT)})
-    runs = NominalRuns(problem).null(CONTROLLERS["CTC+model-referenced"])
-    assert runs.adapted["air"] == pytest.approx(runs.without["air"], rel=1e-9)
-
-
 def test_a_review_says_for_which_weather_it_holds():
     """It sees the nominal value of 283 K alone."""
     question = "Do signals from outside stay where the review sees them?"

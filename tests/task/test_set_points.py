@@ -14,14 +14,12 @@ from scipy.linalg import expm
 from scipy.special import comb
 
 import fpirhc as fp
-from fpirhc.cli.verbs.run import by_kind
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.reference_states import request_along_reference
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.run import load_run
-from fpirhc.studies.comparison.optimality import measure_optimality
 from fpirhc.symbolic.native import native
 from fpirhc.task.set_point import transition
 
@@ -411,15 +409,6 @@ def test_a_stepper_names_set_points_of_outputs():
     assert stepper.trace()["setpoint"].tolist() == [1.5]
 
 
-def test_plans_towards_set_points_have_no_gap():
-    """The nominal motion knows steps that the plans did not know: their cost is not compared with an optimum along it."""
-    problem, controller = two_mass(0.03), tasks.two_mass.controllers["RHC"]
-    run = fp.simulate(problem, controller, seed=0, compiled=False)
-    assert measure_optimality(problem, controller, run, compiled=False) is None
-    along = on(tasks.two_mass.problem, tasks.two_mass.problem.reference, 0.03)
-    assert measure_optimality(along, controller, fp.simulate(along, controller, seed=0, compiled=False), compiled=False)
-
-
 def test_other_references_are_given_nothing():
     """A loop along a trajectory reads no set-points and has no block of the reference's own."""
     loop = close_loop(tasks.two_mass.problem, tasks.two_mass.controllers["RHC+FPI"])
@@ -430,11 +419,3 @@ def test_other_references_are_given_nothing():
     )
     assert "setpoint" not in run.layout
     assert "setpoints" not in run.settings
-
-
-def test_command_line_parts():
-    """`--set setpoints.q1=2.5` is a set-point, all else a setting."""
-    assert by_kind({"setpoints.q1": 2.5, "deformation.gain": -1.0}) == ({"deformation.gain": -1.0}, {"q1": 2.5})
-    assert by_kind({"deformation.gain": -1.0}) == ({"deformation.gain": -1.0}, None)
-    with pytest.raises(InvalidValue, match="one number"):
-        by_kind({"setpoints.q1": (1.0, 2.0)})

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Annotated
 
 import casadi as ca
 import numpy as np
@@ -28,7 +26,7 @@ from fpirhc.controllers.contract import late_deformation
 from fpirhc.controllers.mirror import Answers, believed_path, instant_mirror
 from fpirhc.controllers.model_inputs import measured_output
 from fpirhc.controllers.reference_states import own_signals, own_values, stages_of
-from fpirhc.controllers.slots.schedules import Schedule, linear_modes
+from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import (
     Channel,
     First,
@@ -43,10 +41,9 @@ from fpirhc.controllers.slots.slot import (
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import FpirhcError, Mistakes, NotContractive
-from fpirhc.fields.kinds import Accuracy, CountOrZero, NotNegative, Range
+from fpirhc.fields.kinds import Accuracy, CountOrZero, NotNegative
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
-from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.sensing.base import spline_weights
 from fpirhc.sensing.positions import PositionDifference
@@ -65,13 +62,12 @@ class Slotted(Controller):
 
     Args:
         slots: one per coordinate.
-        schedule: chooses the active slot (FixedSchedule, Periodic, ByError, ByLookAhead).
+        schedule: chooses the active slot (Periodic).
         blend: time constant with which the offset of a switch decays, s; 0: the law is joined at once, and the command jumps
             one cycle after the switch.
         blank: number of cycles at the start of a slot in which the difference between request and desired response stays constant,
             for measurements of y^(r) that need as many cycles after a switch.
         smallest_gain: share of its size at the start that |beta| must keep; below it the command is held (signal `slot_held`).
-        largest_growth: by how much a diverging zero dynamics may grow within one slot.
 
     References:
         J. K. Tar, J. F. Bito, I. J. Rudas, Contradiction resolution in the adaptive control of underactuated mechanical systems
@@ -84,7 +80,6 @@ class Slotted(Controller):
     blend: NotNegative
     blank: CountOrZero = 0
     smallest_gain: Accuracy = 0.05
-    largest_growth: Annotated[float, Range("a factor above 1", low=1.0, open_low=True)] = 100.0
 
     @property
     def deformation(self) -> Deformation:
@@ -105,13 +100,6 @@ class Slotted(Controller):
         same = all(a.deformation is b.deformation for a, b in zip(slots, self.slots, strict=True))
         return self if same else replace(self, slots=tuple(slots))
 
-    def floquet(self, problem: Problem) -> Floquet:
-        """Return the stability of the schedule, with ideal deformations and the plant's exact parameters."""
-        return _radius_of(problem, self.channels(problem), self.schedule, self.blend)
-
-    def notes(self, problem: Problem) -> tuple[str, ...]:
-        return (*self._late(problem), self._stability(problem))
-
     def _late(self, problem: Problem) -> list[str]:
         """Sentences about slots for which a run is too short."""
         names, unit = [s.coordinate for s in self.slots], problem.time_unit
@@ -126,20 +114,6 @@ class Slotted(Controller):
             for (name, _), at in turns
             if at >= problem.duration
         ]
-
-    def _stability(self, problem: Problem) -> str:
-        floquet = self.floquet(problem)
-        if floquet.radius is None:
-            return f"no Floquet radius: {floquet.reason}"
-        alone = ", ".join(
-            f"{name} {round(growth_of(problem.plant)(values).max(), 6) + 0.0:.3g}"
-            for name, values in floquet.eigenvalues.items()
-        )
-        verb = "shrink" if floquet.radius < 1 else "grow"
-        return (
-            f"Floquet radius {floquet.radius:.3g} per period of {floquet.period:g} {problem.time_unit}: near the set-point errors "
-            f"of ideal slots {verb} (largest real part in each slot alone, 1/{problem.time_unit}: {alone})"
-        )
 
     def channels(self, problem: Problem) -> list[Channel]:
         """Return the slots on the plant."""
@@ -157,7 +131,6 @@ class Slotted(Controller):
         channels = self.channels(problem)
         for one in channels:
             _check_gain(problem, one)
-        self._check_growth(problem, channels)
 
     def _check_parts(self, problem: Problem) -> None:
         """Raise with all mistakes of slots and schedule, which is not asked about slots that the plant does not know."""
@@ -182,25 +155,6 @@ class Slotted(Controller):
                 mistakes.add(
                     f"slot '{one.coordinate}' lasts {cycles:.4g} cycles, and its map learns nothing in the first "
                     f"blank = {self.blank}; choose a smaller blank"
-                )
-        mistakes.raise_if_any()
-
-    def _check_growth(self, problem: Problem, channels: Sequence[Channel]) -> None:
-        """Raise where zero dynamics grow too much by the model at the reference's last point; without a set-point there
-        nothing is known, and a schedule that needs it is refused.
-        """
-        modes, reason = linear_modes(problem, channels, problem.plant.approximate, 0.0)
-        dwells = self.schedule.dwells([c.slot.coordinate for c in channels], problem)
-        mistakes, unit = Mistakes("Slotted"), problem.time_unit
-        if reason and self.schedule.foresees:
-            mistakes.add(f"{type(self.schedule).__name__}: {reason}; use ByError")
-        for one, mode in zip(channels, modes, strict=False):
-            name, exponent = one.slot.coordinate, mode.rate * dwells[one.slot.coordinate]
-            if exponent > math.log(self.largest_growth):
-                mistakes.add(
-                    f"slot '{name}' lasts {dwells[name]:g} {unit}, in which its zero dynamics, diverging at {mode.rate:.3g} "
-                    f"1/{unit}, grow e^{exponent:.3g} times, more than largest_growth = {self.largest_growth:g}; make it shorter "
-                    f"than {math.log(self.largest_growth) / mode.rate:.3g} {unit}"
                 )
         mistakes.raise_if_any()
 
@@ -372,66 +326,6 @@ def _weights(problem: Problem, one: Channel) -> np.ndarray:
     if estimator.of_steps or not one.differences:
         return estimator.weights(one.chain.order, problem.period)
     return spline_weights(one.differences)
-
-
-@dataclass(frozen=True, eq=False)
-class Floquet:
-    """The stability of one period of a schedule.
-
-    Args:
-        radius: spectral radius of one period, dimensionless; None where it does not exist.
-        period: duration of one period, s.
-        eigenvalues: of the closed loop in each slot, 1/s, by coordinate.
-        reason: why there is no radius; empty where there is one.
-    """
-
-    radius: float | None
-    period: float
-    eigenvalues: dict[str, np.ndarray]
-    reason: str
-
-
-def floquet_radius(problem: Problem, slots: Sequence[Slot], schedule: Schedule, *, blend: float = 0.0) -> Floquet:
-    """Return the spectral radius of the schedule's period, with ideal deformations and the plant's exact parameters.
-
-    Limits, dead time and the hold of the command over a cycle are left out.
-
-    Args:
-        slots: one per coordinate.
-        blend: time constant of the offset at a switch, s; 0 leaves the offset out.
-
-    Raises:
-        InvalidField: a value of the wrong kind.
-        InvalidProblem: mistakes of slots and schedule, all together.
-    """
-    ideal = Slotted(slots, schedule, blend).with_deformation(Identity())
-    ideal._check_parts(problem)
-    return ideal.floquet(problem)
-
-
-def _radius_of(problem: Problem, channels: Sequence[Channel], schedule: Schedule, blend: float) -> Floquet:
-    """The same as `floquet_radius`, for slots that are already on the plant."""
-    modes, reason = linear_modes(problem, channels, problem.plant.exact, blend)
-    names = [c.slot.coordinate for c in channels]
-    eigenvalues = {name: mode.eigenvalues for name, mode in zip(names, modes, strict=False)}
-    sequence = schedule.sequence(problem)
-    period = sum(duration for _, duration in sequence)
-    if problem.reality is not None:
-        reason = "the radius is that of the model's own equations, and a reality moves"
-    elif not reason and len(problem.plant.inputs) > 1:
-        reason = "the plant has several inputs, and those that a slot does not use keep their last command"
-    if reason or not sequence:
-        return Floquet(None, period, eigenvalues, reason or "the schedule is not periodic")
-    held = response_age(problem.plant) * problem.period
-    before, whole = modes[names.index(sequence[-1][0])], np.eye(modes[0].generator.shape[0])
-    for name, duration in sequence:
-        mode = modes[names.index(name)]
-        begin = mode.start(before, held) if len(sequence) > 1 else mode.goes_on() @ mode.over(held)
-        whole = mode.over(duration - held) @ begin @ whole
-        before = mode
-    entering = np.flatnonzero(np.abs(whole).sum(axis=0) > 0)
-    radius = float(np.abs(np.linalg.eigvals(whole[np.ix_(entering, entering)])).max())
-    return Floquet(radius, period, eigenvalues, "")
 
 
 def by_slot(channels: Sequence[Channel], name: str) -> Signal:

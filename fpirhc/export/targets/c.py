@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import resources
-from pathlib import Path
 
 import numpy as np
 
 from fpirhc.controllers.gate import HELD
 from fpirhc.errors import InvalidValue
-from fpirhc.export.binaries import own_compiler, program
 from fpirhc.export.device import Device, identifiers, literal
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
@@ -64,24 +62,11 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
         "layout.json": json.dumps(layout_of(device), indent=1),
         "samples.bin": recorded(device),
         "main.c": filled(device, "main.c"),
-        "processor.c": filled(device, "processor.c"),
         "CMakeLists.txt": filled(device, "CMakeLists.txt", sources=" ".join(n for n in own if n.endswith(".c"))),
     }
 
 
-def _processor(folder: Path, _: str) -> Sequence[str]:
-    made = folder / "processor"
-    program([path for path in sorted(folder.glob("*.c")) if path.name != "main.c"], made, "-DPROCESSOR")
-    return [str(made)]
-
-
-TARGET = Target(
-    "c",
-    "C99 without heap, files and globals: header, controller, layout, replay, CMake file",
-    _files,
-    processor=_processor,
-    builder=own_compiler,
-)
+TARGET = Target("c", "C99 without heap, files and globals: header, controller, layout, replay, CMake file", _files)
 
 
 def filled(device: Device, file: str, **more: str) -> str:
@@ -228,8 +213,6 @@ def _controller(device: Device) -> str:
         "init": "\n".join(f"  memcpy(&c->{part}, {part.upper()}, sizeof {part.upper()});" for part in data_of(device)),
         "set": _setter(device),
     }
-    if device.bare:
-        return filled(device, "bare.c", tables=of_type("\n".join(texts)), **words)
     texts += [
         f"#define PERIOD ((casadi_real){literal(device.problem.period)})",
         f"#define LONGEST ((casadi_real){LONGEST})",

@@ -45,6 +45,4 @@ _FMI2 = Interface(
     build=_build,
     folders={"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"},
 )
-TARGET = Target(
-    "fmu2", "FMI 2.0 unit, for tools without FMI 3.0", lambda one: mock_up_unit(one, _FMI2), told="sizes.txt"
-)
+TARGET = Target("fmu2", "FMI 2.0 unit for co-simulation", lambda one: mock_up_unit(one, _FMI2))

@@ -80,11 +80,6 @@ def near_fixed_point(controller: Controller) -> Controller:
         return controller
 
 
-def behind_noise(controller: Controller) -> Controller:
-    """Return the controller with its map as it is near the fixed point, behind noise of the response and a filter of the error."""
-    return controller.with_deformation(linear(controller.deformation, noisy=True))
-
-
 def linear(deformation: Deformation, *, noisy: bool = False) -> Deformation:
     """Return the deformation with its map as a `LinearMap`."""
     if deformation.inner is None:

@@ -152,25 +152,9 @@ class Metric(Checked):
         raise InvalidValue(f"metric '{self.name}': expected numbers, got {type(value).__name__}")
 
 
-def first_measured(problem: Problem) -> int:
-    """Return the first cycle that is measured."""
-    return max(0, math.ceil(problem.measure_from / problem.period - 0.5))
-
-
 def measured_cycles(problem: Problem, run: Run) -> np.ndarray:
     """Return which cycles are measured, those from `measure_from` on; shape (cycles,), boolean."""
     return np.asarray(run.time >= problem.measure_from - 0.5 * problem.period)
-
-
-def measured_errors(problem: Problem, run: Run) -> np.ndarray:
-    """Return the true errors of the measured cycles, shape (cycles, coordinates).
-
-    A run that ended early, or before `measure_from`, has one row of NaN.
-    """
-    errors = run["true_error"][measured_cycles(problem, run)]
-    if run.stop is not None or not errors.shape[0]:
-        return np.full((1, errors.shape[1]), np.nan)
-    return np.asarray(errors)
 
 
 def by_name(names: Sequence[str], values: np.ndarray) -> dict[str, float]:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
 
-from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import Checked
 from fpirhc.simulation import drawing
 from fpirhc.simulation.run import Run
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
 
 Kept: TypeAlias = Mapping[str, float | str | list[float]]
 
-NOT_DRAWN = "not drawn"  # what is kept where a picture does not fit the run, with the reason
 INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
 
@@ -90,13 +88,6 @@ def averaged(values: np.ndarray, columns: int) -> np.ndarray:
         return values
     edges = np.linspace(0, values.size, columns + 1).astype(int)
     return np.asarray(np.add.reduceat(values, edges[:-1]) / np.diff(edges))
-
-
-def readable(kept: Mapping[str, Sequence[Kept]]) -> Mapping[str, Sequence[Kept]]:
-    """Return what was kept."""
-    for one in (one for cases in kept.values() for one in cases if NOT_DRAWN in one):
-        raise FpirhcError(str(one[NOT_DRAWN]))
-    return kept
 
 
 def label(run: Run, what: str | Quantity) -> str:

@@ -2,171 +2,50 @@
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
-from typing import cast
+from typing import Any
 
 import numpy as np
 
-from fpirhc.contraction.spectrum import assess_gain
+from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import resolved
-from fpirhc.deformation.base import automatic, innermost
-from fpirhc.errors import FpirhcError, Mistakes, NotContractive
+from fpirhc.controllers.contract import innermost, resolved, without_deformation
+from fpirhc.controllers.live_settings import Numbers
+from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.optimisers.base import FEASIBLE
-from fpirhc.plant.motion import with_space
-from fpirhc.problem_files.pairs import pair_of, same_as
+from fpirhc.problem_files.pairs import pair_of
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.review.questions.gain import recommended_for
-from fpirhc.review.response_prediction import Prediction, predict_response
+from fpirhc.review.review import recommended_for
 from fpirhc.simulation.changes import Changes
-from fpirhc.simulation.lyapunov_view import lyapunov_view
-from fpirhc.simulation.metrics import Metrics, measure
+from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
+from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
+from fpirhc.simulation.model_as_plant import ModelAsPlant
+from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, judged_run
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
-from fpirhc.simulation.trials import weighed
-from fpirhc.studies.comparison.causes import yardstick_of
-from fpirhc.studies.comparison.changes import Finding, Outcome, scales
-from fpirhc.studies.comparison.comparison import Comparison
-from fpirhc.studies.comparison.entry import Contraction, Entry, has_exact_model, information, lines_of, plan_every
-from fpirhc.studies.comparison.optimality import Optimality, measure_optimality
-from fpirhc.studies.comparison.pairwise import (
-    Built,
-    NullTest,
-    beside_each_other,
-    null_tests,
-    partners,
-    with_reviewed_causes,
-)
-from fpirhc.studies.comparison.timing import measure_cycles, step_to_time
-from fpirhc.studies.comparison.verdict import findings
-from fpirhc.studies.objective import Objective, objective
-from fpirhc.studies.view import Progress, circumstances
+from fpirhc.simulation.trials import ErrorPair, Trials, errors_of, harm_in, weighed
+from fpirhc.studies.comparison.verdict import Finding, Outcome, Yardstick, findings
+from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
+from fpirhc.summary import Column, Table
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compiling_ahead
-from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem, cycles_per_plan
 
 
 def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
     """Return the named controllers of a task in the given order; all of them when no names are given."""
-    if not names:
-        return dict(task.controllers)
     mistakes = Mistakes(f"problem '{task.name}'")
-    mistakes.unknown("controller", names, task.controllers)
-    if not mistakes.none and any("," in name for name in names):
-        mistakes.add("names are separated by spaces, without commas")
+    mistakes.unknown("controller", names or (), task.controllers)
     mistakes.raise_if_any()
-    return {name: task.controllers[name] for name in names}
-
-
-@checked_call
-def compare(
-    task: Task,
-    *,
-    seed: Seed,
-    controllers: Sequence[str] | None = None,
-    headline: str | None = None,
-    compiled: bool | None = True,
-    command: str = "",
-    progress: Progress | None = None,
-    changes: Mapping[str, Changes] | None = None,
-) -> Comparison:
-    """Run the task's controllers with the same disturbances and return their results.
-
-    A controller that cannot serve the problem is skipped with its reason. Ctrl-C keeps the finished runs.
-
-    Args:
-        task: the loaded problem file.
-        seed: of the disturbances and the noise.
-        controllers: names of controllers; None: all.
-        headline: number of which the verdict speaks first, 'in_band' or 'rms_error.q1'; None: the problem's, or errors alone.
-        compiled: whether runs use compiled C; None: unless they are short.
-        command: the command line, for the report.
-        progress: function of (controller, cycles done, cycles in all).
-        changes: numbers of settings from a time on, by time in s, by controller.
-
-    Raises:
-        InvalidName, InvalidValue: an unknown headline, or one without a better direction.
-        InvalidProblem: unknown controllers, or deformations with a gain of the wrong sign.
-    """
-    begin = time.perf_counter()
-    figure = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
-    selected = select(task, controllers)
-    mistakes = Mistakes("changes")
-    mistakes.unknown("controller", changes or (), selected)
-    mistakes.raise_if_any()
-    check_gains(task, selected)
-    built: dict[str, Built] = {}
-    ran, skipped = _entries(task, selected, seed, compiled, progress, built, changes or {})
-    _check_figure(figure, ran)
-    sizes = scales(task.problem)
-    found, unjudged = partners(task.problem, ran, selected, seed=seed, compiled=compiled, metrics=task.metrics)
-    alone = [entry for entry, _ in found.values()]
-    ran = [replace(e, pair=found[e.name][0].name) if e.name in found else e for e in ran]
-    broken: list[str] = []
-    ran = _timed(task.problem, ran, built, broken)
-    entries = beside_each_other(task.problem, ran, built, sizes)
-    built |= {entry.name: Built(loop, None) for entry, loop in found.values()}
-    judge = partial(
-        findings,
-        skipped=skipped,
-        headline=task.headline,
-        yardstick=yardstick_of(task.problem, seed=seed),
-        partners=alone,
-        unjudged=unjudged,
-        figure=figure,
-    )
-    entries = with_reviewed_causes(task.problem, entries, built, judge(entries))
-    judged = judge(entries)
-    pairs = list(dict.fromkeys(finding.pair for finding in judged if finding.pair))
-    nulls = null_tests(task.problem, pairs, [*entries, *alone], built, sizes, seed=seed, broken=broken)
-    facts = circumstances(task, {}, command, begin)
-    facts["settings"] |= {e.name: {k: v for k, v in e.run.settings.items() if k != "problem"} for e in entries}
-    return Comparison(
-        **facts,
-        seed=seed,
-        measure_from=task.problem.measure_from,
-        entries=tuple(_advised(task, entries, judged[0], nulls)),
-        skipped=skipped,
-        findings=judged,
-        pictures=task.pictures,
-        nulls=nulls,
-        time_unit=task.problem.time_unit,
-        steps=task.problem.real_integrator.steps_maps,
-        information=(*lines_of(task.problem, {e.name: e.information for e in entries if e.information}), *broken),
-    )
-
-
-def _advised(task: Task, entries: Sequence[Entry], first: Finding, nulls: Sequence[NullTest]) -> list[Entry]:
-    """The entries; the adaptive one of the first pair with the recommended gain, where it does not help and fails no null test."""
-    failed = any(test.harmful for test in nulls if test.pair == first.pair)
-    adaptive = next((e for e in entries if first.pair and e.name == first.pair[1]), None)
-    said = adaptive is None or bool(adaptive.reviewed_gain)
-    if first.pair is None or failed or said or first.outcome not in (Outcome.WORSE, Outcome.MIXED, Outcome.DOUBTFUL):
-        return list(entries)
-    advice = recommended_for(task.problem, task.controllers[first.pair[1]])
-    more = () if advice is None else (f"its gain: {advice.text}",)
-    return [replace(e, notes=(*e.notes, *more)) if e.name == first.pair[1] else e for e in entries]
-
-
-def _check_figure(figure: Objective, entries: Sequence[Entry]) -> None:
-    """Raise where runs finished and none has the figure, unless its function raised, which the notes tell."""
-    metric, finished = figure.metric, [e for e in entries if e.run.stop is None]
-    if metric is None or any(
-        figure.element in e.metrics[metric.name] or metric.name in e.metrics.broken for e in finished
-    ):
-        return
-    for entry in finished[-1:]:
-        figure.check(entry.name, entry.metrics[metric.name])
+    return {name: task.controllers[name] for name in names or task.controllers}
 
 
 def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
@@ -176,199 +55,296 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
         try:
             checked(task.problem, controller)
         except NotContractive as error:
-            advice = recommended_for(task.problem, controller)
-            mistakes.add(f"controller '{name}': {error if advice is None else error.advised(advice.text)}")
+            best = recommended_for(task.problem, controller)
+            mistakes.add(
+                f"controller '{name}': {error}" + ("" if best is None else f"; recommended effective gain {best:.3g}")
+            )
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()
 
 
-_CYCLE = "the time of a cycle"
+@dataclass(frozen=True)
+class Contraction:
+    """The factor by which the iteration shrinks an error per cycle."""
 
-
-def _entries(
-    task: Task,
-    controllers: Mapping[str, Controller],
-    seed: int,
-    compiled: bool | None,
-    progress: Progress | None,
-    built: dict[str, Built],
-    changes: Mapping[str, Changes],
-) -> tuple[list[Entry], dict[str, str]]:
-    """Entries of the controllers that ran, and reasons why the others were skipped; what ran is added to `built`.
-
-    All are composed before the first one runs, so that their compilers are at work side by side.
-    """
-    entries: list[Entry] = []
-    skipped: dict[str, str] = {}
-    composed: dict[str, _Composed] = {}
-    try:
-        with compiling_ahead() as begin:
-            for name, controller in controllers.items():
-                with _skipping(name, skipped):
-                    composed[name] = _composed(task.problem, name, controller, changes.get(name, {}), progress)
-                    composed[name].begin(begin, compiled)
-            for name, one in composed.items():
-                with _skipping(name, skipped):
-                    entries.append(_entry(task, controllers, name, one, seed, compiled, progress, built))
-    except KeyboardInterrupt:
-        done = {*skipped, *(e.name for e in entries)}
-        skipped |= {name: "interrupted before it finished" for name in controllers if name not in done}
-    return entries, {name: skipped[name] for name in controllers if name in skipped}
-
-
-@contextmanager
-def _skipping(name: str, skipped: dict[str, str]) -> Iterator[None]:
-    """Note why a controller is skipped, and go on."""
-    try:
-        yield
-    except FpirhcError as error:
-        skipped[name] = str(error)
+    predicted: float
+    growing: float  # share of the cycles in which small errors grow
+    measured: float
+    report: ContractionReport
+    spectrum: Spectrum
 
 
 @dataclass(frozen=True, eq=False)
-class _Composed:
-    """A controller before its compilers have ended: its loop, and the step by hand, None where that is broken."""
+class Entry:
+    """One controller's row."""
 
-    ready: Controller
-    loop: ComposedLoop
-    by_hand: ComposedStep | None
-    changes: Changes
-    broken: tuple[str, ...]
+    name: str
+    run: Run
+    metrics: Metrics
+    adaptive: bool
+    pair: str | None  # name of the same controller without adaptation
+    weighed: frozenset[str] | None  # judged coordinates that its cost weighs; None: all
+    exact: bool  # whether its model is exact where the others' is not
+    plan_every: int  # cycles from plan to plan
+    contraction: Contraction | None = None
+    lyapunov: LyapunovView | None = None
+    null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
+    cycle: tuple[float, float] | None = None  # median and largest time of a cycle, us
+    notes: tuple[str, ...] = ()
 
-    def begin(self, begin: Callable[..., None], compiled: bool | None) -> None:
-        """Start the compilers of both."""
-        if self.loop.worth_compiling(compiled):
-            begin(self.loop.function, calls=self.loop.calls)
-            if self.by_hand is not None:
-                begin(self.by_hand.function)
+    @property
+    def errors(self) -> Mapping[str, float]:
+        """Rms error by judged coordinate."""
+        return self.metrics.rms_error
 
 
-def _composed(
-    problem: Problem, name: str, controller: Controller, changes: Changes, progress: Progress | None
-) -> _Composed:
-    if progress:
-        progress(name, 0, problem.cycles)
-    broken: list[str] = []
-    ready = resolved(problem, controller)
-    live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
-    loop = ComposedLoop.of(problem, ready, live)
-    step = attempted(_CYCLE, step_to_time, problem, ready, broken=broken)
-    return _Composed(ready, loop, step, changes, tuple(broken))
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Comparison(Study):
+    """The result of `compare`."""
+
+    seed: int
+    measure_from: float
+    entries: tuple[Entry, ...]
+    skipped: Mapping[str, str]
+    findings: tuple[Finding, ...]
+    pictures: tuple[Picture, ...] = ()
+    time_unit: str = "s"
+    steps: bool = False
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """The verdict in sentences."""
+        return tuple(finding.text for finding in self.findings)
+
+    @property
+    def outcome(self) -> Outcome:
+        """What the first sentence states."""
+        return self.findings[0].outcome or Outcome.NOT_COMPARABLE
+
+    def __getitem__(self, name: str) -> Entry:
+        for entry in self.entries:
+            if entry.name == name:
+                return entry
+        raise InvalidName(f"controller '{name}' is not here.{nearest(name, [e.name for e in self.entries])}")
+
+    @property
+    def view(self) -> View:
+        shown = columns([e.metrics for e in self.entries], in_report)
+        best = {
+            c: c.best([c.number(e.metrics) for e in self.entries if e.run.stop is None])
+            for c in shown
+            if c.metric.headline
+        }
+        heads = [Column(c.heading, c.short if c.metric.headline else None) for c in shown]
+        table = Table(
+            self.title, [Column("controller"), *heads, Column("cycle [us]", "cycle us"), Column("status", left=True)]
+        )
+        for e in self.entries:
+            marked = [k for k, c in enumerate(shown, 1) if best.get(c) is not None and c.number(e.metrics) == best[c]]
+            texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
+            status = f"ended early: {e.run.stop}" if e.run.stop else status_shares(e.metrics.statuses)
+            table.add([e.name, *texts, f"{e.cycle[0]:.3g}" if e.cycle else "", status], best=marked)
+        about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
+        notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
+        sentences = [(finding.text, finding.outcome) for finding in self.findings]
+        return self.viewed(
+            sentences, about, (table.filled,), self._facts(), lists={"Notes": notes}, skipped=self.skipped
+        )
+
+    def _facts(self) -> dict[str, Any]:
+        rows = {
+            e.name: {"metrics": e.metrics.values, "cycle_us": e.cycle, "notes": e.notes, "stop": e.run.stop}
+            for e in self.entries
+        }
+        found = [{"text": f.text, "outcome": f.outcome, "pair": f.pair, "ratios": f.ratios} for f in self.findings]
+        facts = {"problem": self.problem, "seed": self.seed, "versions": self.versions, "outcome": str(self.outcome)}
+        return {**facts, "findings": found, "controllers": rows, "skipped": self.skipped}
+
+
+@checked_call
+def compare(
+    task: Task,
+    *,
+    seed: Seed,
+    controllers: Sequence[str] | None = None,
+    compiled: bool | None = True,
+    command: str = "",
+    progress: Progress | None = None,
+    changes: Mapping[str, Changes] | None = None,
+) -> Comparison:
+    """Run the task's controllers with the same disturbances and return their results.
+
+    Args:
+        task: problem and controllers; the pairs are those that differ in their adaptation alone.
+        seed: of the noise.
+        controllers: names; None: all.
+        compiled: whether loops run as compiled C; None: where runs are long.
+        command: that reproduces the comparison.
+        progress: called with (controller, cycles done, cycles in all).
+        changes: of live settings by controller and time.
+    """
+    begin, selected = time.perf_counter(), select(task, controllers)
+    check_gains(task, selected)
+    problem, skipped = task.problem, dict[str, str]()
+    composed, entries = dict[str, tuple[ComposedLoop, ComposedStep | None]](), list[Entry]()
+    with compiling_ahead() as compiling:
+        for name, controller in selected.items():
+            try:
+                live = tuple(dict.fromkeys(p for numbers in (changes or {}).get(name, {}).values() for p in numbers))
+                loop = ComposedLoop.of(problem, resolved(problem, controller), live)
+                step = attempted(
+                    "the time of a cycle", ComposedStep.of, problem, loop.live.controller, bounded=False, broken=[]
+                )
+                composed[name] = loop, step
+                if loop.worth_compiling(compiled):
+                    compiling(loop.function, calls=loop.calls)
+                    if step is not None:
+                        compiling(step.function)
+            except FpirhcError as error:
+                skipped[name] = str(error)
+        for name, (loop, step) in composed.items():
+            try:
+                entries.append(
+                    _entry(task, selected, name, loop, step, seed, compiled, progress, (changes or {}).get(name, {}))
+                )
+            except FpirhcError as error:
+                skipped[name] = str(error)
+            except KeyboardInterrupt:
+                skipped |= {n: "interrupted before it finished" for n in composed if n not in {e.name for e in entries}}
+                break
+    yard = Yardstick.of(problem, seed)
+    facts = circumstances(task, selected, command, begin)
+    return Comparison(
+        **facts,
+        seed=seed,
+        measure_from=problem.measure_from,
+        entries=tuple(entries),
+        skipped=skipped,
+        findings=findings(entries, task.headline, yard, skipped),
+        pictures=task.pictures,
+        time_unit=problem.time_unit,
+        steps=problem.real_integrator.steps_maps,
+    )
 
 
 def _entry(
     task: Task,
     controllers: Mapping[str, Controller],
     name: str,
-    composed: _Composed,
+    composed: ComposedLoop,
+    step: ComposedStep | None,
     seed: int,
     compiled: bool | None,
     progress: Progress | None,
-    built: dict[str, Built],
+    changes: Changes,
 ) -> Entry:
-    problem, controller, ready = task.problem, controllers[name], composed.ready
-    report = progress and partial(progress, name)
-    if report:
-        report(0, problem.cycles)
-    loop = composed.loop.simulator(compiled)
-    compiled = loop.compiled if compiled is None else compiled
-    run = judged_run(loop, seed=seed, name=name, progress=report, changes=composed.changes)
-    adaptive, every = ready.deformation.adapts, plan_every(problem, ready)
-    broken = [*cast(Sequence[str], run.settings.get("broken", ())), *composed.broken]
+    problem, broken = task.problem, list[str]()
     part = partial(attempted, broken=broken)
-    metrics = measure(problem, run, task.metrics)
-    view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
-    stepper = part(_CYCLE, Stepper.of, composed.by_hand, compiled=compiled) if composed.by_hand else None
-    built[name], told = Built(loop, stepper), [view.text] if view else []
+    loop = composed.simulator(compiled)
+    run = judged_run(loop, seed=seed, name=name, progress=progress and partial(progress, name), changes=changes)
+    ready, metrics = loop.controller, measure(problem, run, task.metrics)
+    plans = innermost(ready).planner is not None and problem.horizon is not None
+    pair = pair_of(controllers, name) if ready.deformation.adapts else None
+    null = None
+    if pair is not None:
+        bare = ComposedLoop.of(problem, resolved(problem, controllers[pair])).simulator(False)
+        null = part("the null test", lambda: errors_of(*ModelAsPlant(problem, seed=seed).pair((bare, loop))))
+    stepper = part("the time of a cycle", Stepper.of, step, compiled=loop.compiled) if step is not None else None
+    cycle = part("the time of a cycle", _cycle_time, stepper, run) if stepper is not None else None
     contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-    optimality = part("the excess cost of the plans", measure_optimality, problem, ready, run, compiled=compiled)
-    predicts = adaptive and name in (task.headline or ())
-    prediction = part("the prediction", _predicted, problem, controller, compiled) if predicts else None
-    informed = part("the sentence about what it measures", information, problem, ready, loop.loop, every)
+    view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
+    notes = (*broken_limits(problem, run), *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
     return Entry(
-        name=name,
-        run=run,
-        metrics=metrics,
-        cycle=None,  # measured when all have run, in turn
-        adaptive=adaptive,
-        pair=pair_of(controllers, name) if adaptive else None,
-        contraction=contraction,
-        optimality=optimality,
-        notes=(
-            *broken_limits(problem, run),
-            *_notes(controller, ready),
-            *ready.notes(problem),
-            *told,
-            *_remarks(run, optimality),
-            *broken,
-            *metrics.broken.values(),
-        ),
-        lyapunov=view,
-        prediction=prediction,
-        weighed=weighed(problem, ready),
-        exact=has_exact_model(problem, ready),
-        learns=ready.learns,
-        fixed=same_as(controller.inner, controllers) if ready.learns and controller.inner is not None else None,
-        plan_every=every,
-        information=informed,
-        automatic=automatic(controller.deformation),
+        name,
+        run,
+        metrics,
+        ready.deformation.adapts,
+        pair,
+        weighed(problem, ready),
+        _has_exact_model(problem, ready),
+        cycles_per_plan(problem.horizon, problem.period) if plans else 1,
+        contraction,
+        view,
+        null,
+        cycle,
+        notes,
     )
-
-
-def _timed(problem: Problem, entries: Sequence[Entry], built: Mapping[str, Built], broken: list[str]) -> list[Entry]:
-    """The entries with the times of their cycles, which are measured in turn."""
-    ran = {e.name: (stepper, e.run) for e in entries if (stepper := built[e.name].stepper) is not None}
-    times = attempted(_CYCLE, measure_cycles, problem, [*ran.values()], broken=broken)
-    of = dict(zip(ran, times or (), strict=False))
-    return [replace(e, cycle=of.get(e.name)) for e in entries]
-
-
-def _remarks(run: Run, optimality: Optimality | None) -> list[str]:
-    """What a reader should know of a run; plans at their optimum, to the accuracy of costs, depend on rounding no more than it."""
-    reached = optimality is not None and optimality.reached
-    return [text for text in run.remarks if not (reached and text == run.depends_on_rounding)]
-
-
-def _predicted(problem: Problem, controller: Controller, compiled: bool) -> Prediction | None:
-    """The prediction before the run; None where no prediction covers the controller."""
-    try:
-        return predict_response(problem, controller, compiled=compiled)
-    except FpirhcError:
-        return None
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
-    """The measured contraction with its explanation; None where none was measured."""
-    predicted = metrics.values.get("contraction.predicted")
-    if not predicted:
+    if not metrics.values.get("contraction.predicted"):
         return None
-    spectrum, measured = sampled_spectrum(problem, run), metrics["contraction.measured"][""]
-    growing = metrics["contraction.growing"][""]
-    return Contraction(predicted[""], growing, measured, assess_gain(controller.deformation, spectrum), spectrum)
+    spectrum = sampled_spectrum(problem, run)
+    predicted, growing, measured = (metrics[f"contraction.{n}"][""] for n in ("predicted", "growing", "measured"))
+    return Contraction(predicted, growing, measured, assess_gain(controller.deformation, spectrum), spectrum)
 
 
-_CLOSE = 1e-3  # share of half the range of its limits, or of the only one, within which a state keeps it
+def _has_exact_model(problem: Problem, controller: Controller) -> bool:
+    """Whether it is the bound of a controller with a wrong model: exact parameters, nothing adapted, nothing learned."""
+    model, real = controller.plant_model(problem), problem.real_plant
+    wrong = problem.reality is not None or not np.array_equal(model.plant.approximate, model.plant.exact)
+    fixed = not controller.deformation.adapts and not controller.learns
+    return bool(wrong and fixed and model.plant is real and np.array_equal(model.parameters(model.plant), real.exact))
+
+
+REPLAYED = 2000  # cycles of a run that are stepped again, one by one
+
+
+def _cycle_time(stepper: Stepper, run: Run) -> tuple[float, float] | None:
+    """Median and largest wall time of a call of the controller, from measurement to command, us."""
+    count = min(run.cycles, REPLAYED)
+    if count < 2:
+        return None
+    if stepper.estimates:
+        step, samples = stepper.step_measured, (run.time, raw_measurements(run))
+    elif stepper.beside:
+        step = lambda now, x, r, y, memory: stepper.step(now, x, r, memory, output=y)  # noqa: E731
+        samples = run.time, run["state"], run["realised"], run["output"]
+    else:
+        step, samples = stepper.step, (run.time, run["state"], run["realised"])
+    memory, taken = stepper.start(), np.empty(count)
+    for k in range(count):
+        begin = time.perf_counter_ns()
+        _, memory = step(*(signal[k] for signal in samples), memory)
+        taken[k] = time.perf_counter_ns() - begin
+    return float(np.median(taken[1:])) / 1e3, float(taken[1:].max()) / 1e3
 
 
 def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
-    """By how much the run leaves each hard limit of a state."""
-    limits, names, units = problem.limits, problem.plant.state.elements, problem.plant.state.units
-    hard = [k for k, name in enumerate(names) if name in limits.states and name not in {**limits.soft, **limits.prices}]
-    texts = []
-    for k in hard:
-        (low, high), values = limits.states[names[k]], run["plant_state"][:, k]
-        half, small = 0.5 * (high - low), min(FEASIBLE, _CLOSE * float(np.abs(values).max()))
-        for beyond, limit, end in ((values.max() - high, high, values.max()), (low - values.min(), low, values.min())):
-            if beyond > (_CLOSE * half if math.isfinite(half) else max(small, _CLOSE * abs(limit))):
-                unit = with_space(units[k])
-                texts.append(f"{names[k]} reaches {end:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
+    """Return by how much the run leaves each hard limit of a state."""
+    limits, texts = problem.limits, []
+    for name, (low, high) in limits.states.items():
+        if name in {**limits.soft, **limits.prices} or not run.cycles:
+            continue
+        values = run[f"plant_state.{name}"]
+        room = 1e-3 * (high - low if np.isfinite(high - low) else max(abs(values).max(), 1.0))
+        beyond = max(float(values.max()) - high, low - float(values.min()))
+        if beyond > room:
+            texts.append(f"{name} leaves its hard limits by {beyond:.3g}")
     return tuple(texts)
 
 
-def _notes(controller: Controller, ready: Controller) -> tuple[str, ...]:
-    """Which settings of the deformation were chosen automatically."""
-    map_ = innermost(ready.deformation)
-    return tuple(
-        f"{name} = {getattr(map_, name):g} was chosen automatically" for name in automatic(controller.deformation)
-    )
+def harm_of_adaptation(
+    problem: Problem,
+    name: str,
+    controller: Controller,
+    *,
+    seed: int = 0,
+    compiled: bool = False,
+    settings: Numbers | None = None,
+    **_: Any,
+) -> tuple[str, ...]:
+    """Return what short runs on the plant and on the model show against the adaptation of a controller."""
+    if not controller.deformation.adapts:
+        return ()
+    try:
+        ready = (
+            controller
+            if not settings
+            else ComposedLoop.of(problem, controller, list(settings)).simulator(False).holding(settings).controller
+        )
+        against = harm_in(*Trials(problem, without_deformation(ready), cycles=1000).errors(ready))
+    except FpirhcError:
+        return ()
+    return (f"{name}: {against}.",) if against else ()

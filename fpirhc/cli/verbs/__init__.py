@@ -1,1 +1,0 @@
-"""The commands, one file each: every module of this package has its command in `VERB`."""

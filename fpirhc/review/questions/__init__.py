@@ -1,1 +1,0 @@
-"""Questions of a review, one per file, found by discovery."""

@@ -1,1 +1,0 @@
-"""Many drawn plants, paired between controllers."""
