@@ -1,4 +1,4 @@
-"""Loops are compiled without optimising, which takes a third of the time and gives the same bits; tests of C are as users have it."""
+"""Loops are compiled without optimising: a third of the time, the same bits. Tests of C are as users have it."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     """Chromium, of the system or of Playwright."""
-    api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: ./scripts/browser-test")
+    api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed: ./scripts/nightly")
     with api.sync_playwright() as playwright:
         own = playwright.chromium.executable_path
         path = next(filter(None, map(shutil.which, NAMES)), own if Path(own).exists() else None)
