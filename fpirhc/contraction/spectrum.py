@@ -5,7 +5,8 @@ J is that of the equations, of a cycle of a reality differentiated through its i
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
@@ -15,7 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
-from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
+from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Count, Seed
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -90,6 +93,81 @@ def response_jacobian(plant: Plant) -> ca.Function:
     jacobian = ca.densify(ca.jacobian(realised, r))
     names = ["state", "deformed", "exact", "approximate"]
     return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])
+
+
+@checked_call
+def spectrum_over_run(
+    plant: Plant, states: Array, deformed: Array, *, exact: Array | None = None, approximate: Array | None = None
+) -> Spectrum:
+    """Return the eigenvalues of J along a run; long runs are thinned to `LARGEST_SAMPLE` cycles.
+
+    Args:
+        states: state of every cycle, shape (cycles, nx): run["state"].
+        deformed: request of every cycle, shape (cycles, n): run["deformed"].
+        exact: parameters of the plant, shape (np,); None: its exact ones.
+        approximate: parameters of the model, shape (np,); None: the plant's approximate ones.
+
+    Raises:
+        InvalidShape: arrays that do not fit the plant or each other.
+        InvalidValue: no finite eigenvalue.
+    """
+    states, deformed = _rows(plant, states, deformed)
+    rows = _thinned(len(states))
+    true = np.tile(plant.exact if exact is None else np.asarray(exact, dtype=float), (len(rows), 1))
+    return _spectrum(response_jacobians(plant, states[rows], deformed[rows], true, approximate))
+
+
+@checked_call
+def spectrum_over_box(
+    plant: Plant, box: Mapping[str, tuple[float, float]], states: Array, deformed: Array, *, samples: Count, seed: Seed
+) -> Spectrum:
+    """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
+
+    Every corner of the box is a sample where there are at least as many samples as corners; the others are uniform.
+
+    Args:
+        box: parameter -> (lower, upper), in its unit; others keep the plant's exact value.
+        states: states to draw from, shape (rows, nx).
+        deformed: the requests at these states, shape (rows, n).
+        samples: number of draws.
+        seed: of the draws.
+
+    Raises:
+        InvalidName: the box names an unknown parameter.
+        InvalidValue: an interval whose ends are swapped or not finite, or no finite eigenvalue.
+        InvalidShape: arrays that do not fit the plant or each other.
+    """
+    states, deformed = _rows(plant, states, deformed)
+    names, ends = list(plant.parameters), np.tile(plant.exact, (2, 1))
+    for name, (low, high) in box.items():
+        if name not in names:
+            raise InvalidName(f"box: parameter '{name}' is unknown.{nearest(name, names)}")
+        if not -np.inf < low <= high < np.inf:
+            raise InvalidValue(f"box: '{name}' is from {low!r} to {high!r}; expected finite ends with lower <= upper")
+        ends[:, names.index(name)] = low, high
+    generator = np.random.default_rng(seed)
+    parameters = generator.uniform(*ends, size=(samples, len(names)))
+    places = [names.index(name) for name in box]
+    if 2 ** len(places) <= samples:
+        for row, sides in enumerate(itertools.product((0, 1), repeat=len(places))):
+            parameters[row, places] = ends[list(sides), places]
+    rows = generator.integers(len(states), size=samples)
+    return _spectrum(response_jacobians(plant, states[rows], deformed[rows], parameters, None))
+
+
+def _rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, Array]:
+    states, deformed = (np.atleast_2d(np.asarray(rows, dtype=float)) for rows in (states, deformed))
+    widths = (plant.state.size, len(plant.controlled_names))
+    if (states.shape[1], deformed.shape[1]) != widths or not len(states) == len(deformed) > 0:
+        raise InvalidShape(
+            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {widths[0]}) and (cycles, {widths[1]}), "
+            "of at least one cycle"
+        )
+    return states, deformed
+
+
+def _spectrum(jacobians: Array) -> Spectrum:
+    return Spectrum(np.linalg.eigvals(jacobians[np.isfinite(jacobians).all(axis=(1, 2))]))
 
 
 def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:

@@ -20,9 +20,11 @@ from fpirhc.contraction.spectrum import (
     linear_limit,
     predicted_factor,
     response_jacobian,
+    spectrum_over_box,
+    spectrum_over_run,
 )
 from fpirhc.deformation import Deformation, Identity
-from fpirhc.errors import NotContractive
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive
 from fpirhc.plant.plant import Parameter, Plant
 
 MAPS = (
@@ -106,6 +108,47 @@ def test_jacobian_through_a_root_finder() -> None:
     function = response_jacobian(plant)
     jacobian = float(function([0.3, 0.0], 0.7, plant.exact, plant.approximate))
     assert jacobian == pytest.approx(1.5, rel=1e-6)
+
+
+def test_spectrum_over_run() -> None:
+    """Eigenvalues along a run; cycles that are not finite are left out, an all-bad run is refused."""
+    plant = masses()
+    states, deformed = np.zeros((5000, 4)), np.zeros((5000, 2))
+    states[7] = np.nan
+    spectrum = spectrum_over_run(plant, states, deformed)
+    assert spectrum.smallest_real == pytest.approx(1.3)
+    assert spectrum.largest_real == pytest.approx(1.5)
+    assert spectrum.one_sign
+    right = spectrum_over_run(plant, states, deformed, approximate=plant.exact)
+    assert right.largest_real == pytest.approx(1.0)
+    with pytest.raises(InvalidValue, match="no finite eigenvalue"):
+        Spectrum(np.full((3, 2), np.nan))
+
+
+def test_spectrum_over_box_reaches_the_corners() -> None:
+    """The extremes of a box sit at its corners, so these are always sampled."""
+    plant = masses()
+    box = {"m1": (0.5, 3.0), "m2": (1.3, 2.6)}
+    spectrum = spectrum_over_box(plant, box, np.zeros(4), np.zeros(2), samples=16, seed=3)
+    assert spectrum.smallest_real == pytest.approx(0.5)
+    assert spectrum.largest_real == pytest.approx(3.0)
+    again = spectrum_over_box(plant, box, np.zeros(4), np.zeros(2), samples=16, seed=3)
+    assert np.array_equal(spectrum.eigenvalues, again.eigenvalues)
+
+
+def test_bad_arguments_raise() -> None:
+    """Misspelt parameters, swapped ends and arrays of the wrong width are named."""
+    plant, state, request = masses(), np.zeros(4), np.zeros(2)
+    with pytest.raises(InvalidName, match="'m1'"):
+        spectrum_over_box(plant, {"m_1": (1.0, 2.0)}, state, request, samples=4, seed=0)
+    with pytest.raises(InvalidValue, match="lower <= upper"):
+        spectrum_over_box(plant, {"m1": (2.0, 1.0)}, state, request, samples=4, seed=0)
+    with pytest.raises(InvalidValue, match=r"samples: .* got 0"):
+        spectrum_over_box(plant, {"m1": (1.0, 2.0)}, state, request, samples=0, seed=0)
+    with pytest.raises(InvalidShape, match=r"\(cycles, 4\)"):
+        spectrum_over_run(plant, np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(InvalidShape, match="the same"):
+        identified_factor(np.zeros((5, 2)), np.zeros((4, 2)), 0.5)
 
 
 @settings(deadline=None, derandomize=True, max_examples=50)

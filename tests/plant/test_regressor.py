@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from plants import pendulum
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidValue
+from fpirhc.errors import InvalidName, InvalidValue, NotSupported
 from fpirhc.plant.motion import places
-from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.plant.regressor import Combination, Regressor, linear_parameters
 
 INERTIAS = {
     "a1": Combination(lambda p: p.I1 + p.m1 * p.lc1**2 + p.Ie + p.me * (p.lce**2 + p.l1**2), "kg m^2"),
@@ -139,6 +139,15 @@ def test_more_combinations_than_parameters():
         Regressor(plant, ("inertia", "weight", "square"), combinations)
     with pytest.raises(InvalidValue, match=r"not linear in inertia.*'l' enter"):
         Regressor(plant, ("inertia",), combinations)
+
+
+def test_linear_parameters_are_found():
+    """Linear jointly with all others; a Stribeck level is one only where its velocity is not learned."""
+    assert linear_parameters(pendulum()) == ()
+    result = linear_parameters(fp.load_problem("planar_arm").problem.plant)
+    assert result == ("J1", "k1", "m2", "I2", "load", "b1", "b2", "c1", "c2")
+    with pytest.raises(NotSupported, match="fully actuated"):
+        linear_parameters(fp.load_problem("cart_pole").problem.plant)
 
 
 def test_parameters_that_enter_nonlinearly_are_refused_by_name():
