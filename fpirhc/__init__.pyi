@@ -40,7 +40,7 @@ from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
-from .plant.integrators import Cvodes, Euler, RungeKutta4
+from .plant.integrators import Collocation, Cvodes, Euler, RungeKutta4
 from .plant.motion import Algebraic, Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
@@ -104,6 +104,7 @@ __all__ = [
     "ByModel",
     "Cascade",
     "Cases",
+    "Collocation",
     "ColouredNoise",
     "ComputedTorque",
     "CustomCost",

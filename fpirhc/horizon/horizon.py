@@ -28,7 +28,7 @@ class Horizon(Checked):
     Args:
         stages: number of stages N.
         step: length of one stage, s, over which the input is constant.
-        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(). A
+        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), Collocation(). A
             map has none: a stage is a whole number of its steps.
         terminal: names of states that must meet the reference at the end of the horizon.
         lengths: of the stages, as multiples of `step`, which is that of the first one: fine stages first. One number of at least
@@ -88,7 +88,7 @@ class Horizon(Checked):
                     f"horizon: margins of '{name}' must be {self.stages} numbers, one for every stage, got {described(margin)}"
                 )
         if self.discretisation.opaque:
-            raise InvalidValue("a horizon needs an integrator of plain expressions, such as RungeKutta4()")
+            raise InvalidValue("a horizon needs an integrator of plain expressions, such as RungeKutta4() or Collocation()")
 
     @property
     def relative_lengths(self) -> np.ndarray:

@@ -146,7 +146,7 @@ def _require_rollouts(growth: np.ndarray) -> None:
     raise NotSupported(
         f"FixedPoint rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
         f"{np.prod(growth):.1g} over the horizon, so plans have no digits. Where the plant itself does not run away so, a fast "
-        f"mode is the cause: use RungeKutta4(substeps=...) with more sub-steps; else limit "
+        f"mode is the cause: use Horizon(discretisation=Collocation()), or RungeKutta4(substeps=...) with more sub-steps; else limit "
         f"a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages"
     )
 

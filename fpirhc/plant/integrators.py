@@ -1,6 +1,6 @@
 """Integrators: the plant's state one control cycle later, with the command held. Theory: docs/theory-plants.md.
 
-Runge-Kutta 4, Euler and the implicit methods with a fixed number of Newton steps are plain expressions, so they can be compiled and
+Runge-Kutta 4, Euler, and collocation with a fixed number of Newton steps are plain expressions, so they can be compiled and
 exported. CVODES controls its own error, runs in CasADi's virtual machine, and is the reference for the methods with a fixed step.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
-from typing import Self, TypeAlias, cast
+from typing import Self, cast
 
 import casadi as ca
 import numpy as np
@@ -134,6 +134,48 @@ class Euler(_Substepped):
 
 
 @dataclass(frozen=True)
+class Collocation(_Substepped):
+    """Collocation at Radau points, of order 2 d - 1: for plants with modes much faster than the step. None of them ever grows.
+
+        x_j = x + h sum_k a_jk f(x_k, u, p),   j = 1 ... d,   x+ = x_d
+
+    by a fixed number of Newton steps on all x_j together, from x_j = x. The linear systems are factorised as sparse ones (QR), so
+    work grows with the states as their coupling does: for a rod of cells in proportion.
+
+    Args:
+        substeps: equal sub-steps per step.
+        degree: number of points d in a sub-step.
+        newton: Newton steps per sub-step; one is exact where the plant is linear.
+
+    Raises:
+        InvalidField: fewer than one of any.
+    """
+
+    degree: Few = 2
+    newton: Few = 3
+
+    def step(self, plant: Plant, period: float) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
+        rate = plant.equations.forced_rate
+        x, u, p, w = _symbols(rate)
+        n, d, h = x.numel(), self.degree, period / self.substeps
+        # x_j' = sum_k slopes_kj x_k / h of the polynomial through x and all x_k; the first row belongs to x.
+        slopes = np.asarray(ca.collocation_coeff(ca.collocation_points(d, "radau"))[0])
+        points = ca.SX.sym("points", n, d)
+        rates = ca.horzcat(*(rate(points[:, j], u, p, w) for j in range(d)))
+        left = ca.vec(ca.mtimes(ca.horzcat(x, points), ca.DM(slopes)) - h * rates)
+        newton = ca.vec(points) - _solved(ca.jacobian(left, ca.vec(points)), left)
+        better = ca.Function("fpirhc_newton", [x, points, u, p, w], [ca.cse(ca.reshape(newton, n, d))])
+        x_next = x
+        for _ in range(self.substeps):
+            inside = ca.repmat(x_next, 1, d)
+            for _ in range(self.newton):
+                inside = better(x_next, inside, u, p, w)
+            x_next = inside[:, d - 1]
+        return ca.Function("fpirhc_collocation", [x, u, p, w], [x_next], ["x", "u", "p", "w"], ["x_next"])
+
+
+@dataclass(frozen=True)
 class Cvodes(Integrator):
     """SUNDIALS CVODES.
 
@@ -213,6 +255,12 @@ USUAL = RungeKutta4()
 """The integrator of a problem, or of a horizon, that names none: this very object. A map has its own steps in its place."""
 
 
+def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
+    """matrix^-1 right, as the entries of a sparse matrix allow."""
+    v, r, beta, rows, columns = ca.qr_sparse(matrix)
+    return ca.qr_solve(right, v, r, beta, rows, columns, False)
+
+
 def runge_kutta_4(rate: Callable[[Expression], Expression], x: Expression, h: float) -> Expression:
     """Return x after one classical Runge-Kutta step of length h for x' = rate(x)."""
     k1 = rate(x)
@@ -252,7 +300,7 @@ def stiffness(
     fastest = modes[wrong][int(np.argmax(np.abs(modes[wrong])))]
     substeps = math.ceil(float(np.abs(modes).max()) * period / _INSIDE)
     few = substeps <= _MOST
-    remedy = f"RungeKutta4(substeps={substeps})" if few else "Cvodes()"
+    remedy = f"RungeKutta4(substeps={substeps})" if few else "Collocation()"
     needed = "" if few else f"; RungeKutta4 would need {substeps} sub-steps"
     rate = f"1/{plant.time_unit}"
     return (
@@ -301,6 +349,3 @@ def _slope_of(plant: Plant) -> ca.Function:
 
 def _text(pole: complex) -> str:
     return f"{pole.real:.4g}" if abs(pole.imag) <= 1e-9 * abs(pole) else f"{pole.real:.4g} +- {abs(pole.imag):.4g}i"
-
-
-_Coefficients: TypeAlias = tuple[np.ndarray, np.ndarray]  # a (stages, stages) and b (stages,)

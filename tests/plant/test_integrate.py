@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+
+import casadi as ca
 import numpy as np
 import pytest
 from plants import pendulum
@@ -49,15 +52,76 @@ def test_forcing_adds_to_the_response():
     np.testing.assert_allclose((forced - free).full().ravel(), [0.0, 2.5], equal_nan=False)
 
 
-@pytest.mark.parametrize(("method", "order"), [(fp.Euler, 1.0)])
-def test_methods_have_their_order(method, order):
-    """Halving the step divides the error by 2^order; CVODES is the reference."""
-    truth = _after(fp.Cvodes(1e-12), 0.1, 10)
-    errors = [np.linalg.norm(_after(method(n), 0.1, 10) - truth) for n in (2, 4, 8, 16)]
+@pytest.mark.parametrize(("degree", "order"), [(0, 1.0), (2, 3.0), (3, 5.0)])
+def test_methods_have_their_order(degree, order):
+    """Halving the step divides the error by 2^order, of collocation at d points 2 d - 1; CVODES is the reference."""
+    truth, counts = _after(fp.Cvodes(1e-13), 0.5, 4), (1, 2, 4) if degree == 3 else (4, 8, 16)
+    methods = [fp.Collocation(n, degree, newton=5) if degree else fp.Euler(8 * n) for n in counts]
+    errors = [np.linalg.norm(_after(method, 0.5, 4) - truth) for method in methods]
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), order, atol=0.2, equal_nan=False)
 
 
-@pytest.mark.parametrize("method", [fp.Euler, fp.RungeKutta4])
+STIFF = fp.Plant(
+    coordinates={"slow": "K", "fast": "K"},
+    inputs={"u": "K"},
+    controlled=("fast",),
+    order=1,
+    response=lambda q, u, p: {"slow": -q.slow + q.fast, "fast": -p.rate * (q.fast - ca.cos(q.slow) - u.u)},
+    parameters={"rate": fp.Parameter(1e5, 1e5, "1/s")},
+)
+
+
+def test_a_stiff_plant_is_sent_to_collocation_which_follows_it():
+    """A mode of 1e5 1/s over steps of 50 ms: within 1e-4 of CVODES; sub-steps of Runge-Kutta would be 2 500."""
+    after = {}
+    for method in (fp.Cvodes(1e-11), fp.Collocation()):
+        step, x = method.step(STIFF, 0.05), np.array([0.5, 0.0])
+        for _ in range(20):
+            x = step(x, [0.1], STIFF.exact, [0.0, 0.0]).full().ravel()
+        after[type(method)] = x
+    np.testing.assert_allclose(after[fp.Collocation], after[fp.Cvodes], atol=1e-4, equal_nan=False)
+    reference, limits = (
+        fp.Trajectory(lambda t: {"slow": 0.5 + 0 * t, "fast": 1.0 + 0 * t}),
+        fp.Limits(inputs={"u": (-2.0, 2.0)}),
+    )
+    asked = {
+        "duration": 1.0,
+        "plant": STIFF,
+        "reference": reference,
+        "start": {"slow": 0.5, "fast": 0.9},
+        "limits": limits,
+        "period": 0.05,
+    }
+    with pytest.raises(fp.FpirhcError, match=r"2500 sub-steps; use Reality\(..., integrator=Collocation\(\)"):
+        fp.Problem(**asked, reality=fp.Reality(STIFF))
+    fp.Problem(**asked, reality=fp.Reality(STIFF), integrator=fp.Collocation())
+
+
+def test_work_of_collocation_grows_as_the_coupling_of_the_states():
+    """A rod of n cells, each coupled with its neighbours: twice the cells, about twice the operations; one Newton step is exact."""
+
+    def step(cells, newton=1):
+        names = [f"T{k}" for k in range(cells)]
+
+        def rates(x, u, p):
+            padded = [x[n] for n in (names[0], *names, names[-1])]
+            flows = [1e3 * (a - b) for a, b in itertools.pairwise(padded)]
+            return {n: flows[k] - flows[k + 1] + (u.heat if k == 0 else 0.0) for k, n in enumerate(names)}
+
+        outputs = {"end": fp.Output("K", lambda x, p: x.T0)}
+        rod = fp.Plant.of_states(
+            states=dict.fromkeys(names, "K"), inputs={"heat": "K/s"}, rates=rates, outputs=outputs, parameters={}
+        )
+        return fp.Collocation(newton=newton).step(rod, 0.1)
+
+    assert step(40).n_instructions() < 2.3 * step(20).n_instructions()
+    x = np.linspace(10.0, 30.0, 20)
+    once, thrice = (step(20, newton)(x, [2.0], [], [0.0] * 20).full() for newton in (1, 3))
+    np.testing.assert_allclose(once, thrice, rtol=1e-10)
+    np.testing.assert_allclose(once.mean(), x.mean() + 0.1 * 2.0 / 20, rtol=1e-10)  # the heat stays in the rod
+
+
+@pytest.mark.parametrize("method", [fp.Euler, fp.RungeKutta4, fp.Collocation])
 def test_counts_are_checked(method):
     with pytest.raises(InvalidValue, match="expected a whole number from 1 to"):
         method(0)

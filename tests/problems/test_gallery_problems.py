@@ -234,7 +234,7 @@ def test_an_explicit_stage_of_10_ms_diverges_and_review_says_so():
     }
     assert "no" in answered["coarse"]
     assert "no" not in answered["fine"]
-    with pytest.raises(fp.FpirhcError, match=r"multiplies a motion by 291 in a stage.*RadauIIA"):
+    with pytest.raises(fp.FpirhcError, match=r"multiplies a motion by 291 in a stage.*Collocation"):
         fp.simulate(coarse, exact["RHC exact model"], seed=0)
 
 
