@@ -5,27 +5,24 @@ Theory: docs/theory-plants.md.
 
 from __future__ import annotations
 
-import queue
-import threading
-import time as wall
+import reprlib
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, NoReturn, Protocol, TypeVar
+from typing import ClassVar, NoReturn, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import CountOrZero, NotNegative, Positive, finite_number
+from fpirhc.fields.kinds import CountOrZero, NotNegative, Positive
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
 
 _SAME = 1e-9  # share of a period that is no difference
-_LONGEST = 60  # characters of an answer that are shown
 
 
 class Body(Protocol):
@@ -60,11 +57,8 @@ class ExternalPlant(Checked):
             "q1'"), outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled
             ("q1''"). Units are those of the model; stated ones are compared with them.
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
-        deadline: longest wall time of a step's answer, s; a later one is bad. With a deadline the body is called by a thread of its
-            own: where it does not return, it is given up, and called again when it has returned. None: it may take its time, as a
-            simulator does.
-        reset_deadline: longest wall time of making and resetting the body, s, where there is a deadline.
-        clock: function that returns the wall time, s.
+            A bad answer is an exception, another shape, or a number that is not finite: a body that has measured nothing in a
+            cycle, or waited for it too long, returns NaN.
         dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
             problem; the body has it already, so it is not simulated.
         lag: by input, in the model's unit of time: the time constant with which the body follows a command. `ModelReferenced` and
@@ -80,9 +74,6 @@ class ExternalPlant(Checked):
     body: Body | None = None
     measures: Mapping[str, str] | Sequence[str] = field(default_factory=dict)
     holds: CountOrZero = 0
-    deadline: Positive | None = None
-    reset_deadline: Positive = 10.0
-    clock: Callable[[], float] = field(default=wall.perf_counter, metadata={"setting": False})
     dead_time: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
     lag: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
 
@@ -230,95 +221,52 @@ class ExternalPlant(Checked):
         """Return the first measurements.
 
         Raises:
-            InvalidProblem: a bad answer.
+            InvalidProblem: a bad answer, or no body.
         """
-        reading = self._answer(lambda: self._begun(seed).reset(seed), "reset", self.reset_deadline)
+        if self.make is not None:
+            try:
+                body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)
+            except Exception as error:  # noqa: BLE001  # a stranger's function may raise anything
+                raise InvalidProblem(f"reality: make raised {_words(error)}") from None
+            if mistake := _wrong_body(body):
+                raise InvalidProblem(f"reality: make returned {mistake}")
+            self._present[:] = [body]
+        reading = self._answer(lambda: self._present[0].reset(seed), "reset")
         if reading.values is None:
             raise InvalidProblem(f"reality: {reading.mistake}")
         return reading.values
 
     def read(self, time: float, command: np.ndarray) -> Reading:
-        """Return the answer to a command; with a deadline it is waited for no longer."""
-        return self._answer(lambda: self._present[0].step(time, command), "step", self.deadline)
-
-    def _begun(self, seed: int) -> Body:
-        """The body of the run that begins."""
-        if self.make is not None:
-            try:
-                body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)
-            except Exception as error:  # noqa: BLE001  # a stranger's function may raise anything
-                raise _NoBody(f"make raised {type(error).__name__}{_words(error)}") from None
-            if mistake := _wrong_body(body):
-                raise _NoBody(f"make returned {mistake}")
-            self._present[:] = [body]
-        return self._present[0]
+        """Return the answer to a command."""
+        return self._answer(lambda: self._present[0].step(time, command), "step")
 
     @cached_property
     def _present(self) -> list[Body]:
         return [] if self.body is None else [self.body]
 
-    @cached_property
-    def _caller(self) -> _Caller:
-        """The thread that calls the body; there is one, because a body that is given up is still inside its call."""
-        return _Caller()
-
-    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
-        if self.deadline is None:
-            return self._judged(ask, method, None)
-        who = f"{method} of {self.name}"
-        try:
-            return self._caller.call(lambda: self._judged(ask, method, deadline), deadline, free_within=self.deadline)
-        except _GaveUp as end:
-            what = "did not return" if end.begun else "was not called, because its last call has not returned"
-            patience = deadline if end.begun else self.deadline
-            return Reading(None, f"{who} {what} within {patience:.3g} s, its deadline; it was given up")
-
-    def _judged(self, ask: Callable[[], npt.ArrayLike], method: str, deadline: float | None) -> Reading:
-        """The answer of a stranger's object, of which every part may raise: its numbers, its length, its words, its errors."""
-        who, begin = f"{method} of {self.name}", self._now()
+    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str) -> Reading:
+        who, expected = f"{method} of {self.name}", f"{len(self.measures)} numbers: {', '.join(self.measures)}"
         try:
             returned = ask()
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # noqa: BLE001  # whatever else a stranger's object raises is a bad answer
-            words = f"{who} raised {type(error).__name__}{_words(error)}"
-            words = (
-                f"{who}{_words(error)}" if issubclass(type(error), FpirhcError) else words
-            )  # those of an adapter say it all
-            return Reading(None, str(error) if issubclass(type(error), _NoBody) else words)
-        elapsed = self._now() - begin
-        answer = _real_numbers(returned)
-        expected = f"{len(self.measures)} numbers: {', '.join(self.measures)}"
-        if answer is None:
-            return Reading(None, f"{who} returned {_short(returned)}, expected {expected}")
-        if answer.shape != (len(self.measures),):
-            return Reading(None, f"{who} returned the shape {answer.shape}, expected {expected}")
-        if not np.isfinite(answer).all():
-            place = int(np.argmin(np.isfinite(answer)))
+            values = np.ma.filled(returned, np.nan)  # what lies under a mask is no measurement
+        except FpirhcError as error:  # those of an adapter say it all
+            return Reading(None, f"{who}: {error}")
+        except Exception as error:  # noqa: BLE001  # a stranger's object may raise anything
+            return Reading(None, f"{who} raised {_words(error)}")
+        if values.dtype.kind not in "iuf":
+            return Reading(None, f"{who} returned {reprlib.repr(returned)}, expected {expected}")
+        if values.shape != (len(self.measures),):
+            return Reading(None, f"{who} returned the shape {values.shape}, expected {expected}")
+        if not np.isfinite(values).all():
+            place = int(np.argmin(np.isfinite(values)))
             return Reading(
-                None, f"{who} returned {list(self.measures)[place]} = {answer[place]}, expected a finite number"
+                None, f"{who} returned {list(self.measures)[place]} = {values[place]}, expected a finite number"
             )
-        if deadline is not None and elapsed > deadline:
-            return Reading(None, f"{who} took {elapsed:.3g} s, and its deadline is {deadline:.3g} s")
-        return Reading(answer)
-
-    def _now(self) -> float:
-        """The wall time; without a deadline nobody asks for it."""
-        if self.deadline is None:
-            return 0.0
-        try:
-            time = self.clock()
-        except Exception as error:  # noqa: BLE001  # a stranger's function may raise anything
-            raise InvalidValue(f"ExternalPlant(clock=...): it raised {type(error).__name__}{_words(error)}") from None
-        if not finite_number(time):
-            raise InvalidValue(
-                f"ExternalPlant(clock=...): it returned {_short(time)}, expected the wall time as a number, in s"
-            )
-        return float(time)
+        return Reading(values.astype(float))
 
 
-class _NoBody(Exception):
-    """`make` gave no body; the words say why."""
+def _words(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":")
 
 
 def _wrong_body(body: object) -> str:
@@ -332,35 +280,6 @@ def _wrong_body(body: object) -> str:
     return f"{what}; expected an object with reset(seed) and step(time, command)"
 
 
-def _real_numbers(answer: object) -> np.ndarray | None:
-    """The answer as real numbers; None where it is none."""
-    try:
-        if isinstance(answer, np.ma.MaskedArray):  # what lies under a mask is no measurement
-            return None
-        if isinstance(answer, list | tuple) and any(isinstance(v, bool | np.bool_) for v in answer):
-            return None
-        column = np.asarray(answer)
-        return column.astype(float) if column.dtype.kind in "iuf" else None
-    except Exception:  # noqa: BLE001  # rows of different lengths; an object that raises where numpy asks it for its numbers
-        return None
-
-
-def _words(error: BaseException) -> str:
-    try:
-        text = " ".join(str(error).split())
-    except Exception:  # noqa: BLE001  # an exception of a stranger's that has no words
-        text = ""
-    return f": {text}" if text else ""
-
-
-def _short(answer: object) -> str:
-    try:
-        text = " ".join(repr(answer).split())
-    except Exception:  # noqa: BLE001  # an answer that cannot write itself down
-        text = f"a value of the class {type(answer).__name__}"
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
-
-
 def quantities(model: Plant) -> dict[str, str]:
     """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
     signals, orders = (model.state, model.output), model.response_orders
@@ -368,67 +287,3 @@ def quantities(model: Plant) -> dict[str, str]:
     units = model.response_signal("realised").entry_units
     responses = {name + "'" * order: unit for (name, order), unit in zip(orders.items(), units, strict=True)}
     return {**shown, **responses}
-
-
-Result = TypeVar("Result")
-
-
-class _GaveUp(Exception):
-    """The time is over; `begun` says whether the call itself was begun."""
-
-    def __init__(self, *, begun: bool) -> None:
-        super().__init__(begun)
-        self.begun = begun
-
-
-class _Caller:
-    """Calls functions in one thread of its own, one after another; who waits can give up, and nothing is interrupted.
-
-    An object that belongs to a thread is safe so. The thread begins with the first call and does not keep the program from ending.
-    """
-
-    def __init__(self) -> None:
-        self._calls: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
-        self._last = threading.Event()  # set when the last call has returned
-        self._last.set()
-
-    def call(self, function: Callable[[], Result], patience: float | None, *, free_within: float) -> Result:
-        """Return what a function returns, or raise what it raises.
-
-        Args:
-            patience: longest time that is waited for it, s; None: any.
-            free_within: longest time in which an earlier call that was given up has to return, s.
-        """
-        end = None if patience is None else wall.monotonic() + patience
-        if not self._last.wait(free_within):
-            raise _GaveUp(begun=False)
-        returned: list[Result] = []
-        raised: list[BaseException] = []
-        done = self._last = threading.Event()
-
-        def run() -> None:
-            try:
-                returned.append(function())
-            except BaseException as error:  # noqa: BLE001 -- it is raised where the result is waited for
-                raised.append(error)
-            finally:
-                done.set()
-
-        self._start()
-        self._calls.put(run)
-        if not done.wait(None if end is None else max(end - wall.monotonic(), 0.0)):
-            raise _GaveUp(begun=True)
-        if raised:
-            raise raised[0]
-        return returned[0]
-
-    def _start(self) -> None:
-        if self._thread is None:
-            self._thread = threading.Thread(target=_work, args=(self._calls,), name="fpirhc body", daemon=True)
-            self._thread.start()
-
-
-def _work(calls: queue.SimpleQueue[Callable[[], None]]) -> None:
-    while True:
-        calls.get()()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from dataclasses import replace
 from typing import Any
 from unittest.mock import DEFAULT, Mock
@@ -13,7 +12,7 @@ import pytest
 from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.path import moving
 from fpirhc.simulation.simulate import Patch, run_cycles, simulator
@@ -76,12 +75,11 @@ BAD: dict[str, tuple[Any, str]] = {
     "wrong shape": (lambda a: a[:2], r"returned the shape \(2,\), expected 3 numbers: y, y', y''"),
     "no number": (lambda a: a * [1, np.nan, 1], "returned y' = nan, expected a finite number"),
     "text": (lambda _: "on", "returned 'on', expected 3 numbers: y, y', y''"),
-    "masked": (lambda a: np.ma.masked_array(a, [True, False, False]), r"returned masked_array\(.*, expected 3 numbers"),
+    "masked": (lambda a: np.ma.masked_array(a, [True, False, False]), "returned y = nan, expected a finite number"),
     "truth values": (lambda a: a > 0, r"returned array\(.*, expected 3 numbers"),
-    "a truth value": (lambda a: [*a[:2], True], r"returned \[.*, expected 3 numbers"),
     "nothing": (lambda _: None, "returned None, expected 3 numbers"),
     "complex": (lambda a: a * 1j, "expected 3 numbers"),
-    "ragged": (lambda a: [a, 1.0], "expected 3 numbers"),
+    "ragged": (lambda a: [a, 1.0], "raised ValueError"),
 }
 
 
@@ -179,15 +177,6 @@ def test_one_input_is_late_in_the_body_and_another_before_it():
     assert late.simulated.queued == ("w",)
 
 
-@pytest.mark.parametrize("clock", [lambda: None, lambda: "noon", lambda: float("nan"), lambda: 1 / 0])
-def test_a_clock_that_shows_no_time_is_named(clock):
-    """It is the user's own mistake, and no bad answer of the body."""
-    with pytest.raises(
-        InvalidValue, match=r"ExternalPlant\(clock=\.\.\.\): it (returned .*, expected the wall|raised Zero)"
-    ):
-        run(outside(task(), deadline=1.0, clock=clock), CONTROLLERS["computed torque"])
-
-
 def test_positions_alone_are_enough_for_an_estimator():
     """A body that measures y only runs with an estimator; errors are then those of the estimate."""
     problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))
@@ -237,158 +226,6 @@ def test_bad_answers_are_held_as_stated(kind):
     three = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad, range(100, 103)), MEASURES, holds=2)))
     assert three.cycles == 102
     assert str(three.stop).endswith("after 2 in a row that were held; ExternalPlant(holds=3) bridges one more")
-
-
-def test_answer_after_the_deadline():
-    """A clock that jumps in the hundredth step stands for a body that is late."""
-    problem = task()
-    body = Wrapped(problem)
-    foreign = fp.ExternalPlant(body, MEASURES, deadline=100.0, clock=lambda: 1e3 * (body.calls >= 100))
-    result = run(replace(problem, reality=foreign))
-    assert result.cycles == 100
-    assert "took 1e+03 s, and its deadline is 100 s" in str(result.stop)
-
-
-class Blocking(Wrapped):
-    """The same, and in its hundredth step it waits until it is released."""
-
-    def __init__(self, problem) -> None:
-        super().__init__(problem)
-        self.released, self.resets = threading.Event(), 0
-
-    def reset(self, seed):
-        self.resets += 1
-        return super().reset(seed)
-
-    def step(self, time, command):
-        good = super().step(time, command)
-        if self.calls == 100 and not self.released.is_set():
-            self.released.wait()
-        return good
-
-
-def test_a_body_that_blocks_is_given_up():
-    """The run ends as with every bad answer, and keeps what was before it; the body is not interrupted."""
-    problem = task()
-    body = Blocking(problem)
-    result = run(replace(problem, reality=fp.ExternalPlant(body, MEASURES, deadline=0.05)))
-    body.released.set()
-    assert (result.cycles, body.calls) == (100, 100)
-    assert "step of Blocking did not return within 0.05 s, its deadline; it was given up at t = 0.1 s" in str(
-        result.stop
-    )
-
-
-class Reluctant(Blocking):
-    """The same, and its reset waits until it is released."""
-
-    def reset(self, seed):
-        self.released.wait()
-        return super().reset(seed)
-
-
-def test_a_body_whose_reset_blocks_is_given_up():
-    """A start may take longer than a step, and not for ever."""
-    body = Reluctant(task())
-    with pytest.raises(
-        InvalidProblem,
-        match=re.escape("reset of Reluctant did not return within 0.02 s, its deadline; it was given up"),
-    ):
-        run(task(reality=fp.ExternalPlant(body, MEASURES, deadline=1.0, reset_deadline=0.02)))
-    body.released.set()
-
-
-def test_a_body_that_blocks_is_not_called_before_it_has_returned():
-    """Two calls at the same time would be two masters of one device: answers are held meanwhile, and a new run waits."""
-    problem = task(duration=0.2)
-    body = Blocking(problem)
-    held = replace(problem, reality=fp.ExternalPlant(body, MEASURES, deadline=0.02, holds=3))
-    stopped = run(held)
-    assert body.calls == 100
-    assert np.flatnonzero(stopped["foreign_held"]).tolist() == [100, 101, 102]
-    assert "step of Blocking was not called, because its last call has not returned" in str(stopped.stop)
-    with pytest.raises(InvalidProblem, match="reset of Blocking was not called"):
-        run(held)
-    body.released.set()
-    again = run(held)
-    assert (again.stop, again.cycles, body.resets) == (None, problem.cycles, 2)
-
-
-class Hostile:
-    """An answer in which something raises."""
-
-    def __init__(self, *names) -> None:
-        self.names = names
-
-    def __array__(self, *arguments, **named):
-        self._raise("array")
-        return np.zeros(3)
-
-    def __len__(self):
-        self._raise("len")
-        return 3
-
-    def __repr__(self):
-        self._raise("repr")
-        return "Hostile()"
-
-    def _raise(self, name):
-        if name in self.names:
-            raise ZeroDivisionError(name)
-
-
-class Speechless(Exception):
-    """An exception whose words raise."""
-
-    def __str__(self):
-        raise ZeroDivisionError
-
-
-def speechless(_answer):
-    """Raise it."""
-    raise Speechless
-
-
-class Nameless(Exception):
-    """An exception whose attributes raise."""
-
-    def __getattribute__(self, name):
-        raise TypeError(name)
-
-
-def nameless(_answer):
-    """Raise it."""
-    raise Nameless
-
-
-class WithoutLength:
-    """A sequence that has no length."""
-
-    def __len__(self):
-        raise ZeroDivisionError
-
-    def __getitem__(self, place):
-        raise ZeroDivisionError
-
-
-@pytest.mark.parametrize("deadline", [None, 60.0])
-@pytest.mark.parametrize(
-    ("bad", "words"),
-    [
-        (lambda _: Hostile("array"), r"returned Hostile\(\), expected 3 numbers"),
-        (lambda _: Hostile("array", "repr"), "returned a value of the class Hostile, expected 3 numbers"),
-        (lambda _: [Hostile("array", "len", "repr")] * 3, "returned a value of the class list, expected 3 numbers"),
-        (lambda _: WithoutLength(), "expected 3 numbers"),
-        (speechless, "step of Faulty raised Speechless at t"),
-        (nameless, "step of Faulty raised Nameless at t"),
-    ],
-)
-def test_whatever_raises_in_an_answer_is_a_bad_answer(bad, words, deadline):
-    """A stranger's object may raise where it is turned into numbers, measured, or written down."""
-    problem = task(duration=0.11)
-    result = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad), MEASURES, deadline=deadline)))
-    assert re.search(words, str(result.stop))
-    assert result.cycles == 100
 
 
 def test_bad_first_answer_is_an_error():
@@ -483,12 +320,6 @@ WRONG: dict[str, tuple[Any, str]] = {
         lambda: task(reality=loose(measures={**MEASURES, "y": "mm"})),
         "measures y in mm, the model has it in m",
     ),
-    "no deadline": (lambda: loose(deadline=0.0), "deadline: expected a finite number above 0 or None, got 0.0"),
-    "a word": (
-        lambda: loose(deadline="fast"),
-        "deadline: expected a finite number above 0 or None, got the text 'fast'",
-    ),
-    "a reset": (lambda: loose(reset_deadline=-1.0), "reset_deadline: expected a finite number above 0, got -1.0"),
     "half a hold": (lambda: loose(holds=1.5), "holds: expected a whole number of at least 0, got 1.5"),
     "an option": (lambda: loose(dead_times={}), "no field 'dead_times'. Did you mean 'dead_time'?"),
     "a dead time": (
@@ -567,7 +398,6 @@ def test_comparison_and_report_of_an_object_outside(tmp_path):
     errors = [entry.metrics.rms_error["y"] for entry in comparison.entries]
     inside = [fp.measure(task(), run(task(), one)).rms_error["y"] for one in pair.values()]
     assert errors == pytest.approx(inside, rel=1e-10)
-    assert comparison.null is not None
     fp.write_report(comparison, tmp_path / "report.html")
     assert "plain form" in (tmp_path / "report.html").read_text()
 
