@@ -34,7 +34,7 @@ Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
 NoCompile = Annotated[bool, typer.Option("--no-compile", help="run loops in CasADi's virtual machine")]
 Processes = Annotated[int, typer.Option(min=1, help="number of processes")]
 Cases = Annotated[
-    list[str] | None, typer.Option(help="cases of the problem file, by name, group or pattern; again for each")
+    list[str] | None, typer.Option(help="cases of the problem file, by name or group, or all; again for each")
 ]
 Baselines = Annotated[Path | None, typer.Option(help="folder of the baselines [default: baselines beside the problem]")]
 

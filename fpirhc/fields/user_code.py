@@ -233,12 +233,6 @@ def users_place() -> str:
     return f"{Path(frame.f_code.co_filename).name}, line {frame.f_lineno}" if frame else ""
 
 
-def users_folder() -> Path:
-    """Return the folder of the file of that call; the current one where the call stands in no file."""
-    _, frame = _users_frame(sys._getframe(1))
-    return Path(frame.f_code.co_filename).resolve().parent if frame else Path.cwd()
-
-
 def users_level() -> int:
     """Return the `stacklevel` with which a warning by the caller of this function stands at the user's line."""
     depth, frame = _users_frame(sys._getframe(1))

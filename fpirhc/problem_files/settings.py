@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidValue, Mistakes
@@ -56,22 +56,11 @@ def of_problem(problem: Problem, path: str) -> str | None:
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
     """Return a problem with other numbers at paths of a case, see `Cases`, or as `of_problem` takes them."""
-    written = {of_problem(problem, path) or path: path for path in values}
-    changes = {path: values[given] for path, given in written.items()}
-    return _Written({_SET: changes}, places=written).problem(_SET, problem) if values else problem
+    changes = {of_problem(problem, path) or path: value for path, value in values.items()}
+    return Cases({_SET: changes}).problem(_SET, problem) if values else problem
 
 
 _SET = "--set"
-
-
-@dataclass(frozen=True, eq=False)
-class _Written(Cases):
-    """One case of numbers that a user wrote in a command; `places` has the paths as they were written."""
-
-    _where: ClassVar[str] = _SET
-
-    def _place(self, name: str, path: str = "", *, head: bool = False) -> str:  # noqa: ARG002
-        return f"'{self.places[path]}'" if path else name
 
 
 def is_own(controller: Controller, path: str) -> bool:

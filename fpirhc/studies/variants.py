@@ -62,9 +62,9 @@ class Variants(ABC):
 
 @dataclass(frozen=True)
 class CasesOf(Variants):
-    """The cases of the problem file that these patterns name."""
+    """The cases of the problem file with these names, of cases or of groups."""
 
-    patterns: tuple[str, ...] = ("all",)
+    names: tuple[str, ...] = ("all",)
     seed: int = 0
 
     def of(self, task: Task) -> Sequence[Variant]:
@@ -72,7 +72,7 @@ class CasesOf(Variants):
         if cases is None:
             raise InvalidValue(f"problem '{task.name}' has no cases; add cases = fpirhc.Cases(...) to its file")
         made, variants = dict[object, Problem](), []
-        for name in cases.matching(self.patterns):
+        for name in cases.matching(self.names):
             key, place = cases.key(name), cases.names.index(name)
             if key not in made:
                 made[key] = cases.build(name, task.problem)

@@ -39,7 +39,10 @@ that only holds the distance of the bis misses its motion within the horizon (RH
 concentrations at which the model has the measured bis and bis', as plans behind a deformation always do.
 """
 
+from pathlib import Path
+
 import casadi as ca
+import pandas as pd
 
 import fpirhc as fp
 
@@ -127,4 +130,5 @@ tuning = {
     "CTC+FPI": {"tracking.rate": fp.LogSpan(0.5, 5.0), "deformation.gain": fp.LogSpan(-6.0, -0.5)},
 }
 # The curves of 44 patients, with this man's kinetics.
-cases = fp.Cases.from_csv("anaesthesia_patients.csv", needed=[f"exact.{name}" for name in plant.parameters])
+patients = pd.read_csv(Path(__file__).with_name("anaesthesia_patients.csv"), comment="#", index_col="case")
+cases = fp.Cases(patients.to_dict("index"))

@@ -74,8 +74,10 @@ kinetics are not the pump's, its worst patient is outside the range for more tha
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
+import pandas as pd
 
 import fpirhc as fp
 
@@ -300,10 +302,9 @@ why = (
     "Dead times of up to 150 s bound the gain, and both add up the error of the bis "
     "within it; in mg/l the loop's gain varies less."
 )
-OWN = ("age", "height", "weight", "sex", "eleveld", "E0", "Emax", "ke0", "C50", "steepness")
-NEEDED = [*(f"exact.{n}" for n in OWN), "dead_time.inputs.target"]
-WORDS = {"exact.sex": {"m": 0.0, "f": 1.0}}
-cases = fp.Cases.from_csv("anaesthesia_people.csv", needed=NEEDED, words=WORDS)
+patients = pd.read_csv(Path(__file__).with_name("anaesthesia_people.csv"), comment="#", index_col="case")
+patients["exact.sex"] = patients["exact.sex"].map({"m": 0.0, "f": 1.0})
+cases = fp.Cases(patients.to_dict("index"))
 BIS = "plant_state.bis"
 
 

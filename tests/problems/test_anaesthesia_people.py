@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +16,6 @@ from scipy.linalg import expm
 from scipy.signal import lsim
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import Task, _imported
 from fpirhc.problem_files.shipped import find_problem
 
@@ -178,39 +176,3 @@ def test_the_monitor_is_its_transfer_function():
     _, shown, _ = lsim(system, changes, fine, interp=False)
     index = run["reality_state.index"]
     np.testing.assert_allclose(index, 92.0 + shown[::100][: len(index)], atol=2e-2)
-
-
-GOOD = Path(str(find_problem(NAME))).with_suffix(".csv").read_text("utf-8").splitlines()
-HEAD, FIRST = next(k for k, line in enumerate(GOOD) if line.startswith("case")), "A01"
-
-
-def read_with(column: str, cell: str | None) -> fp.Cases:
-    """The table with the first patient's cell replaced; None: without the column. It is checked against the problem."""
-    rows = [line.split(",") for line in GOOD[HEAD : HEAD + 3]]
-    place = rows[0].index(column)
-    if cell is None:
-        rows = [row[:place] + row[place + 1 :] for row in rows]
-    else:
-        rows[1][place] = cell
-    Path("patients.csv").write_text("\n".join(map(",".join, rows)))
-    module = written()
-    cases = fp.Cases.from_csv(Path("patients.csv").resolve(), needed=module.NEEDED, words=module.WORDS)
-    cases.check(task().problem)
-    return cases
-
-
-@pytest.mark.parametrize(
-    ("column", "cell", "message"),
-    [
-        ("exact.weight", None, "patients.csv: row 1: there is no column 'exact.weight', which every case needs."),
-        ("exact.weight", "-65", "patients.csv, row 2 (A01), column 'exact.weight': expected 3 to 300 kg, got -65"),
-        ("exact.sex", "x", "patients.csv: row 2 (A01), column 'exact.sex': expected 'm' or 'f', got 'x'"),
-        ("exact.age", "", "patients.csv: row 2 (A01), column 'exact.age': it is empty; expected a number, such as 3.5"),
-    ],
-)
-def test_a_wrong_table_of_patients_is_named(column, cell, message, tmp_path, monkeypatch):
-    """A missing column, a negative weight, an unknown sex, an empty cell: row, column, and what is expected."""
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(InvalidProblem) as wrong:
-        read_with(column, cell)
-    assert message in str(wrong.value)
