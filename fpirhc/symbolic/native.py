@@ -34,7 +34,8 @@ from fpirhc.symbolic.program import NAME, generate
 _LINK = ("-shared", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 # -falign: where a loop begins in a cache line decides up to 17 % of a plan's time, and any other number of the code moves it.
 _ALIGNED = ("-falign-functions=64", "-falign-loops=64")
-_FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC")
+# -fno-semantic-interposition: CasADi's small functions are no symbols that another library may replace, so they are inlined.
+_FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-fno-semantic-interposition")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _loaded: dict[str, ca.Function] = {}
 _begun: dict[Path, tuple[Sequence[str], Future[None]]] = {}  # by note: the C, and the compiler that is at work on it

@@ -12,20 +12,21 @@ from fpirhc.errors import NoCode
 from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_type
 
 NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
-_BASE = 64  # calls of a chain that are compiled as one loop
 
 
 def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
     """Return the C files of a Function: its own under a fixed name, and the files of the drivers that it calls.
 
-    `function`: the Function. `calls`: number of calls in a row, see `chained`; 0: it is called once.
+    `function`: the Function. `calls`: number of calls in a row, as in `chained`; 0: it is called once.
     """
     called = function.find_functions()
     if any(f.is_a("External") for f in called):
         raise NoCode("it calls a Function that is already compiled; compile the whole instead")
-    whole = chained(function, calls, _BASE) if calls else function
-    arguments = [ca.MX.sym(whole.name_in(k), whole.sparsity_in(k)) for k in range(whole.n_in())]
-    named = ca.Function(NAME, arguments, whole.call(arguments), whole.name_in(), whole.name_out())
+    if calls:
+        named = _signature_of_loop(function, calls)
+    else:
+        arguments = [ca.MX.sym(function.name_in(k), function.sparsity_in(k)) for k in range(function.n_in())]
+        named = ca.Function(NAME, arguments, function.call(arguments), function.name_in(), function.name_out())
     generator = ca.CodeGenerator(NAME, {"with_header": False})
     try:
         # CasADi warns on stderr of parts that it cannot write. The text has it too, and the caller announces it once.
@@ -38,12 +39,57 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
     drivers = list(dict.fromkeys(f.name() for f in [function, *called] if is_driver(f.name())))
     for name in drivers:
         entry, room = entry_of(name)[:2]
-        body = rf"(^/\* {name}:\([^\n]*\*/\nstatic int \w+\([^\n]*\) \{{\n).*?^\}}$"
         # The graph in place of which the loops stand may need less work than they do.
         work = f"casadi_real work[{max(room, 1)}];"
-        call = f"int {entry}{SIGNATURE};\n\\1  {work}\n  return {entry}(arg, res, iw, work, mem);\n}}"
-        source = re.sub(body, call, source, flags=re.MULTILINE | re.DOTALL)
+        call = f"  {work}\n  return {entry}(arg, res, iw, work, mem);\n"
+        source = _with_body(source, name, call, f"int {entry}{SIGNATURE};\n")
+    if calls:
+        source = _with_body(source, NAME, _loop(source, function))
     return of_type(source), *map(file_of, drivers)
+
+
+def _with_body(source: str, name: str, body: str, before: str = "") -> str:
+    """C in which a Function has another body, and something stands before it."""
+    whole = rf"(^/\* {name}:\([^\n]*\*/\nstatic int \w+\([^\n]*\) \{{\n).*?^\}}$"
+    return re.sub(whole, lambda found: f"{before}{found[1]}{body}}}", source, flags=re.MULTILINE | re.DOTALL)
+
+
+def _signature_of_loop(function: ca.Function, calls: int) -> ca.Function:
+    """A graph with arguments, results and work of the loop over calls of a Function, which its body in C replaces."""
+    memory, *reads = (ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(function.n_in()))
+    tables = [ca.MX.sym(one.name(), one.size1(), one.size2() * calls) for one in reads]
+    after, *results = function.call([memory, *(t[:, : one.size2()] for t, one in zip(tables, reads, strict=True))])
+    outputs = [after, *(ca.repmat(one, 1, calls) for one in results)]
+    names = [*function.name_in(), "count"], function.name_out()
+    return ca.Function(NAME, [memory, *tables, ca.MX.sym("count")], outputs, *names)
+
+
+def _loop(source: str, function: ca.Function) -> str:
+    """The body of the loop: two memories change places, and every call writes into its columns of the tables.
+
+    CasADi's own chain keeps the memories of all calls, and copies that table three times.
+    """
+    found = re.search(rf"^/\* {function.name()}:\([^\n]*\*/\nstatic int (\w+)\(", source, re.MULTILINE)
+    assert found
+    size, reads, results = function.numel_out(0), range(1, function.n_in()), range(1, function.n_out())
+    first = len(reads) + 2  # arguments of the loop: the memory, the tables, the count
+    lines = [
+        f"casadi_real memory[2][{size}];",
+        f"const casadi_real** arg1 = arg + {first};",
+        f"casadi_real** res1 = res + {len(results) + 1};",
+        f"casadi_int k, count = (casadi_int)arg[{first - 1}][0];",
+        f"casadi_copy(arg[0], {size}, memory[0]);",
+        "for (k = 0; k < count; ++k) {",
+        "  arg1[0] = memory[k % 2];",
+        *(f"  arg1[{i}] = arg[{i}] ? arg[{i}] + k * {function.numel_in(i)} : 0;" for i in reads),
+        "  res1[0] = memory[(k + 1) % 2];",
+        *(f"  res1[{i}] = res[{i}] ? res[{i}] + k * {function.numel_out(i)} : 0;" for i in results),
+        f"  if ({found[1]}(arg1, res1, iw, w, 0)) return 1;",
+        "}",
+        f"casadi_copy(memory[count % 2], {size}, res[0]);",
+        "return 0;",
+    ]
+    return "".join(f"  {line}\n" for line in lines)
 
 
 def chained(function: ca.Function, calls: int, base: int) -> ca.Function:
