@@ -1,6 +1,7 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .baselines.baseline import check
+from .certificate.limits import certify_limits
 from .controllers import rivals
 from .controllers.computed_torque import ComputedTorque, FeedforwardOnly
 from .controllers.receding_horizon import RecedingHorizon
@@ -208,6 +209,7 @@ __all__ = [
     "Unknown",
     "VelocityDifference",
     "certify",
+    "certify_limits",
     "check",
     "compare",
     "figures",

@@ -1,0 +1,182 @@
+"""Certificates of limits: no plant of the box leaves what they state, and the laws of the proof hold in the loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import casadi as ca
+import certificate as certified
+import numpy as np
+import pytest
+
+import fpirhc as fp
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported
+
+
+@cache
+def task(name):
+    return certified.task(name)
+
+
+@cache
+def certificate(name):
+    case = certified.LOOPS[name]
+    return fp.certify_limits(*task(name), mismatch=case.mismatch, pieces=case.pieces)
+
+
+@pytest.mark.parametrize(
+    "name", ["body", "tanks", *(pytest.param(n, marks=pytest.mark.slow) for n in ("arm", "quadrotor"))]
+)
+def test_no_plant_of_the_box_leaves_its_certificate(name):
+    """The plants run in a loop in numpy that is that of `simulate`; with three quarters of the bound of errors some leave."""
+    stated = certificate(name)
+    assert stated.holds, stated
+    plants = certified.drawn(stated.box, 100)
+    found = certified.runs(name, stated, plants)
+    assert not certified.violating(stated, found).any()
+    narrow = replace(stated, error={n: 0.75 * e for n, e in stated.error.items()})
+    assert certified.violating(narrow, found).any()
+    run = fp.simulate(stated.problem.with_exact(plants[0]), stated.controller, seed=0)
+    assert np.abs(run["state"] - found[0][:-1, :, 0]).max() < 1e-12
+    assert np.abs(run["command"] - found[1][:, :, 0]).max() < 1e-11
+
+
+def test_plans_with_room_do_not_depend_on_the_plant():
+    """Bit by bit, also where the commands differ; without a stated room they have what the deformation leaves."""
+    problem, controller = task("tanks")
+    problem = replace(problem, duration=1.0)
+    other = problem.with_exact(1.04 * problem.plant.exact)
+    one, two = (fp.simulate(p, controller, seed=0) for p in (problem, other))
+    assert np.abs(one["command"] - two["command"]).max() > 1e-3
+    for name in ("planned", "target", "nominal"):
+        assert np.array_equal(one[name], two[name])
+    assert np.abs(one["planned.Q1"]).max() <= 4.0 - 0.4 + 1e-9
+    without = replace(controller, replanning=replace(controller.replanning, room=None))
+    one, two = (fp.simulate(p, without, seed=0) for p in (problem, other))
+    assert not np.array_equal(one["planned"], two["planned"])
+
+
+def pushed(period: float = 0.01, gain: float = 1.0) -> tuple[fp.Problem, fp.ComputedTorque]:
+    """A mass on a spring that follows a sine, with a limit of its speed."""
+    plant = fp.Plant(
+        coordinates={"q": "m"},
+        inputs={"F": "N"},
+        response=lambda q, v, u, p: {"q": (u.F - 3.0 * q.q**3) / p.m},
+        parameters={"m": fp.Parameter(1.3, 1.0, "kg")},
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"q": ca.sin(t)}),
+        start={"q": 0.0, "q'": 1.0},
+        period=period,
+        duration=3.0,
+        limits=fp.Limits(inputs={"F": (-10.0, 10.0)}, states={"q'": (-1.1, 1.1)}),
+    )
+    return problem, fp.ComputedTorque(fp.Exponential(5.0, integral=False), fp.ModelReferenced(fp.Affine(-2 * gain)))
+
+
+def test_a_reference_is_certified_too_and_the_tube_vanishes_with_the_period():
+    """The bounds are of the order of the period, and tend to half of them with half of it."""
+    tubes = []
+    for period in (0.01, 0.005, 0.0025):
+        stated = fp.certify_limits(*pushed(period), mismatch=5)
+        assert stated.holds, stated
+        assert len(stated.lower) == round(3.0 / period)  # every cycle of the run, to its end
+        tubes.append(stated.tube["q'"])
+    assert all(0.35 < later / before < 0.55 for before, later in pairwise(tubes))
+
+
+def test_a_smaller_box_has_a_narrower_tube_and_pieces_have_too():
+    wide, narrow = (fp.certify_limits(*pushed(), mismatch=m).tube["q"] for m in (8, 4))
+    assert 0.35 < narrow / wide < 0.5
+    assert fp.certify_limits(*pushed(), mismatch=8, pieces=2).tube["q"] < 0.6 * wide
+
+
+def test_margins_of_a_horizon_are_kept_and_widened():
+    """Those that it has are the least; only limits that may be passed get more."""
+    problem, controller = task("body")
+    margins = {"w1": (0.05,) * 30, "w2": (0.0,) * 30}
+    own = replace(problem, horizon=replace(problem.horizon, margins=margins))
+    stated = fp.certify_limits(own, controller, mismatch=5)
+    assert stated.holds
+    assert stated.problem.horizon.margins == margins
+    added = certificate("body").problem.horizon.margins
+    assert 0.0 < max(added["w1"]) < 0.05
+
+
+def test_bounds_that_do_not_close_are_refused():
+    """The third level has no input: in one piece its bounds feed those of the flows, and grow without end."""
+    problem, controller = task("tanks")
+    stated = fp.certify_limits(replace(problem, duration=3.0), controller, mismatch=8)
+    assert "the bounds do not close" in stated.failures[0]
+    assert "of 'h3' first" in stated.failures[0]
+    assert not stated.holds
+    assert not stated.error
+
+
+def limited(**limits):
+    problem, controller = pushed()
+    return replace(problem, limits=fp.Limits(**limits)), controller
+
+
+@pytest.mark.parametrize(
+    ("loop", "mismatch", "words"),
+    [
+        (limited(inputs={"F": (-2.0, 10.0)}, states={"q'": (-0.9, 0.9)}), 5, r"may pass its limits \(-0.9, 0.9\) by"),
+        (limited(inputs={"F": (-1.0, 1.0)}), 5, "clips a command at t = "),
+        (pushed(gain=1.5), 10, "need not contract"),  # 1.5 * 1.3 / 0.9 is above 2
+    ],
+)
+def test_what_fails_is_named(loop, mismatch, words):
+    with pytest.raises(AssertionError, match=words):
+        assert not fp.certify_limits(*loop, mismatch=mismatch).failures
+
+
+def test_a_limit_of_an_input_that_is_too_narrow_is_named_with_its_amount():
+    problem, controller = pushed()
+    low, high = fp.certify_limits(problem, controller, mismatch=20).commands["F"]
+    tight = replace(problem, limits=fp.Limits(inputs={"F": (low + 0.1, high)}))
+    assert "by 0.1;" in fp.certify_limits(tight, controller, mismatch=20).failures[0]
+
+
+MAP = fp.ModelReferenced(fp.Affine(-2.0))
+
+
+@pytest.mark.parametrize(
+    ("words", "changes"),
+    [
+        ("must not integrate", {"tracking": fp.Exponential(5.0)}),
+        ("must be ModelReferenced", {"deformation": fp.Affine(-2.0)}),
+        ("without dead time, lag", {"deformation": replace(MAP, lag=0.1)}),
+        ("without dead time, lag", {"deformation": fp.ModelReferenced(fp.Filtered(fp.Affine(-2.0), pole=0.5))}),
+    ],
+)
+def test_controllers_that_the_theorem_does_not_cover_are_refused(words, changes):
+    problem, controller = pushed()
+    with pytest.raises(NotSupported, match=words):
+        fp.certify_limits(problem, replace(controller, **changes), mismatch=5)
+
+
+def test_what_else_the_theorem_does_not_cover_is_refused():
+    problem, controller = pushed()
+    tanks, planned = task("tanks")
+    with pytest.raises(NotSupported, match="disturbances"):
+        fp.certify_limits(replace(problem, disturbances={"q": fp.Noise(0.1)}), controller, mismatch=5)
+    with pytest.raises(NotSupported, match="exact parameters of every plant"):
+        fp.certify_limits(problem, fp.ExactModel(controller), mismatch=5)
+    for ways, words in (
+        (fp.FromMeasurement(), "FromPlan"),
+        (replace(planned.replanning, room=None), "depend on the plant"),
+    ):
+        with pytest.raises(NotSupported, match=words):
+            fp.certify_limits(tanks, replace(planned, replanning=ways), mismatch=5)
+    for room, words, error in (
+        ({"Q3": 1.0}, "'Q3' is unknown", InvalidName),
+        ({"Q1": 2.0}, "leaves nothing", InvalidProblem),
+    ):
+        with pytest.raises(error, match=words):
+            replace(planned, replanning=replace(planned.replanning, room=room)).check(tanks)
+    with pytest.raises(InvalidValue, match="room"):
+        replace(planned.replanning, room={"Q1": -1.0})
