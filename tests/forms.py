@@ -82,6 +82,11 @@ def moved(plant: fp.Plant, order: int, /, **settings: Any) -> tuple[fp.Problem, 
     ), order
 
 
+def filtered(speed: str) -> fp.KalmanFilter:
+    """What believes a speed from y."""
+    return fp.KalmanFilter(measured={"y": 1e-3}, noise={speed: 5.0})
+
+
 LATE: dict[str, Any] = {"dead_time": fp.DeadTime(inputs={"F": CYCLE}, measurement=CYCLE)}
 ENCODER: dict[str, Any] = {"sensors": {"y": fp.Sensor()}, "estimator": fp.PositionDifference()}
 SEEN = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
@@ -96,6 +101,8 @@ FORMS = {
     "late": moved(chain(2), 2, **LATE),
     "late curve": moved(CURVE, 1, **LATE),
     "encoder": moved(chain(2), 2, sensing=fp.Sensing(**ENCODER)),
+    "believed": moved(MASS, 2, sensing=fp.Sensing(**ENCODER, measured=("y",), observer=filtered("w"))),
+    "believed map": moved(STEPS, 2, sensing=fp.Sensing(measured=("y",), observer=filtered("z"))),
     "reality": moved(chain(2), 2, reality=fp.Reality(MASS, start={"a": 0.1, "w": 0.0})),
     "outside": moved(chain(2), 2, reality=fp.ExternalPlant(Body(), measures=SEEN)),
 }

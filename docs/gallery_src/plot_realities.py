@@ -76,7 +76,7 @@ fine = fp.RungeKutta4(substeps=4)
 realities = {
     "model's own": None,
     **{
-        f"actuator {1e3 * tau:g} ms": fp.Reality(lag(tau), integrator=fine)
+        f"actuator {1e3 * tau:g} ms": fp.Reality(lag(tau), start={"F": 0.0}, integrator=fine)
         for tau in (1e-3, 3e-3, 1e-2, 2e-2, 3e-2)
     },
     **{
@@ -85,9 +85,9 @@ realities = {
         )
         for damping in (0.05, 0.2, 0.8)
     },
-    "bristles": fp.Reality(friction, integrator=fine),
-    "sensor 3 ms": fp.Reality(sensor(3e-3), seen={"x": "s"}, integrator=fine),
-    "sensor 30 ms": fp.Reality(sensor(3e-2), seen={"x": "s"}, integrator=fine),
+    "bristles": fp.Reality(friction, start={"z": 1e-4}, integrator=fine),
+    "sensor 3 ms": fp.Reality(sensor(3e-3), {"s": 0.0}, fine, {"x": "s"}),
+    "sensor 30 ms": fp.Reality(sensor(3e-2), {"s": 0.0}, fine, {"x": "s"}),
 }
 
 problem = fp.Problem(

@@ -28,7 +28,6 @@ from fpirhc.symbolic.layout import Expression
 from fpirhc.task.dead_time import MEASUREMENT
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
-from fpirhc.task.reality import Equations
 
 _TOLERANCE = 1e-7
 _STEPS = 100_000
@@ -124,10 +123,24 @@ def _rest(problem: Problem, parameters: np.ndarray) -> np.ndarray | None:
     wanted = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
     places = [plant.output.elements.index(name) for name in plant.controlled_names]
     off = plant.equations.output(x, u, p, calm)[places] - wanted[places]
-    root = Equations(ca.vertcat(x, u), [p], ca.vertcat(drift, off)).root(
-        np.concatenate([problem.start_state, problem.inputs_before]), parameters
-    )
-    return None if root is None else root.at[: plant.state.size]
+    moved, left = ca.vertcat(x, u), ca.vertcat(drift, off)
+    values = ca.Function("fpirhc_rest", [moved, p], [ca.densify(left), ca.densify(ca.jacobian(left, moved))])
+    at = np.concatenate([problem.start_state, problem.inputs_before])
+    for _ in range(_NEWTON):
+        residual, slope = (np.asarray(m.full()) for m in values(at, parameters))
+        if not (np.isfinite(residual).all() and np.isfinite(slope).all()):
+            return None
+        sizes = np.abs(slope).max(axis=1, initial=0.0)  # rows differ by powers of the fastest rate
+        sizes[sizes == 0] = 1.0
+        # The shortest of the steps that solve the linear equations best: where many points are at rest, to a near one.
+        step = np.linalg.lstsq(slope / sizes[:, None], -residual.ravel() / sizes, rcond=None)[0]
+        at += step
+        if np.abs(step).max(initial=0.0) <= _SMALL * (1 + np.abs(at).max(initial=0.0)):
+            return at[: plant.state.size]
+    return None
+
+
+_NEWTON, _SMALL = 60, 1e-10  # steps, and the last one, relative
 
 
 def _cycle(problem: Problem, places: list[int]) -> ca.Function:

@@ -312,7 +312,7 @@ class Problem(Checked):
         Raises:
             InvalidProblem: a reality whose own states neither are given nor settle.
         """
-        return self.truth.start_state(self.plant, self.start_state, self.inputs_before)
+        return self.truth.start_state(self.plant, self.start_state)
 
     @property
     def real_parameters(self) -> np.ndarray:

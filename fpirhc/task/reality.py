@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
@@ -36,9 +34,7 @@ class Reality(Checked):
         plant: with the model's inputs, and a coordinate or an output of the same name and unit for what is measured, controlled or
             judged of the model; without an observer that is all of it. Its exact parameters act; the approximate ones are not used,
             unless it is the model of an `ExactModel`.
-        start: first values of states that the model does not have. Of those that are not named, the one on which a derivative of
-            the model's state depends starts where this derivative is the model's, as a speed does. The others settle: their rates
-            are zero while the model's states and the inputs before the first cycle are held.
+        start: first values of all states that the model does not have.
         integrator: of its motion; None: the problem's.
         seen: coordinate or output of the model -> coordinate of the reality that is measured in its place, such as the output of
             a slow sensor. Errors are judged at the coordinate of the same name where there is one.
@@ -168,77 +164,26 @@ class Reality(Checked):
         wanted = [(self._own(e.rstrip("'"), seen=seen), e.count("'")) for e in quantities]
         return derivatives_function(self.plant, wanted)
 
-    def start_state(self, model: Plant, start: np.ndarray, command: np.ndarray) -> np.ndarray:
+    def start_state(self, model: Plant, start: np.ndarray) -> np.ndarray:
         """Return the first state of the reality, shape (its nx,).
 
         Args:
             model: of the problem.
             start: first state of the model, shape (nx,).
-            command: inputs before the first cycle, shape (nu,).
 
         Raises:
-            InvalidProblem: states that are not named in `start` and have no equilibrium, or a derivative of the model's state that
-                depends on several of them.
+            InvalidProblem: a state that neither the model nor `start` says.
         """
         elements = self.plant.state.elements
         shared = {elements[there]: start[own] for own, there in self.shared(model).items()}
         known = {**shared, **self.start}
-        first = np.array([float(known.get(e, 0.0)) for e in elements])
-        free = [k for k, e in enumerate(elements) if e not in known]
-        tied = self._tied(model, start, free)
-        at_rest = settled(self.plant, first, command, self.plant.exact, free, tied) if free else first
-        if at_rest is None:
-            missing = ", ".join(elements[k] for k in free)
+        free = [e for e in elements if e not in known]
+        if free:
             raise InvalidProblem(
-                f"reality: its states {missing} have no equilibrium at the start of the model; give their first values: "
-                f"Reality(start={{'{elements[free[0]]}': ...}})"
+                f"reality: it has states that the model does not have: {', '.join(free)}; give their first values: "
+                f"Reality(start={{{', '.join(f'{e!r}: ...' for e in free)}}})"
             )
-        self._check_shown_start(model, start, at_rest, command)
-        return at_rest
-
-    def _tied(self, model: Plant, start: np.ndarray, free: Sequence[int]) -> dict[int, Tied]:
-        """Return what the derivatives of the model's start say of states that are no derivatives here, by place of the state.
-
-        `start`: first state of the model, shape (nx,).
-        """
-        shared, elements = self.shared(model), self.plant.state.elements
-        tied: dict[int, Tied] = {}
-        for k, e in enumerate(model.state.elements):
-            if k in shared or not e.endswith("'") or self.true_name(e.rstrip("'")) not in self.plant.coordinates:
-                continue
-            value = self.function([e])
-            x, u, p = self.plant.symbols()
-            on = set(ca.jacobian_sparsity(value(x, u, p, 0), x).get_triplet()[1]) & set(free)
-            if len(on) > 1:
-                names = ", ".join(elements[i] for i in sorted(on))
-                raise InvalidProblem(
-                    f"reality: {e} is {start[k]:.4g} at the start of the model and depends on its states {names}; give the first "
-                    f"values of all but one: Reality(start={{'{elements[min(on)]}': ...}})"
-                )
-            for i in on & set(tied):
-                raise InvalidProblem(
-                    f"reality: {e} and another derivative at the start of the model say what its state {elements[i]} is; give its "
-                    f"first value: Reality(start={{'{elements[i]}': ...}})"
-                )
-            tied |= {i: (value, float(start[k])) for i in on}
-        return tied
-
-    def _check_shown_start(self, model: Plant, start: np.ndarray, first: np.ndarray, command: np.ndarray) -> None:
-        """Raise if outputs stand for the model's coordinates, no start is stated, and they start elsewhere than the model."""
-        hidden = [
-            e for e in self.shown(model.state.elements) if self.true_name(e.rstrip("'")) not in self.plant.coordinates
-        ]
-        if model.outputs or self.start or not hidden:
-            return
-        values = self.function(hidden)(first, command, self.plant.exact, np.zeros(len(self.plant.names)))
-        own = dict(zip(hidden, np.asarray(values.full()).ravel(), strict=True))
-        for name in hidden:
-            wanted = start[model.state.elements.index(name)]
-            if not abs(own[name] - wanted) <= 1e-6 * (1 + abs(wanted)):
-                raise InvalidProblem(
-                    f"reality: its output '{name}' starts at {own[name]:.4g}, that of the model at {wanted:.4g}; give first values "
-                    f"of its states: Reality(start={{'{self.plant.state.elements[0]}': ...}})"
-                )
+        return np.array([float(known[e]) for e in elements])
 
     def shared(self, model: Plant) -> dict[int, int]:
         """Return the places of the states that both have: place in the model's state -> place in its own."""
@@ -399,98 +344,3 @@ def _check_expression(plant: Plant, seen: Mapping[str, str], model: Plant, name:
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
             "model; give the model this order, or the reality an actuator"
         )
-
-
-Tied = tuple[ca.Function, float]  # (state, input, parameters, forcing) -> a quantity, and its value at the start
-_REST = 1e-8  # largest rate of a state at rest, as a share of its rate at the first guess
-
-
-def settled(
-    plant: Plant,
-    state: np.ndarray,
-    command: np.ndarray,
-    parameters: np.ndarray,
-    free: Sequence[int],
-    tied: Mapping[int, Tied] = MappingProxyType({}),
-) -> np.ndarray | None:
-    """Return the state in which the rates of its free entries are zero; None where there is no such state.
-
-    Where many values are at rest, a near one is taken, see `fpirhc.task.reality`.
-
-    Args:
-        state: shape (nx,); its free entries are the first guess.
-        command: held input, shape (nu,).
-        parameters: shape (np,).
-        tied: by place of a free entry, a quantity that has a value there, in place of its rate.
-    """
-    places = list(free)
-    held, u, p = plant.symbols()
-    x = ca.SX(held)
-    moving = ca.SX.sym("moving", len(places))
-    x[places] = moving
-    left = plant.equations.rate(x, u, p)
-    for place, (quantity, value) in tied.items():
-        left[place] = quantity(x, u, p, 0) - value
-    root = Equations(moving, [held, u, p], left[places]).root(state[places], state, command, parameters)
-    if root is None or root.left > _REST * max(1.0, root.first):
-        return None
-    at = np.array(state, dtype=float)
-    at[places] = root.at
-    return at
-
-
-_STEPS = 60
-_SMALL = 1e-10  # last step, relative
-
-
-@dataclass(frozen=True, eq=False)
-class Root:
-    """Where Newton's method has come to rest.
-
-    Args:
-        at: the unknowns, shape (n,).
-        left: largest equation before the last step, each in units of its largest slope. It is large where the method rests at a
-            point that solves nothing.
-        first: the same at the guess.
-    """
-
-    at: npt.NDArray[np.float64]
-    left: float
-    first: float
-
-
-class Equations:
-    """Equations r(z, data) = 0.
-
-    Args:
-        unknown: z, a column of symbols.
-        known: the data, symbols.
-        residual: r, expressions of both.
-    """
-
-    def __init__(self, unknown: ca.SX, known: Sequence[ca.SX], residual: ca.SX) -> None:
-        slope = ca.jacobian(residual, unknown)
-        both = [ca.densify(residual), ca.densify(slope)]
-        self._values = ca.Function("fpirhc_equations", [unknown, *known], both)
-
-    def root(self, guess: npt.NDArray[np.float64], *known: npt.NDArray[np.float64]) -> Root | None:
-        """Return the root that the method finds from a guess; None where it does not come to rest, or meets what is no number.
-
-        A step is the shortest of those that solve the linear equations best, z - r'(z)^+ r(z): where many points are roots it
-        goes to a near one.
-        """
-        at, first = np.array(guess, dtype=float), None
-        for _ in range(_STEPS):
-            residual, slope = (np.asarray(m.full()) for m in self._values(at, *known))
-            if not (np.isfinite(residual).all() and np.isfinite(slope).all()):
-                return None
-            sizes = np.abs(slope).max(axis=1, initial=0.0)  # rows differ by powers of the fastest rate
-            sizes[sizes == 0] = 1.0
-            scaled = residual.ravel() / sizes
-            left = float(np.abs(scaled).max(initial=0.0))
-            first = left if first is None else first
-            step = np.linalg.lstsq(slope / sizes[:, None], -scaled, rcond=None)[0]
-            at += step
-            if np.abs(step).max(initial=0.0) <= _SMALL * (1 + np.abs(at).max(initial=0.0)):
-                return Root(at, left, first)
-        return None

@@ -79,7 +79,7 @@ camera = fp.Sensor(noise=fp.Noise(2e-4))  # m
 
 problem = fp.Problem(
     plant=plant,
-    reality=fp.Reality(table),
+    reality=fp.Reality(table, start={"along": 0.0, "across": 0.0}),
     reference=fp.Trajectory(eight),
     start={"x": 0.05, "y": -0.05},
     period=2e-2,  # s

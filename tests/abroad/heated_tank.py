@@ -36,7 +36,7 @@ valve = fp.Plant(
 )
 problem = fp.Problem(
     plant=plant,
-    reality=fp.Reality(plant=valve),
+    reality=fp.Reality(plant=valve, start={"w": 10.0}),
     reference=fp.Trajectory(lambda t: {"T": 30 + 10 * ca.sin(0.1 * t)}),
     start={"T": 20.0},
     input_before={"u": 10.0},

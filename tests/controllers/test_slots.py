@@ -247,21 +247,22 @@ def masses_by_states() -> fp.Plant:
 
 @pytest.mark.parametrize("name", ["slots", "slots+FPI"])
 @pytest.mark.parametrize(
-    "reality", [lambda: SHIPPED.mass_spring_slots.problem.plant, masses_by_states], ids=["same", "by states"]
+    "reality",
+    [
+        lambda: fp.Reality(SHIPPED.mass_spring_slots.problem.plant),
+        lambda: fp.Reality(masses_by_states(), start=dict.fromkeys(("w2", "w1", "between", "total"), 0.0)),
+    ],
+    ids=["same", "by states"],
 )
 def test_slots_read_their_responses_from_a_reality(name, reality):
     """A reality that is the plant itself, or its equations in other states, is the plant: over a switch, with a wrong model."""
     problem = replace(SHIPPED.mass_spring_slots.problem, duration=1.5, measure_from=0.0)
     plain = run(problem, SHIPPED.mass_spring_slots.controllers[name])
-    real = run(replace(problem, reality=fp.Reality(reality())), SHIPPED.mass_spring_slots.controllers[name])
+    real = run(replace(problem, reality=reality()), SHIPPED.mass_spring_slots.controllers[name])
     assert len(switches(real)) == 1
     for signal in ("state", "command", "realised", "deformed"):
         scale = np.abs(plain[signal]).max()
         np.testing.assert_allclose(real[signal] / scale, plain[signal] / scale, atol=1e-9, err_msg=signal)
-    assert (
-        "a reality moves"
-        in SHIPPED.mass_spring_slots.controllers[name].notes(replace(problem, reality=fp.Reality(reality())))[0]
-    )
 
 
 # Switches
@@ -448,23 +449,8 @@ def slotted(*names: str) -> fp.Slotted:
     )
 
 
-def test_zero_dynamics_that_diverge_little_are_accepted():
-    """A cart slot shorter than 1.32 s, or one whose growth is allowed."""
-    brief = replace(SHIPPED.cart_pole_slots.problem, duration=0.02, measure_from=0.0)
-    run(brief, pole_slots(schedule=fp.Periodic({"angle": 0.5, "cart": 1.31})))
-    run(brief, pole_slots(schedule=fp.Periodic({"angle": 0.5, "cart": 1.4}), largest_growth=150.0))
-
-
 @pytest.mark.parametrize(
-    "changed",
-    [
-        {"blend": -1.0},
-        {"blend": "a"},
-        {"blank": 1.5},
-        {"smallest_gain": 1.0},
-        {"smallest_gain": "a"},
-        {"largest_growth": 1},
-    ],
+    "changed", [{"blend": -1.0}, {"blend": "a"}, {"blank": 1.5}, {"smallest_gain": 1.0}, {"smallest_gain": "a"}]
 )
 def test_numbers_out_of_range(changed):
     ((name, value),) = changed.items()

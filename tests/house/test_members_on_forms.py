@@ -120,7 +120,7 @@ REFUSED: dict[tuple[str, str], str] = {
     **{("Sigmoid 11", form): WRONG_SIGN for form in FORMS},
     **{("Sigmoid 12", form): WRONG_SIGN for form in FORMS},
     **{("FullSpaceFixedPoint 2", form): "serves problems without limits only (it is a baseline)" for form in FORMS},
-    **{("Paired 15", form): WRONG_PAIR for form in ("map", "encoder", "believed", "believed map")},
+    **{("Paired 13", form): WRONG_PAIR for form in ("map", "encoder", "believed", "believed map")},
     ("Estimating", "states"): NO_FILTER,
     ("Estimating", "believed"): NO_FILTER,
     ("ADRC", "at once"): "ADRC observes a chain of integrators, and the command moves 'y' at once (order 0)",
@@ -139,7 +139,7 @@ REFUSED: dict[tuple[str, str], str] = {
 }
 YOUNG = "order 1", "curve", "at once", "late", "late curve"
 FARTHER = {  # pairs that are served and leave their reference
-    **{("Paired 15", form): "its pairs are three cycles old, where nothing is late by three" for form in YOUNG},
+    **{("Paired 13", form): "its pairs are three cycles old, where nothing is late by three" for form in YOUNG},
     ("Sigmoid 9", "order 3"): "its scale of 1 m/s^3 is less than the change that a cycle asks for",
 }
 

@@ -257,7 +257,8 @@ def test_a_plant_with_outputs_behind_a_lag_is_judged_at_its_own_outputs() -> Non
         outputs=dict(model.outputs),
         time_unit="min",
     )
-    problem = replace(sedated(model), reality=fp.Reality(real, integrator=fp.RungeKutta4(substeps=4)))
+    settled = {"pump": float(sedated(model).inputs_before[0])}
+    problem = replace(sedated(model), reality=fp.Reality(real, settled, fp.RungeKutta4(substeps=4)))
     law = fp.Exponential(rate=1.0)
     errors = [depth_error(problem, fp.ComputedTorque(law, map)) for map in (fp.Identity(), fp.Affine(-1.0))]
     assert errors[1] < 0.5 * errors[0]

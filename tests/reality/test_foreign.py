@@ -365,7 +365,7 @@ def test_contraction_is_identified_where_the_response_is_measured():
 
 def test_lagged_body_is_the_lagged_reality():
     """An actuator outside is what an actuator in symbols is: two ways to the same run."""
-    problem = task(reality=fp.Reality(lagged(), integrator=fp.RungeKutta4(substeps=8)))
+    problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}, integrator=fp.RungeKutta4(substeps=8)))
 
     class Actuated(Wrapped):
         """Y'' = 2 F, F exactly exponential within a cycle, y by the closed form."""

@@ -56,7 +56,7 @@ def test_range_in_a_later_chunk_of_cycles():
 
 def test_state_of_a_reality_and_of_a_body_outside():
     """The state that counts is that of what moves: the reality's force, the measured coordinate of an object."""
-    real = fp.Reality(replace(lagged(), ranges={"F": (-5.0, 0.5)}))
+    real = fp.Reality(replace(lagged(), ranges={"F": (-5.0, 0.5)}), start={"F": 0.0})
     result = run(task(reality=real))
     assert "state 'F' is " in str(result.stop)
     assert np.all(result["reality_state.F"] <= 0.5)

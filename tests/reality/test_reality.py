@@ -120,17 +120,17 @@ def test_model_as_what_moves_shows_its_own_outputs_and_responses(name):
 def test_no_reality_is_no_setting():
     """A problem without one is described as before, so that its baselines stay valid."""
     assert "reality" not in describe(task())
-    assert describe(task(reality=fp.Reality(lagged())))["reality"]["is"] == "Reality"
+    assert describe(task(reality=fp.Reality(lagged(), start={"F": 0.0})))["reality"]["is"] == "Reality"
 
 
 def test_table_of_a_problem_names_the_reality():
     """A reader of a notebook sees what moves."""
-    assert "y of order 2, F of order 1" in task(reality=fp.Reality(lagged()))._repr_html_()
+    assert "y of order 2, F of order 1" in task(reality=fp.Reality(lagged(), start={"F": 0.0}))._repr_html_()
 
 
 def test_lagged_reality_moves_as_the_matrix_exponential_says():
     """The commands of the run, held over each cycle, move the exact discretisation of y'' = b F, tau F' = u - F alike."""
-    reality = fp.Reality(lagged(), integrator=fp.RungeKutta4(substeps=4))
+    reality = fp.Reality(lagged(), start={"F": 0.0}, integrator=fp.RungeKutta4(substeps=4))
     result = run(task(reality=reality), CONTROLLERS["plain form"])
     a = np.array([[0, 1, 0], [0, 0, 2.0], [0, 0, -1 / TAU]])
     whole = expm(np.block([[a, np.array([[0], [0], [1 / TAU]])], [np.zeros((1, 4))]]) * PERIOD)
@@ -147,7 +147,7 @@ def test_lagged_reality_moves_as_the_matrix_exponential_says():
 
 def test_slow_sensor_is_seen_and_the_true_coordinate_is_judged():
     """The controller is given s, s' and s''; the error that counts is that of y."""
-    result = run(task(reality=fp.Reality(slow_sensor(), seen={"y": "s"})), CONTROLLERS["plain form"])
+    result = run(task(reality=fp.Reality(slow_sensor(), start={"s": 0.1}, seen={"y": "s"})), CONTROLLERS["plain form"])
     y, s, speed = (result[f"reality_state.{name}"] for name in ("y", "s", "y'"))
     assert np.array_equal(result["state.y"], s)
     assert np.allclose(result["state.y'"], (y - s) / TAU, rtol=1e-12, atol=1e-15)
@@ -173,7 +173,7 @@ def test_a_sensor_in_place_of_an_output_stands_beside_the_model_s_own_state(sens
         response=lambda q, u, p: {"a": p.b * u.u - q.a, "s": (2 * q.a - q.s) / TAU + u.u},
         controlled=("y",),
     )
-    reality = fp.Reality(sensed, seen={"y": "s"})
+    reality = fp.Reality(sensed, start={"s": 0.1}, seen={"y": "s"})
     shared: dict[str, Any] = {"plant": model, "reality": reality, "horizon": None, "cost": None, "sensing": sensing}
     result = run(task(**shared, start={"a": 0.05}), CONTROLLERS["plain form"])
     assert np.array_equal(result["state.a"], result["reality_state.a"])
@@ -182,17 +182,15 @@ def test_a_sensor_in_place_of_an_output_stands_beside_the_model_s_own_state(sens
     assert not np.allclose(result["output.y"], result["plant_output.y"], atol=1e-3)
 
 
-def test_states_of_its_own_settle_or_are_given():
-    """An actuator begins at the input before the first cycle, a sensor at what it measures, and a named state where it is put."""
-    actuated = task(reality=fp.Reality(lagged()), input_before={"u": 3.0})
-    assert np.allclose(actuated.real_start, [0.1, 3.0, 0.0], atol=1e-12)
-    assert np.allclose(task(reality=fp.Reality(slow_sensor(), seen={"y": "s"})).real_start, [0.1, 0.1, 0.0], atol=1e-12)
-    assert np.allclose(task(reality=fp.Reality(lagged(), start={"F": -2.0})).real_start, [0.1, -2.0, 0.0])
+def test_states_of_its_own_start_as_stated_and_the_others_as_the_model():
+    assert task(reality=fp.Reality(lagged(), start={"F": -2.0})).real_start.tolist() == [0.1, -2.0, 0.0]
+    elsewhere = fp.Reality(lagged(), start={"F": 0.0, "y'": 0.5})
+    assert task(reality=elsewhere).real_start.tolist() == [0.1, 0.0, 0.5]
 
 
 def test_disturbance_of_a_state_that_the_model_does_not_have():
     """A push on the actuator's force is attached by the reality's name; the model's own plant leaves it out."""
-    problem = task(reality=fp.Reality(lagged()), disturbances={"F": fp.Step(0.0, 100.0)})
+    problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}), disturbances={"F": fp.Step(0.0, 100.0)})
     calm = replace(problem, disturbances={})
     assert run(problem)["reality_state.F"][5] > run(calm)["reality_state.F"][5] + 0.3
     assert problem.of_model.disturbances == {}
@@ -205,22 +203,22 @@ def test_disturbance_of_a_state_that_the_model_does_not_have():
 def test_exact_model_is_refused_where_the_reality_has_other_coordinates():
     """The controller is given y and y' only, so it cannot have a model with a force."""
     with pytest.raises(NotSupported, match="the coordinate F, which the controller is not given"):
-        run(task(reality=fp.Reality(lagged())), fp.ExactModel(CONTROLLERS["computed torque"]))
+        run(task(reality=fp.Reality(lagged(), start={"F": 0.0})), fp.ExactModel(CONTROLLERS["computed torque"]))
 
 
 def test_contraction_is_that_of_a_whole_cycle():
     """Behind the lag a request has done b / b^ (1 - exp(-T / tau)) to the response by the end of its cycle."""
-    result = run(task(reality=fp.Reality(lagged())), fp.ComputedTorque(TRACK, FPI))
+    result = run(task(reality=fp.Reality(lagged(), start={"F": 0.0})), fp.ComputedTorque(TRACK, FPI))
     expected = 1 - FPI.effective_gain() * 2.0 * (1 - np.exp(-PERIOD / TAU))
     assert np.allclose(result["contraction"], expected, atol=1e-6)
 
 
 def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
     """The command has no effect at once, but its sign is known at the end of the cycle."""
-    problem = task(reality=fp.Reality(lagged(gain=-2.0)))
+    problem = task(reality=fp.Reality(lagged(gain=-2.0), start={"F": 0.0}))
     with pytest.raises(NotContractive):
         checked(problem, CONTROLLERS["plain form"])
-    checked(task(reality=fp.Reality(lagged())), CONTROLLERS["plain form"])
+    checked(task(reality=fp.Reality(lagged(), start={"F": 0.0})), CONTROLLERS["plain form"])
 
 
 # Mistakes
@@ -255,14 +253,15 @@ MISTAKES = {
         lambda: fp.Reality(lagged(), start={"force": 1.0}),
         "start: state 'force' is unknown. Valid: y, F, y'",
     ),
-    "unknown sensor": (lambda: fp.Reality(lagged(), seen={"y": "Y"}), "coordinate of the reality 'Y' is unknown"),
-    "no equilibrium": (
-        lambda: fp.Reality(
-            replace(lagged(), response=lambda q, v, u, p: {"y": p.b * q.F, "F": (1 + (u.u - q.F) ** 2) / p.tau})
-        ),
-        r"F have no equilibrium .* Reality\(start=\{'F': ...\}\)",
+    "unknown sensor": (
+        lambda: fp.Reality(lagged(), start={"F": 0.0}, seen={"y": "Y"}),
+        "coordinate of the reality 'Y' is unknown",
     ),
-    "stiff": (lambda: fp.Reality(lagged(tau=1e-4)), r"pole -1e\+04 1/s, .* is 10, .*RungeKutta4\(substeps=5\)"),
+    "no start": (lambda: fp.Reality(lagged()), r"does not have: F; give .* Reality\(start=\{'F': ...\}\)"),
+    "stiff": (
+        lambda: fp.Reality(lagged(tau=1e-4), start={"F": 0.0}),
+        r"pole -1e\+04 1/s, .* is 10, .*RungeKutta4\(substeps=5\)",
+    ),
 }
 
 
@@ -275,7 +274,7 @@ def test_mistakes_are_named(mistake):
 
 def test_the_named_sub_steps_would_do():
     """With five sub-steps the stiff lag moves as its exact discretisation, and the run is finite."""
-    reality = fp.Reality(lagged(tau=1e-4), integrator=fp.RungeKutta4(substeps=5))
+    reality = fp.Reality(lagged(tau=1e-4), start={"F": 0.0}, integrator=fp.RungeKutta4(substeps=5))
     result = run(task(reality=reality))
     assert result.stop is None
     assert np.allclose(result["reality_state.F"][1:], np.asarray(result["command"])[:-1, 0], rtol=1e-3, atol=1e-3)

@@ -67,7 +67,7 @@ def test_a_map_has_no_lag():
     assert with_believed_way(yearly, fp.ModelReferenced(MAP, lag=1.0)) is yearly
 
 
-@pytest.mark.parametrize("reality", [None, fp.Reality(behind_actuators(plant(1.0), (LAG,)))])
+@pytest.mark.parametrize("reality", [None, fp.Reality(behind_actuators(plant(1.0), (LAG,)), start={"u_acting": 0.0})])
 def test_a_believed_lag_is_a_part_of_the_right_model(reality):
     """Beside a plant without lag and beside a real one: it leaves a right model alone, and no form is advised."""
     answer = asked(task(reality=reality), fp.ModelReferenced(MAP, lag=LAG))
@@ -102,7 +102,7 @@ def test_the_form_in_use_is_never_advised():
 def test_a_comparison_asks_the_same():
     adapting = fp.ComputedTorque(LAW, fp.ModelReferenced(MAP, lag=LAG))
     shipped = fp.load_problem("two_mass")
-    real = fp.Reality(behind_actuators(plant(1.0), (LAG,)))
+    real = fp.Reality(behind_actuators(plant(1.0), (LAG,)), start={"u_acting": 0.0})
     pair = {"CTC": fp.ComputedTorque(LAW), "CTC+FPI": adapting}
     made = replace(shipped, problem=task(reality=real, duration=2.0), controllers=pair, headline=("CTC", "CTC+FPI"))
     null = fp.compare(made, seed=0, compiled=False).null

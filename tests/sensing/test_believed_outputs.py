@@ -170,14 +170,14 @@ def integrating(measured: str) -> fp.Problem:
 
 
 WRONG: dict[str, tuple[Callable[[], object], type[FpirhcError], str]] = {
-    
-    
+
+
     "state without an observer": (
         lambda: sedated(None, sensing=fp.Sensing({}, fp.PositionDifference(), measured=["depth", "C"])),
         InvalidProblem,
         "C is given as it is to controllers of a plant with outputs, unless an observer is stated",
     ),
-    
+
     "filter of what is not measured": (
         lambda: sedated(replace(FILTER, measured={"C": 0.1})),
         InvalidProblem,

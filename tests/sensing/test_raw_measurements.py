@@ -90,5 +90,5 @@ def sensed_slowly(gain: float) -> fp.Problem:
         horizon=fp.Horizon(stages=5, step=0.01),
         cost=fp.Quadratic(states={"y": 1e2}, deviation={"u": 0.1}),
         sensing=fp.Sensing(estimator=fp.PositionDifference()),
-        reality=fp.Reality(real, seen={"y": "s"}),
+        reality=fp.Reality(real, start={"s": 0.1 * gain}, seen={"y": "s"}),
     )

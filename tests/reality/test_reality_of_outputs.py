@@ -1,0 +1,315 @@
+"""Realities and foreign bodies of a model with outputs: they have these by name, and states of their own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import fpirhc as fp
+from fpirhc.errors import InvalidProblem, NotSupported
+
+PERIOD = 1 / 12  # min
+TRACK = fp.ComputedTorque(fp.Exponential(rate=1.5))
+FPI = fp.Sigmoid(gain=-2.0, shift=0.3, scale=20.0)
+PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-1))
+FILTER = fp.KalmanFilter(measured={"bis": 1.0}, noise={"c": 0.01, "e": 0.01})
+BELIEVED = fp.Sensing(observer=FILTER)
+FIRST = {"C1": 2.0, "C2": 0.6, "C3": 0.1, "Ce": 1.5}
+START = 93.0 / (1 + (1.5 / 4.1) ** 1.36)
+RATES = (1.9 + 1.1 + 0.84, 1.1, 0.84, 4.27, 16.0, 238.0)  # clearances, l/min, and volumes, l
+
+
+def depth(site: Any, p: Any, top: float) -> Any:
+    """Depth of anaesthesia by the concentration at the effect site."""
+    return top / (1 + (site / p.C50) ** p.steepness)
+
+
+def constants(half: float, steepness: float, speed: float) -> dict[str, fp.Parameter]:
+    return {
+        "C50": fp.Parameter(half, half, "mg/l"),
+        "steepness": fp.Parameter(steepness, steepness, "1"),
+        "ke0": fp.Parameter(speed, speed, "1/min"),
+    }
+
+
+def model(one: str = "c", site: str = "e") -> fp.Plant:
+    """One compartment and an effect site, under free names."""
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {one: -0.3 * x[one] + u.u / 8, site: p.ke0 * (x[one] - x[site])}
+
+    return fp.Plant.of_states(
+        states={one: "mg/l", site: "mg/l"},
+        inputs={"u": "mg/min"},
+        parameters=constants(4.5, 1.5, 0.3),
+        rates=rates,
+        outputs={"bis": fp.Output("1", lambda x, p: depth(x[site], p, 92.0))},
+        time_unit="min",
+    )
+
+
+def moved(x: Any, u: Any, ke0: Any) -> list[Any]:
+    """Rates of the patient, of numbers and of expressions: three compartments and an effect site."""
+    out, fast, slow, blood, muscle, fat = RATES
+    return [
+        (-out * x[0] + fast * x[1] + slow * x[2] + u) / blood,
+        fast / muscle * (x[0] - x[1]),
+        slow / fat * (x[0] - x[2]),
+        ke0 * (x[0] - x[3]),
+    ]
+
+
+def patient(unit: str = "1", output: str = "bis") -> fp.Plant:
+    """Three compartments and an effect site, with another curve."""
+    return fp.Plant.of_states(
+        states=dict.fromkeys(FIRST, "mg/l"),
+        inputs={"u": "mg/min"},
+        parameters=constants(4.1, 1.36, 0.2),
+        rates=lambda x, u, p: dict(zip(FIRST, moved([x[n] for n in FIRST], u.u, p.ke0), strict=True)),
+        outputs={output: fp.Output(unit, lambda x, p: depth(x.Ce, p, 93.0))},
+        time_unit="min",
+    )
+
+
+def lightly(t: Any) -> dict[str, Any]:
+    """From light sedation to 50, and to 45."""
+    return {"bis": 50 + (START - 50) * (1 + t / 1.5) * ca.exp(-t / 1.5) - 5 / (1 + ca.exp(-2 * (t - 12)))}
+
+
+def task(**changes: Any) -> fp.Problem:
+    """The patient, of whom the bis is measured, with the model of one compartment."""
+    settings: dict[str, Any] = {
+        "plant": model(),
+        "reference": fp.Trajectory(lightly),
+        "start": {"c": 1.5, "e": 1.5},
+        "period": PERIOD,
+        "duration": 20.0,
+        "reality": fp.Reality(patient(), start=FIRST),
+        "sensing": BELIEVED,
+        "limits": fp.Limits(inputs={"u": (0.0, 400.0)}),
+        "horizon": fp.Horizon(stages=10, step=3 * PERIOD),
+        "cost": fp.Quadratic(outputs={"bis": 1.0, "bis'": 0.1}, rate={"u": 1e-5}),
+    }
+    return fp.Problem(**(settings | changes))
+
+
+def run(problem: fp.Problem, controller: Any = TRACK) -> fp.Run:
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+# A reality
+
+
+@pytest.mark.parametrize("controller", [TRACK, PLAN], ids=["computed torque", "receding horizon"])
+def test_adaptation_helps_although_no_state_is_the_models(controller):
+    """The bis and its derivatives are measured; what one compartment cannot say is adapted to: at least three times less error."""
+    problem = task(measure_from=5.0)
+    runs = [run(problem, replace(controller, deformation=d)) for d in (fp.Identity(), FPI)]
+    errors = [fp.measure(problem, one).rms_error["bis"] for one in runs]
+    assert errors[1] < 0.35 * errors[0]
+    assert "plant_state" not in runs[0].layout
+    assert runs[0].layout["reality_state"].elements == tuple(FIRST)
+    np.testing.assert_array_equal(runs[0]["plant_output.bis"], runs[0]["output.bis"])
+
+
+def test_it_moves_as_scipy_says():
+    """The commands, held over every cycle, move the patient's own equations alike; the bis is the patient's curve."""
+    result = run(task(duration=2.0), replace(TRACK, deformation=FPI))
+    x, states = np.array(list(FIRST.values())), []
+    for u in np.asarray(result["command"]).ravel():
+        states.append(x)
+        x = solve_ivp(lambda t, x, u=u: moved(x, u, 0.2), (0, PERIOD), x, rtol=1e-11, atol=1e-13).y[:, -1]
+    np.testing.assert_allclose(result["reality_state"], states, rtol=2e-6)
+    np.testing.assert_allclose(result["output.bis"], 93 / (1 + (np.array(states)[:, 3] / 4.1) ** 1.36), rtol=2e-6)
+
+
+def arm() -> fp.Plant:
+    """A rigid arm whose output is the angle of its joint."""
+    return fp.Plant(
+        {"q": "rad"},
+        {"u": "N m"},
+        {"J": fp.Parameter(1.3, 1.0, "kg m^2")},
+        lambda q, v, u, p: {"q": (u.u - 5 * ca.sin(q.q)) / p.J},
+        outputs={"angle": fp.Output("rad", lambda q, v, p: q.q)},
+    )
+
+
+def flexible() -> fp.Plant:
+    """A motor and a link behind a damped spring; the angle is the link's, which is a coordinate of its own."""
+
+    def response(q: Any, v: Any, u: Any, p: Any) -> dict[str, Any]:
+        force = p.k * (q.motor - q.angle) + 40 * (v.motor - v.angle)
+        return {"angle": (force - 5 * ca.sin(q.angle)) / 0.8, "motor": (u.u - force) / 0.2}
+
+    return fp.Plant(
+        {"angle": "rad", "motor": "rad"}, {"u": "N m"}, {"k": fp.Parameter(4000.0, 4000.0, "N m/rad")}, response
+    )
+
+
+JOINT = fp.KalmanFilter(measured={"angle": 1e-4}, noise={"q": 10.0})
+
+
+@pytest.mark.parametrize("estimator", [fp.Measured(), fp.PositionDifference()], ids=["measured", "estimated"])
+def test_a_flexible_joint_behind_a_rigid_model(estimator):
+    """The output is a coordinate of the reality; its motor is nobody's. The increment form leaves half of the error at most."""
+    still = {"angle": 0.0, "angle'": 1.0, "motor": 0.0, "motor'": 1.0}
+    problem = fp.Problem(
+        plant=arm(),
+        reference=fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}),
+        start={"q": 0.0, "q'": 1.0},
+        period=1e-3,
+        duration=2.0,
+        measure_from=1.0,
+        reality=fp.Reality(flexible(), start=still, integrator=fp.RungeKutta4(substeps=4)),
+        sensing=fp.Sensing(estimator=estimator, observer=JOINT),
+        limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),
+    )
+    law, map_ = fp.Exponential(rate=6.0), fp.Increment(fp.Sigmoid(gain=-0.3, scale=60.0), cycles=0)
+    runs = [run(problem, fp.ComputedTorque(law, d)) for d in (fp.Identity(), map_)]
+    errors = [fp.measure(problem, one).rms_error["angle"] for one in runs]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_a_comparison_and_its_report(tmp_path):
+    """The page is as of every problem; what is exact is the patient."""
+    problem = task(duration=1.0)
+    other = problem.with_exact(1.1 * problem.real_plant.exact)
+    assert np.array_equal(other.real_plant.exact, 1.1 * problem.real_plant.exact)
+    pair = {"CTC": TRACK, "CTC+FPI": replace(TRACK, deformation=FPI)}
+    file = replace(fp.load_problem("two_mass"), problem=problem, controllers=pair, headline=("CTC", "CTC+FPI"))
+    comparison = fp.compare(file, seed=0, compiled=False)
+    fp.write_report(comparison, tmp_path / "report.html")
+    assert "reality: Ce" in (tmp_path / "report.html").read_text()
+
+
+MISTAKES = {
+    "no output": (lambda: fp.Reality(patient(output="depth"), start=FIRST), "no output 'bis', which the model has"),
+    "unit": (lambda: fp.Reality(patient(unit="%"), start=FIRST), "its 'bis' is in %, the model's in 1;"),
+    "start": (lambda: fp.Reality(patient(), start={"c": 1.0}), "start: state 'c' is unknown. Valid: C1, C2, C3, Ce"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_mistakes_of_a_reality_are_named(mistake):
+    make, message = MISTAKES[mistake]
+    with pytest.raises(InvalidProblem, match=f"(?s){message}"):
+        task(reality=make())
+
+
+def test_without_a_belief_the_states_are_needed():
+    """The controller would be given states that the patient does not have; the message says how they are believed."""
+    with pytest.raises(
+        InvalidProblem, match=r"(?s)no coordinate 'c'.*believed: Sensing\(measured=..., observer=KalmanFilter"
+    ):
+        task(sensing=fp.Sensing())
+
+
+def test_it_is_no_exact_model():
+    """A controller of one compartment is not given three."""
+    with pytest.raises(NotSupported, match="C1, which the controller is not given"):
+        run(task(duration=0.5), fp.ExactModel(TRACK))
+
+
+# A body outside
+
+
+class Patient:
+    """The same patient outside: numpy's own Runge-Kutta steps, and measurements by name."""
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.names = names
+
+    def reset(self, seed: int) -> list[float]:
+        del seed
+        self.x = np.array(list(FIRST.values()))
+        return self.shown(np.zeros(1))
+
+    def step(self, time: float, command: np.ndarray) -> list[float]:
+        del time
+        h, x = PERIOD, self.x
+        f = lambda x: np.array(moved(x, command[0], 0.2))  # noqa: E731
+        k1 = f(x)
+        k2 = f(x + h / 2 * k1)
+        k3 = f(x + h / 2 * k2)
+        k4 = f(x + h * k3)
+        self.x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return self.shown(command)
+
+    def shown(self, command: np.ndarray) -> list[float]:
+        """The bis and its derivatives by the chain rule, and the states of the model, which are none of the patient's."""
+        b, site = (1 / 4.1) ** 1.36, self.x[3]
+        rates = moved(self.x, command[0], 0.2)
+        base, first = 1 + b * site**1.36, 1.36 * b * site**0.36
+        second = 1.36 * 0.36 * b * site**-0.64
+        slope = -93 * first / base**2
+        curve = -93 * (second / base**2 - 2 * first**2 / base**3)
+        bending = 0.2 * (rates[0] - rates[3])
+        values = {"bis": 93 / base, "bis'": slope * rates[3], "bis''": curve * rates[3] ** 2 + slope * bending}
+        return [values.get(n, 1.5) for n in self.names]
+
+
+UNITS = {"bis": "1", "bis'": "1/min", "bis''": "1/min^2"}
+
+
+@pytest.mark.parametrize("controller", [replace(TRACK, deformation=FPI), PLAN], ids=["adaptive", "plan"])
+@pytest.mark.parametrize("estimator", [fp.Measured(), fp.PositionDifference()], ids=["measured", "estimated"])
+def test_a_body_with_outputs_is_the_reality_of_these_outputs(controller, estimator):
+    """The same patient in symbols and outside: the same commands to rounding, whatever the sensors show of the bis."""
+    # An estimator begins at the model's start, which must show the bis that the body shows, and its derivative.
+    site = 4.5 * (92 / START - 1) ** (1 / 1.5)
+    slope = -92 * 1.5 * (site / 4.5) ** 1.5 / site / (1 + (site / 4.5) ** 1.5) ** 2
+    first = Patient(("bis'",)).reset(0)[0]
+    start = {"e": site, "c": site + first / slope / 0.3}
+    sensing = fp.Sensing(estimator=estimator, observer=FILTER)
+    problem = task(duration=3.0, sensing=sensing, start=start)
+    names = problem.sensing.measures(problem.plant)
+    body = fp.ExternalPlant(Patient(names), {n: UNITS[n] for n in names})
+    one, other = run(problem, controller), run(replace(problem, reality=body), controller)
+    np.testing.assert_allclose(other["command"], one["command"], atol=1e-9 * np.abs(one["command"]).max())
+    np.testing.assert_allclose(other["true_error"], one["true_error"], atol=1e-10)
+
+
+def test_a_body_must_measure_what_the_controller_is_given():
+    """Without an observer also the model's states; units are compared."""
+    body = Patient(tuple(UNITS))
+    with pytest.raises(InvalidProblem, match=r"(?s)does not measure c .*does not measure e"):
+        task(reality=fp.ExternalPlant(body, UNITS), sensing=fp.Sensing())
+    with pytest.raises(InvalidProblem, match="measures bis in %, the model has it in 1"):
+        task(reality=fp.ExternalPlant(body, {**UNITS, "bis": "%"}))
+    with pytest.raises(InvalidProblem, match="does not measure bis'' "):
+        task(reality=fp.ExternalPlant(body, {"bis": "1", "bis'": "1/min"}))
+
+
+def test_a_body_that_measures_states_and_outputs():
+    """Given as they are, without an observer: the model's plant outside, to rounding."""
+    problem = task(reality=None, sensing=fp.Sensing(), duration=2.0)
+    plant = problem.plant
+    x, u, p = plant.symbols()
+    outputs = plant.equations.output(x, u, p, np.zeros(2))
+    shown = ca.Function("shown", [x, u, p], [ca.vertcat(x, outputs, plant.equations.controlled_response(x, u, p))])
+    move = problem.integrator.step(plant, PERIOD)
+
+    class Own:
+        """The model's plant with its exact parameters."""
+
+        def reset(self, seed: int) -> np.ndarray:
+            del seed
+            self.x = problem.start_state
+            return np.asarray(shown(self.x, problem.inputs_before, plant.exact).full()).ravel()
+
+        def step(self, time: float, command: np.ndarray) -> np.ndarray:
+            del time
+            self.x = np.asarray(move(self.x, command, plant.exact, np.zeros(2)).full()).ravel()
+            return np.asarray(shown(self.x, command, plant.exact).full()).ravel()
+
+    measures = {"c": "mg/l", "e": "mg/l", **UNITS}
+    controller = replace(PLAN, deformation=FPI)
+    one, other = run(problem, controller), run(replace(problem, reality=fp.ExternalPlant(Own(), measures)), controller)
+    np.testing.assert_allclose(other["command"], one["command"], atol=1e-10 * np.abs(one["command"]).max())
+    np.testing.assert_allclose(other["plant_state"], one["plant_state"], atol=1e-12)
+    assert "cost" in other.layout
