@@ -88,8 +88,7 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = ""
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
     constants = {**sizes, **_constants(settings, measures), "ITERATIONS": iterations or settings.iterations}
-    memory = (4, 2)
-    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures), in_place=memory)
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures))
 
 
 def _room(ocp: OptimalControl, measures: Scales) -> int:

@@ -121,7 +121,7 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[st
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     costates = _costates(ocp, leaves["hessian"])
     constants = {**_sizes(ocp), "COSTATES": costates, **_metric(ocp), **_constants(ocp, settings), **stops}
-    return Driver("\n".join(texts), leaves, constants, _room(ocp, costates), in_place=(4, 2))  # the memory
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, costates))
 
 
 def _costates(ocp: OptimalControl, hessian: ca.Function) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import accumulate, groupby
+from itertools import accumulate
 from operator import attrgetter
 from typing import cast
 
@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind, total
 from fpirhc.symbolic.layout import Kind, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
@@ -182,7 +181,6 @@ class Composite:
     memory: Layout
     trace: Layout
     outputs: tuple[str, ...] = ()
-    interpreted: bool = False  # whether the virtual machine runs it
 
     @cached_property
     def graph(self) -> ca.Function:
@@ -190,10 +188,8 @@ class Composite:
         inputs = {s.name: ca.MX.sym(s.name, s.size) for s in self.reads.signals}
         remembered, next_memory = ca.MX.sym("memory", self.memory.size), dict[str, ca.MX]()
         known: dict[str, ca.MX] = {**self.memory.split(remembered), **inputs}
-        # The virtual machine takes longer to enter a block than to run it.
-        inlines = self.interpreted and self.opaque
-        for block in _fewer(self.blocks) if inlines else self.blocks:
-            call(block, known, next_memory, inlines=inlines and block.opaque)
+        for block in self.blocks:
+            call(block, known, next_memory)
         for delay in self.delays:
             next_memory[delay.now.name] = known[delay.source]
         returned = [self.memory.join(next_memory), self.trace.join(known), *[known[o] for o in self.outputs]]
@@ -288,8 +284,7 @@ def compose(
     reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
     _require_wired(reads, memory, blocks, delays)
     trace = Layout(tuple([s for b in blocks for s in b.writes.signals if not s.name.startswith("_")]))
-    parts = name, tuple(blocks), tuple(delays), reads, memory, trace, tuple(outputs)
-    return Composite(*parts, interpreted=plans_are_compiled())
+    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, tuple(outputs))
 
 
 def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delays: Sequence[Delay]) -> None:
@@ -307,35 +302,6 @@ def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delay
         _require_size(f"delay '{delay.now.name}'", delay.now, delay.source, sizes)
 
 
-def _fewer(blocks: Sequence[Block]) -> list[Block]:
-    """The same steps with scalar blocks beside each other as one."""
-    result: list[Block] = []
-    for apart, some in groupby(blocks, key=lambda block: block.opaque or bool(open_settings([block]).names)):
-        group = list(some)
-        result += group if apart or len(group) == 1 else [_joined(group)]
-    return result
-
-
-def _joined(blocks: Sequence[Block]) -> Block:
-    """Blocks of scalar code, in order, as one block."""
-    memory, written = [s for b in blocks for s in b.memory.signals], list[Signal]()
-    reads: dict[str, Signal] = {}
-    for block in blocks:
-        held = {s.name for s in (*memory, *written)}
-        reads |= {s.name: s for s in block.reads.signals if s.name not in held}
-        written += block.writes.signals
-
-    def step(s: Signals) -> dict[str, Expression]:
-        known, following = dict(vars(s)), dict[str, Expression]()
-        for block in blocks:
-            call(block, known, following)
-        shared = ca.cse([known[w.name] for w in written] + [following[m.name] for m in memory])
-        return dict(zip([*(w.name for w in written), *(f"{m.name}_next" for m in memory)], shared, strict=True))
-
-    name = "_".join(block.name for block in blocks)
-    return Block(name, Layout(tuple(reads.values())), Layout(tuple(written)), step, Layout(tuple(memory)))
-
-
 def scalar_code(function: ca.Function) -> ca.Function:
     """Write all calls out as scalar expressions and compute common parts of blocks once."""
     inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
@@ -343,11 +309,11 @@ def scalar_code(function: ca.Function) -> ca.Function:
     return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
-def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix], *, inlines: bool = False) -> None:
+def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
     # Of graphs they are MX, which the stub does not mix with SX.
     arguments = cast(list[ca.SX], [known[name] for name in (*block.inputs.names, *block.memory.names)])
-    values = block.function.call(arguments, inlines, False)
+    values = block.function.call(arguments)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
         known[name] = results[name]

@@ -90,8 +90,6 @@ class Driver:
     leaves: Mapping[str, ca.Function]  # generated Functions by key
     constants: Mapping[str, object]  # preprocessor definitions by name
     room: int = 0  # numbers that the driver needs in w
-    # (argument, result) that may lie at one place: the argument is not read after the result is begun
-    in_place: tuple[int, int] | None = None
 
     @property
     def fits(self) -> bool:
@@ -107,14 +105,9 @@ class Driver:
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
         generated = _ABSENT.sub(lambda found: found[2] or "", generated)
-        return "\n".join(
-            [of_type(generated), WORDS, self.around({name: f"fpirhc_leaf_{name}" for name in self.leaves})]
-        )
-
-    def around(self, leaves: Mapping[str, str]) -> str:
-        """Return the loops and their definitions, for leaves that stand before under these names."""
-        defined = {**self.constants, **leaves, "ROOM": self.room}
-        return "\n".join([*(f"#define {name} {value}" for name, value in defined.items()), _FAST, self.text])
+        defined = {**self.constants, **{name: f"fpirhc_leaf_{name}" for name in self.leaves}, "ROOM": self.room}
+        definitions = (f"#define {name} {value}" for name, value in defined.items())
+        return "\n".join([of_type(generated), WORDS, *definitions, _FAST, self.text])
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
@@ -141,7 +134,7 @@ def works_alone(function: ca.Function) -> bool:
 
 
 @contextmanager
-def compiled_plans(yes: bool = True) -> Iterator[None]:  # noqa: FBT001, FBT002
+def compiled_plans(yes: bool = True) -> Iterator[None]:
     """Within it a loop of the virtual machine calls the compiled plan: a short run is not worth a compiler, its plans are.
 
     What is composed within calls a library, so it cannot be compiled as a whole.
@@ -180,15 +173,9 @@ def is_driver(name: str) -> bool:
     return name in _drivers
 
 
-def entry_of(name: str) -> tuple[str, int, tuple[int, int] | None]:
-    """Return the name of the C function of a driver, the numbers that it needs in w, and what may lie at one place."""
-    driver = driver_of(name)
-    return f"{name}_driver", driver.room, driver.in_place
-
-
-def driver_of(name: str) -> Driver:
-    """Return the driver of a Function of this name."""
-    return _drivers[name][0]
+def entry_of(name: str) -> tuple[str, int]:
+    """Return the name of the C function of a driver, and the numbers that it needs in w."""
+    return f"{name}_driver", _drivers[name][0].room
 
 
 def file_of(name: str) -> str:
@@ -265,7 +252,7 @@ def kept_if_finite(new: Expression, old: Expression, good: Expression) -> tuple[
 @cache
 def _kept(size: int) -> ca.Function:
     new, old, good = ca.MX.sym("new", size), ca.MX.sym("old", size), ca.MX.sym("good")
-    driver = Driver(_KEPT, {}, {"SIZE": size}, in_place=(0, 0))
+    driver = Driver(_KEPT, {}, {"SIZE": size})
     fine = _none_large(new)
     # A short circuit copies; else every entry is selected by itself.
     kept = ca.if_else(ca.logic_and(good, fine), new, old, True)

@@ -19,8 +19,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 import casadi as ca
@@ -38,7 +38,7 @@ _ALIGNED = ("-falign-functions=64", "-falign-loops=64")
 _FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-fno-semantic-interposition")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _loaded: dict[str, ca.Function] = {}
-_begun: dict[Path, tuple[Sequence[str], Future[None]]] = {}  # by note: the C, and the compiler that is at work on it
+_begun: dict[Path, Future[None]] = {}  # compilers at work, by the library that they make
 _places: dict[Path, threading.Lock] = {}  # of objects that are being made
 
 
@@ -74,23 +74,21 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
 
     Args:
         required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
-        calls: number of calls in a row that the compiled Function makes, see `program.chained`; 0: it is `function` itself.
+        calls: number of calls in a row that the compiled Function makes, see `program.chained`; 0: one call of `function` itself.
 
     Raises:
         CompileError: `required`, and the compiler failed.
     """
     if function.is_a("External"):
         return Native(function, True, "")
-    compiler, flags = find_compiler(), _with_own(flags)
+    compiler = find_compiler()
     if compiler is None:
         return Native(function, False, why_no_compiler())
     try:
-        note = _note(function, compiler, flags, calls)
-        known = _noted(note) if note else None
-        if known is None:
-            key, known = _library(_written(note, function, calls), compiler, flags)
-            _remember(note, key)
-        return Native(known, True, "")
+        library = _Library(function, compiler, _with_own(flags), calls)
+        if library.key not in _loaded:
+            _loaded[library.key] = library.load()
+        return Native(_loaded[library.key], True, "")
     except (NoCode, CompileError) as error:
         if required and isinstance(error, CompileError):
             raise
@@ -104,39 +102,31 @@ def compiling_ahead() -> Iterator[Callable[..., None]]:
     `native` waits for a compiler that has been started, so several are at work side by side while Python goes on. What fails here
     fails again there, with its message.
     """
-    pool, notes = ThreadPoolExecutor(os.cpu_count()), list[Path]()
+    pool, begun = ThreadPoolExecutor(os.cpu_count()), list[Path]()
 
     def begin(function: ca.Function, flags: Sequence[str] = (), *, calls: int = 0) -> None:
-        compiler, flags = find_compiler(), _with_own(flags)
-        note = _note(function, compiler, flags, calls) if compiler else None
-        if compiler is None or note is None or note in _begun or _noted(note) is not None:
+        compiler = find_compiler()
+        if compiler is None:
             return
         with contextlib.suppress(NoCode):
-            sources = generate(function, calls)
-            _begun[note] = sources, pool.submit(_make, sources, compiler, flags)
-            notes.append(note)
+            library = _Library(function, compiler, _with_own(flags), calls)
+            if library.key in _loaded or library.path in _begun or _is_intact(library.path):
+                return
+            library.units  # noqa: B018 -- its C is written here: CasADi works in one thread
+            _begun[library.path] = pool.submit(library.make)
+            begun.append(library.path)
 
     try:
         yield begin
     finally:
         pool.shutdown(cancel_futures=True)
-        for note in notes:
-            _begun.pop(note, None)
+        for path in begun:
+            _begun.pop(path, None)
 
 
 def _with_own(flags: Sequence[str]) -> Sequence[str]:
     """The flags, and behind them those of the user."""
     return (*flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", "")))
-
-
-def _written(note: Path | None, function: ca.Function, calls: int) -> Sequence[str]:
-    """The C of a Function; where its compiler has been started, what was written then, after the compiler has ended."""
-    begun = _begun.pop(note, None) if note else None
-    if begun is None:
-        return generate(function, calls)
-    sources, compiler = begun
-    wait([compiler])
-    return sources
 
 
 def cache_folder() -> Path:
@@ -222,30 +212,6 @@ def _machine_flags() -> tuple[str, ...]:
     return ("-DALWAYS_WIDE",) if platform.machine() == "x86_64" and " avx2 " in _processor() else ()
 
 
-def _note(function: ca.Function, compiler: str, more: Sequence[str], calls: int) -> Path | None:
-    """The file that says which library so many calls of a Function have; None for a Function that cannot be written down.
-
-    Its name is a hash of the Function, in which the names of drivers have a hash of their text, and of all else that decides the
-    library: compiler, flags, machine, CasADi, and the code that writes C. So what is in the cache is found without writing C.
-    """
-    try:
-        content = function.serialize()
-    except RuntimeError:
-        return None
-    link, command = (compiler, *more, *_LINK), _unit("", compiler, more).command
-    facts = (
-        _writer(),
-        _version(compiler),
-        platform.machine(),
-        ca.CasadiMeta.version(),
-        str(calls),
-        *command,
-        *link,
-        content,
-    )
-    return cache_folder() / f"{hashlib.sha256(chr(0).join(facts).encode()).hexdigest()[:32]}.note"
-
-
 @cache
 def _writer() -> str:
     """Hash of the code that writes C."""
@@ -253,94 +219,59 @@ def _writer() -> str:
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
-def _noted(note: Path) -> ca.Function | None:
-    """The library that a note names; None where there is no whole note or no whole library."""
-    try:
-        key, check = read_own(note).decode("ascii").split()
-    except (OSError, ValueError):
-        return None
-    path = cache_folder() / f"{key}{_suffix()}"
-    if check != _check_of(note, key):
-        return None
-    if key not in _loaded and _is_intact(path):
-        with contextlib.suppress(RuntimeError):  # made on another system
-            _loaded[key] = ca.external(f"fpirhc_{key}", str(path))
-    return _loaded.get(key)
+class _Library:
+    """The library of so many calls of a Function, which is found without writing its C.
 
+    Its key is a hash of the Function, in which the names of drivers have a hash of their text, and of all else that decides it:
+    compiler, flags, machine, CasADi, and the code that writes C.
 
-def _remember(note: Path | None, key: str) -> None:
-    """Write a note; without it the library is found by its C."""
-    if note is None:
-        return
-    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=note.parent, prefix=BUILDING) as work:
-        new = Path(work) / note.name
-        new.write_text(f"{key} {_check_of(note, key)}", encoding="ascii")
-        new.chmod(0o600)
-        new.replace(note)
+    Raises:
+        NoCode: a Function that cannot be written as C.
+    """
 
+    def __init__(self, function: ca.Function, compiler: str, flags: Sequence[str], calls: int) -> None:
+        self._what, self._compiler, self._flags = (function, calls), compiler, flags
+        self._link = (compiler, *flags, *_LINK)
+        try:
+            content = function.serialize()
+        except RuntimeError:
+            content = "\0".join(generate(function, calls))
+        facts = (_writer(), str(calls), *self._link, _unit("", compiler, flags).key, content)
+        self.key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:32]
+        self.path = cache_folder() / f"{self.key}{_suffix()}"
 
-def _check_of(note: Path, key: str) -> str:
-    """Checksum of a note: a damaged key is no other model's."""
-    return hashlib.sha256(f"{note.stem} {key}".encode()).hexdigest()
+    @cached_property
+    def units(self) -> tuple[_Unit, ...]:
+        """Its C files with their commands: its own, and those of the drivers that it calls."""
+        own, *drivers = generate(*self._what)
+        texts = own.replace(NAME, f"fpirhc_{self.key}"), *drivers
+        return tuple(_unit(text, self._compiler, self._flags) for text in texts)
 
+    def make(self) -> None:
+        """Compile it into the cache."""
+        _compile(self.units, self._link, self.path)
 
-@dataclass(frozen=True)
-class _Plan:
-    """How the library of some C files is made."""
-
-    key: str  # hash of all that it depends on
-    units: tuple[_Unit, ...]
-    link: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        return f"fpirhc_{self.key}"
-
-    @property
-    def path(self) -> Path:
-        return cache_folder() / f"{self.key}{_suffix()}"
-
-
-def _planned(sources: Sequence[str], compiler: str, more: Sequence[str]) -> _Plan:
-    own, *drivers = (_unit(source, compiler, more) for source in sources)
-    link = (compiler, *more, *_LINK)
-    key = hashlib.sha256("\0".join((own.key, *(d.key for d in drivers), *link)).encode()).hexdigest()[:32]
-    plan = _Plan(key, (), link)
-    return replace(plan, units=(replace(own, source=own.source.replace(NAME, plan.name)), *drivers))
-
-
-def _make(sources: Sequence[str], compiler: str, more: Sequence[str]) -> None:
-    """Compile these files into a library of the cache, where there is none."""
-    plan = _planned(sources, compiler, more)
-    if not _is_intact(plan.path):
-        _compile(plan.units, plan.link, plan.path)
-
-
-def _library(sources: Sequence[str], compiler: str, more: Sequence[str]) -> tuple[str, ca.Function]:
-    """Return key and external Function of the library for these files, compiling it when needed."""
-    plan = _planned(sources, compiler, more)
-    if plan.key not in _loaded:
-        _loaded[plan.key] = _load(plan)
-    return plan.key, _loaded[plan.key]
+    def load(self) -> ca.Function:
+        """Return it from the cache, compiled before where it is not there, or was made on another system."""
+        begun = _begun.pop(self.path, None)
+        if begun is not None:
+            wait([begun])
+        if _is_intact(self.path):
+            with contextlib.suppress(RuntimeError):
+                return ca.external(f"fpirhc_{self.key}", str(self.path))
+        try:
+            self.make()
+            return ca.external(f"fpirhc_{self.key}", str(self.path))
+        except (OSError, RuntimeError) as error:
+            if isinstance(error, CompileError):
+                raise
+            raise CompileError(
+                f"the compiled library cannot be kept in '{self.path.parent}' or loaded: {error}"
+            ) from None
 
 
 def _suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
-
-
-def _load(plan: _Plan) -> ca.Function:
-    path = plan.path
-    if _is_intact(path):
-        # An intact library that does not load was made on another system: it is compiled again here.
-        with contextlib.suppress(RuntimeError):
-            return ca.external(plan.name, str(path))
-    try:
-        _compile(plan.units, plan.link, path)
-        return ca.external(plan.name, str(path))
-    except (OSError, RuntimeError) as error:
-        if isinstance(error, CompileError):
-            raise
-        raise CompileError(f"the compiled library cannot be kept in '{path.parent}' or loaded: {error}") from None
 
 
 def _checksum_file(path: Path) -> Path:
@@ -354,7 +285,7 @@ def _is_intact(path: Path) -> bool:
         return False
 
 
-def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path, libraries: Sequence[str] = ()) -> None:
+def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path) -> None:
     """Compile into a folder of its own beside the cache entry, files side by side, then link and put the library into place.
 
     The first file is of this library alone. Others are drivers, whose objects are kept for the libraries that share them. What
@@ -367,7 +298,7 @@ def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path, libraries:
             shared = pool.map(partial(_driver, path.parent, Path(work)), range(1, len(units)), units[1:])
             objects = [own.result(), *shared]
         library = Path(work) / f"model{_suffix()}"
-        _succeed([*link, "-o", str(library), *map(str, objects), *libraries, "-lm"], library, work)
+        _succeed([*link, "-o", str(library), *map(str, objects), "-lm"], library, work)
         _publish(library, path)
 
 

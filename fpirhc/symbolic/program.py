@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+from collections.abc import Mapping
 
 import casadi as ca
 
@@ -12,6 +13,8 @@ from fpirhc.errors import NoCode
 from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_type
 
 NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
+_PART = re.compile(r"^(?=/\* \w+:\(.*\*/\nstatic int casadi_f\d+\(|CASADI_SYMBOL_EXPORT )", re.MULTILINE)
+_OWN = re.compile(r"/\* (?P<name>\w+):\(.*\*/\nstatic int (?P<place>casadi_f\d+)\([^{]*\{\n")
 
 
 def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
@@ -37,21 +40,40 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
         raise NoCode(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
     _check_self_contained(source)
     drivers = list(dict.fromkeys(f.name() for f in [function, *called] if is_driver(f.name())))
-    for name in drivers:
-        entry, room = entry_of(name)[:2]
-        # The graph in place of which the loops stand may need less work than they do.
-        work = f"casadi_real work[{max(room, 1)}];"
-        call = f"  {work}\n  return {entry}(arg, res, iw, work, mem);\n"
-        source = _with_body(source, name, call, f"int {entry}{SIGNATURE};\n")
+    entries = {name: entry_of(name) for name in drivers}
+    # The graph in place of which the loops of a driver stand may need less work than they do.
+    bodies = {
+        name: f"  casadi_real work[{max(room, 1)}];\n  return {entry}(arg, res, iw, work, mem);\n"
+        for name, (entry, room) in entries.items()
+    }
+    declared = "".join(f"int {entry}{SIGNATURE};\n" for entry, _ in entries.values())
     if calls:
-        source = _with_body(source, NAME, _loop(source, function))
-    return of_type(source), *map(file_of, drivers)
+        bodies[NAME] = _loop(source, function)
+    return of_type(_with_bodies(source, bodies, declared)), *map(file_of, drivers)
 
 
-def _with_body(source: str, name: str, body: str, before: str = "") -> str:
-    """C in which a Function has another body, and something stands before it."""
-    whole = rf"(^/\* {name}:\([^\n]*\*/\nstatic int \w+\([^\n]*\) \{{\n).*?^\}}$"
-    return re.sub(whole, lambda found: f"{before}{found[1]}{body}}}", source, flags=re.MULTILINE | re.DOTALL)
+def _with_bodies(source: str, bodies: Mapping[str, str], declared: str) -> str:
+    """The C in which some Functions have other bodies, and without what the old ones alone called.
+
+    What is dead is most of the text of a plan, and would have it compiled with less optimising.
+    """
+    head, *parts = _PART.split(source)
+    written, waiting = dict[str, str](), list[str]()
+    for k, part in enumerate(parts):
+        own = _OWN.match(part)
+        if own and own["name"] in bodies:
+            parts[k] = f"{own[0]}{bodies[own['name']]}}}\n\n"
+        if own:
+            written[own["place"]] = parts[k]
+        else:
+            waiting.append(part)
+    needed = set[str]()
+    while waiting:
+        fresh = set(re.findall(r"\bcasadi_f\d+\b", waiting.pop())) & written.keys() - needed
+        needed |= fresh
+        waiting += [written[place] for place in fresh]
+    kept = (part for part in parts if not (own := _OWN.match(part)) or own["place"] in needed)
+    return "".join([head, declared, *kept])
 
 
 def _signature_of_loop(function: ca.Function, calls: int) -> ca.Function:

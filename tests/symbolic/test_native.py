@@ -12,7 +12,6 @@ import subprocess
 import threading
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -135,7 +134,8 @@ def test_compilers_at_work_side_by_side_do_nothing_twice(cache, monkeypatch, fai
     with compiling_ahead() as begin:
         for function in pair:
             begin(function)
-        monkeypatch.setattr(module, "generate", lambda *_: pytest.fail("C is written again"))
+        if not fails:
+            monkeypatch.setattr(module, "generate", lambda *_: pytest.fail("C is written again"))
         ready = [native(function) for function in pair]
     at = np.array([0.3, 0.7, -2.0])
     for function, one in zip(pair, ready, strict=True):
@@ -166,7 +166,7 @@ def test_cache_is_by_content(cache, monkeypatch):
 
 @needs_compiler
 def test_a_library_is_found_without_writing_c(cache, monkeypatch):
-    """By a note of the same Function, compiler, flags and writer of C; whatever differs writes C, and its own library is found."""
+    """By the Function, compiler, flags and writer of C; whatever differs writes C, and its own library is found."""
     native(model(2.0))
     written: list[ca.Function] = []
 
@@ -199,43 +199,23 @@ def test_a_library_is_found_without_writing_c(cache, monkeypatch):
 
 @needs_compiler
 def test_calls_in_a_chain_have_a_library_of_their_own(cache, monkeypatch):
-    """It hands on what is remembered. Without tables the count says how many calls there are, so that one library serves all."""
+    """It hands on what is remembered; another number of calls has another library, which is found without writing its C."""
     x = np.linspace(-1.0, 1.0, 3)
     for calls in (4, 5, 5):
         expected = model(0.5).mapaccum("chain", calls)(x)[:, -1]
         np.testing.assert_array_equal(native(model(0.5), calls=calls).function(x, calls).full(), expected.full())
     np.testing.assert_array_equal(native(model(0.5)).function(x).full(), model(0.5)(x).full())
-    assert len(_libraries(cache)) == 2
+    assert len(_libraries(cache)) == 3
     monkeypatch.setattr(module, "_loaded", {})
     monkeypatch.setattr(module, "generate", lambda *_: pytest.fail("its C was written again"))
     np.testing.assert_array_equal(native(model(0.5), calls=5).function(x, 5).full(), expected.full())
 
 
 @needs_compiler
-@pytest.mark.parametrize("damage", ["exchanged", "cut", "strange", "no library"])
-def test_a_wrong_note_finds_nothing(cache, monkeypatch, damage):
-    """A note of another Function, half of one, other words, and one whose library is gone: the numbers are the model's own."""
-    native(model(2.0))
-    [own] = cache.glob("*.note")
-    native(model(3.0))
-    [other] = set(cache.glob("*.note")) - {own}
-    text = own.read_text()
-    own.write_text({"exchanged": other.read_text(), "cut": text[:40], "strange": "a b c"}.get(damage, text))
-    if damage == "no library":
-        Path(cache / f"{text.split()[0]}{module._suffix()}").unlink()
-    monkeypatch.setattr(module, "_loaded", {})
-    np.testing.assert_array_equal(native(model(2.0)).function(np.ones(3)).full(), model(2.0)(np.ones(3)).full())
-    assert own.read_text() == text
-
-
-@needs_compiler
 @pytest.mark.parametrize("damage", [b"", b"not a library", None])
 def test_damaged_library_is_built_again(cache, damage):
     """Truncated, overwritten, or with a lost checksum: the answer is right and the cache is whole again."""
-    sources = generate(model(4.0))
-    compiler = find_compiler()
-    assert compiler is not None
-    module._library(sources, compiler, ())
+    native(model(4.0))
     (path,) = _libraries(cache)
     checksum = path.with_suffix(".sha256")
     if damage is None:
