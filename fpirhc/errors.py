@@ -128,6 +128,10 @@ class ConcurrentUse(FpirhcError, RuntimeError):
     """A value that serves one thread, used by two at the same time."""
 
 
+class WorkerDied(FpirhcError, RuntimeError):
+    """A process of a study was killed; what is finished is kept."""
+
+
 class OutputError(FpirhcError, OSError):
     """A file or folder that cannot be written or read."""
 

@@ -22,7 +22,8 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.shipped import missing
 from fpirhc.studies.comparison.compare import select
-from fpirhc.studies.variants import Variant, Variants, run_variants
+from fpirhc.studies.runs import run_variants
+from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.view import Progress, versions
 from fpirhc.whole_file import write_whole
 

@@ -1,30 +1,41 @@
-"""How much of something a controller bears before it fails: doubling and halving of one quantity, a row for every run."""
+"""How much of something a controller bears before it fails: doubling and halving of one quantity, a row for every limit.
+
+Controllers know nothing of what grows.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from fpirhc.controllers.contract import believing
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import AboveZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.sensing.sensing import Sensor
+from fpirhc.simulation.metrics.base import Metric, measured_cycles
+from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.variants import Draws, Runner, Variant, ranges
+from fpirhc.studies.runs import Kept, Row, Runner, header_of, ranges
+from fpirhc.studies.variants import Draws, Variant
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, number
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
 
-FAILS = 0.5  # rms error from which a run has failed, as a share of the reference's range
-_NEAR, _HALVINGS = 1.05, 14
+FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
 PLANTS = 100  # drawn for every percent of 'plants'
+_NEAR, _HALVINGS = 1.05, 14
+_OUTSIDE = 0.02  # of a limit's width: a state farther outside has left it
+_FARTHEST = 128  # cycles of latency
 
 
 @dataclass(frozen=True)
@@ -35,59 +46,92 @@ class Quantity:
     start: float
     first: float
     most: float
-    at: Callable[[float], Sequence[Variant]]
+    at: Callable[[float], Sequence[Variant]]  # the variants of which none may fail
+    whole: bool = False  # whether values are whole multiples of the first one
 
 
-def _one(problem: Problem, key: object) -> list[Variant]:
-    return [Variant("", problem, key)]
+def _one(problem: Problem, seed: int, key: object, built: Problem, believed: Problem) -> list[Variant]:
+    return [Variant(f"{key}", problem, key, seed=seed, built=built, believed=believed)]
 
 
-def _mismatch(problem: Problem) -> Quantity:
+def _mismatch(problem: Problem, seed: int) -> Quantity:
     known = {n: p.approximate for n, p in problem.plant.parameters.items()}
     exact = np.array([p.exact for p in problem.moved.parameters.values()])
     model = np.array([known.get(n, p.exact) for n, p in problem.moved.parameters.items()])
     if np.array_equal(exact, model):
         raise InvalidValue("the model is right")
-    ratios = np.where(exact * model > 0, np.log(np.abs(exact / np.where(model, model, 1.0))), 0.0)
+    scaled = exact * model > 0
+    ratios = np.log(np.where(scaled, exact, 1.0) / np.where(scaled, model, 1.0))
 
     def at(share: float) -> list[Variant]:
-        values = np.where(exact * model > 0, model * np.exp(share * ratios), model + share * (exact - model))
-        return _one(problem.with_exact(values), None)
+        values = np.where(scaled, model * np.exp(share * ratios), model + share * (exact - model))
+        return _one(problem.with_exact(values), seed, None, problem, problem)
 
-    return Quantity("times", 1.0, 2.0, 64.0, at)
+    return Quantity("times", 1.0, 2.0, _existing(at, 1.0, 64.0), at)
 
 
-def _latency(problem: Problem) -> Quantity:
+def _existing(at: Callable[[float], object], low: float, high: float) -> float:
+    """The largest value whose problem exists: parameters have bounds, and a response an inverse."""
+
+    def exists(value: float) -> bool:
+        try:
+            at(value)
+        except FpirhcError:
+            return False
+        return True
+
+    if exists(high):
+        return high
+    while high > 1.01 * low:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if exists(middle) else (low, middle)
+    return low
+
+
+def _latency(problem: Problem, seed: int) -> Quantity:
+    times, period = problem.dead_time, problem.period
+
     def at(value: float) -> list[Variant]:
-        inputs = {n: problem.dead_time.inputs.get(n, 0.0) + value for n in problem.plant.inputs}
-        return _one(replace(problem, dead_time=replace(problem.dead_time, inputs=inputs)), value)
+        inputs = {n: times.inputs.get(n, 0.0) + value for n in problem.plant.inputs}
+        later = replace(problem, dead_time=replace(times, inputs=inputs))
+        return _one(later, seed, value, later, problem)
 
-    return Quantity(problem.time_unit, 0.0, problem.period, problem.period * max(problem.cycles // 4, 1), at)
+    most = min(_FARTHEST, max(problem.cycles // 4, 1))
+    return Quantity(problem.time_unit, 0.0, period, period * most, at, whole=True)
 
 
-def _sensed(problem: Problem, change: Callable[[Sensor, str, float], Sensor]) -> Callable[[float], list[Variant]]:
+def _sensed(
+    problem: Problem, seed: int, change: Callable[[Sensor, str, float], Sensor]
+) -> Callable[[float], list[Variant]]:
     sensing = problem.sensing
 
     def at(value: float) -> list[Variant]:
         sensors = {n: change(sensing.sensors.get(n, Sensor()), n, value) for n in sensing.measures(problem.plant)}
-        return _one(replace(problem, sensing=replace(sensing, sensors={**sensing.sensors, **sensors})), value)
+        sensed = replace(problem, sensing=replace(sensing, sensors={**sensing.sensors, **sensors}))
+        return _one(sensed, seed, value, sensed, problem)
 
     return at
 
 
-def _noise(problem: Problem) -> Quantity:
-    sizes = ranges(problem)
-    change = lambda s, n, v: replace(s, noise=Noise(v * sizes[n])) if n in sizes and v else s  # noqa: E731
-    return Quantity("of the range", 0.0, 1e-3, 4.096, _sensed(problem, change))
+def _noise(problem: Problem, seed: int) -> Quantity:
+    sizes = ranges(problem)[0]
+
+    def noisier(sensor: Sensor, name: str, value: float) -> Sensor:
+        return replace(sensor, noise=Noise(value * sizes[name])) if name in sizes and value else sensor
+
+    return Quantity("of the range", 0.0, 1e-3, 4.096, _sensed(problem, seed, noisier))
 
 
-def _lost(problem: Problem) -> Quantity:
-    return Quantity("of the samples", 0.0, 0.02, 0.98, _sensed(problem, lambda s, _, v: replace(s, dropout=v)))
+def _lost(problem: Problem, seed: int) -> Quantity:
+    losing = _sensed(problem, seed, lambda sensor, _, value: replace(sensor, dropout=value))
+    return Quantity("of the samples", 0.0, 0.02, 0.98, losing)
 
 
-def _plants(problem: Problem) -> Quantity:
-    draws = lambda percent: Draws(PLANTS if percent else 1, percent).of_problem(problem)  # noqa: E731
-    return Quantity("% around the exact parameters", 0.0, 8.0, 99.0, draws)
+def _plants(problem: Problem, seed: int) -> Quantity:
+    def at(percent: float) -> Sequence[Variant]:
+        return Draws(PLANTS if percent else 1, percent, seed).of_problem(problem)
+
+    return Quantity("% around the exact parameters", 0.0, 8.0, _existing(at, 1e-3, 99.0), at)
 
 
 QUANTITIES = {"mismatch": _mismatch, "plants": _plants, "latency": _latency, "noise": _noise, "lost": _lost}
@@ -95,23 +139,42 @@ QUANTITIES = {"mismatch": _mismatch, "plants": _plants, "latency": _latency, "no
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Limits(Study):
-    """The result of `limits`."""
+    """The result of `limits`.
 
-    table: pd.DataFrame  # a row per controller and quantity: unit, holds, fails, why
+    Args:
+        table: a row per controller and quantity: unit, holds (NaN where the problem as it stands fails), fails (infinite where
+            nothing does), and why.
+        fails: relative error from which a run has failed.
+    """
+
+    table: pd.DataFrame
     fails: float
 
     @property
     def view(self) -> View:
-        shown = Table(
-            f"{self.problem}: where controllers fail",
-            [Column(c) for c in ("controller", "quantity", "holds", "fails", "why")],
+        heads = ("controller", "quantity", "holds", "fails", "why")
+        shown = Table(f"{self.problem}: where controllers fail", [Column(c) for c in heads])
+        rows: Iterator[Any] = self.table.itertuples()
+        for row in rows:
+            holds = "none" if math.isnan(row.holds) else number(row.holds)
+            fails = "as it stands" if math.isnan(row.holds) and row.unit else number(row.fails)
+            shown.add(
+                [row.controller, f"{row.quantity} [{row.unit}]" if row.unit else row.quantity, holds, fails, row.why]
+            )
+        tried = self.table.loc[self.table.unit != ""]
+        said = [_most(str(name), some) for name, some in tried.groupby("quantity", sort=False)]
+        about = (
+            f"A run fails if it ends early, leaves a limit of a state by {in_percent(_OUTSIDE)} of its width, or has a relative "
+            f"rms error above {in_percent(self.fails)}."
         )
-        for row in self.table.itertuples():
-            shown.add([row.controller, f"{row.quantity} [{row.unit}]", number(row.holds), number(row.fails), row.why])
-        best = self.table.sort_values("fails").groupby("quantity", sort=False).last()
-        sentences = [(f"{name}: {row.controller} bears most.", None) for name, row in best.iterrows()]
-        about = f"A run fails if it ends early, or has an rms error above {in_percent(self.fails)} of the reference's range."
-        return self.viewed(sentences, about, (shown,), {"limits": self.table.to_dict("records"), "fails": self.fails})
+        facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
+        return self.viewed([(text, None) for text in said if text], about, (shown,), facts)
+
+
+def _most(quantity: str, rows: pd.DataFrame) -> str:
+    """Who bears most, where somebody bears more than the others."""
+    best = rows.loc[rows.fails == rows.fails.max(), "controller"]
+    return f"{quantity}: {', '.join(best)} bears most." if 0 < len(best) < len(rows) else ""
 
 
 @checked_call
@@ -120,62 +183,114 @@ def limits(
     *,
     over: Sequence[str] | None = None,
     controllers: Sequence[str] | None = None,
-    fails: float = FAILS,
+    fails: AboveZero = FAILS,
+    seed: Seed = 0,
     compiled: bool = True,
+    folder: Path | None = None,
     command: str = "",
     progress: Progress | None = None,
 ) -> Limits:
-    """Return for every controller the mismatch, drawn plants, latency, noise and lost samples at which it fails, to 5 %."""
-    begin, chosen, rows = time.perf_counter(), select(task, controllers), []
+    """Return for every controller how much it bears, to 5 %, and what fails there.
+
+        mismatch    f: exact = approximate (exact / approximate)^f of all parameters; 1 is the problem's own
+        plants      percent within which exact parameters are drawn; none of 100 plants may fail
+        latency     commands arrive later, by whole cycles
+        noise       deviation of white noise on every measured quantity, as a share of its range along the reference
+        lost        probability that a sample of a cycle is lost
+
+    Args:
+        task: a problem with its controllers.
+        over: names of quantities; None: all.
+        controllers: names; None: all.
+        fails: relative error from which a run has failed.
+        seed: of noise, lost samples and plants, the same in all runs.
+        compiled: whether loops run as compiled C.
+        folder: of finished limits, which the same call does not search again.
+        command: that reproduces it.
+        progress: called with (controller, quantities done, in all).
+
+    Raises:
+        InvalidName: no such quantity or controller; the nearest one is offered.
+    """
+    begin, chosen = time.perf_counter(), select(task, controllers)
     check_gains(task, chosen)
-    for name in over or ():
+    wanted = list(over or QUANTITIES)
+    for name in wanted:
         if name not in QUANTITIES:
             raise InvalidName(f"quantity '{name}' is unknown.{nearest(name, QUANTITIES)}")
-    ready = replace(task, controllers={n: believing(task.problem, c) for n, c in chosen.items()})
-    for name in chosen:
-        runner = Runner(ready, name, [m for m in task.metrics if m.name == "rms_error"], compiled=compiled)
-        for done, what in enumerate(over or QUANTITIES):
-            rows.append({"controller": name, "quantity": what, **_limit(task.problem, what, runner, fails)})
-            if progress:
-                progress(name, done + 1, len(over or QUANTITIES))
-    return Limits(table=pd.DataFrame(rows), fails=fails, **circumstances(task, chosen, command, begin))
+    metrics = [*(m for m in task.metrics if m.name == "rms_error"), Metric("outside", _outside)]
+    header = header_of(replace(task, controllers=chosen), {"kind": "limits", "fails": fails, "seed": seed}, metrics)
+    with Kept(folder and folder / "limits.jsonl", header) as kept:
+        rows = {(row["controller"], row["quantity"]): row for row in kept.rows}
+        for name in chosen:
+            runner = Runner(task, name, metrics, compiled=compiled)
+            for done, what in enumerate(wanted, 1):
+                if (name, what) not in rows:
+                    found = {"controller": name, "quantity": what, **_limit(task.problem, what, seed, runner, fails)}
+                    rows[name, what] = found
+                    kept.append(found)
+                if progress:
+                    progress(name, done, len(wanted))
+    table = pd.DataFrame([rows[name, what] for name in chosen for what in wanted])
+    return Limits(table=table, fails=fails, **circumstances(task, chosen, command, begin))
 
 
-def _limit(problem: Problem, what: str, runner: Runner, fails: float) -> Mapping[str, object]:
-    try:
-        quantity = QUANTITIES[what](problem)
-    except FpirhcError as error:
-        return {"unit": "", "holds": math.nan, "fails": math.nan, "why": f"not tried: {error}"}
+def _outside(problem: Problem, run: Run) -> float:
+    """By how much a state leaves its limits, as a share of their width."""
+    signal = "plant_state" if "plant_state" in run.layout else "state"
+    late, worst = measured_cycles(problem, run), 0.0
+    for name, (lower, upper) in problem.limits.states.items() if late.any() else ():
+        values = run[f"{signal}.{name}"][late]
+        width = upper - lower if math.isfinite(upper - lower) else abs(upper if math.isfinite(upper) else lower)
+        width = width or float(np.abs(values).max()) or 1.0  # the only limit may be zero
+        worst = max(worst, float(max(lower - values.min(), values.max() - upper)) / width)
+    return worst
+
+
+def _why(row: Row, fails: float) -> str:
+    """Why a run failed; empty where it did not."""
+    if row["why"]:
+        return str(row["why"]).partition(";")[0]
+    if row["outside"] > _OUTSIDE:
+        return "a state leaves its limits"
+    return "" if row["error"] <= fails else f"error of {in_percent(row['error'])}"
+
+
+def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float) -> Mapping[str, object]:
     reasons: dict[float, str] = {}
 
     def failed(value: float) -> bool:
         if value not in reasons:
             try:
-                worst = max(
-                    runner.records(quantity.at(value)),
-                    key=lambda r: r["error"] if r["error"] == r["error"] else math.inf,
-                )
-                reasons[value] = worst["why"] or (
-                    "" if worst["error"] <= fails else f"error of {in_percent(worst['error'])}"
-                )
+                rows = runner.rows(quantity.at(value))
+                reasons[value] = next(filter(None, map(partial(_why, fails=fails), rows)), "")
             except FpirhcError as error:
+                if value <= quantity.first:
+                    raise
                 reasons[value] = str(error)
         return bool(reasons[value])
 
-    holds, ends = (math.nan, quantity.start) if failed(quantity.start) else bracket(failed, quantity)
+    try:
+        quantity = QUANTITIES[what](problem, seed)
+        start = failed(quantity.start)
+        holds, ends = (math.nan, quantity.start) if start else bracket(failed, quantity)
+    except FpirhcError as error:
+        return {"unit": "", "holds": math.nan, "fails": math.nan, "why": f"not tried: {error}"}
     return {"unit": quantity.unit, "holds": holds, "fails": ends, "why": reasons.get(ends, "")}
 
 
 def bracket(failed: Callable[[float], bool], of: Quantity) -> tuple[float, float]:
-    """Return the largest value that holds and the smallest one that fails; infinity where none fails."""
-    holds, fails = of.start, of.first
+    """Return the largest value that holds and the smallest one that fails, by doubling and halving; infinity where none fails."""
+    holds, fails = of.start, min(of.first, of.most)
     while not failed(fails):
         if fails >= of.most:
             return fails, math.inf
         holds, fails = fails, min(2 * fails, of.most)
     for _ in range(_HALVINGS):
-        if fails <= _NEAR * holds:
+        if fails <= _NEAR * holds or (of.whole and fails - holds < 1.5 * of.first):
             break
         middle = math.sqrt(holds * fails) if holds > 0 else fails / 2
+        if of.whole:
+            middle = of.first * round((holds + fails) / 2 / of.first)
         holds, fails = (holds, middle) if failed(middle) else (middle, fails)
     return holds, fails

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,75 +12,79 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import betaincinv  # scipy.stats takes a second to import
 
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.compare import check_gains, select
 from fpirhc.studies.comparison.verdict import Outcome
-from fpirhc.studies.objective import Objective, figure
-from fpirhc.studies.variants import Variants, run_variants
+from fpirhc.studies.objective import Objective, objective
+from fpirhc.studies.runs import run_variants
+from fpirhc.studies.variants import CasesOf, Draws, Variants
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent
 
-FEWEST = 6  # variants of which an interval at 95 % can be told
+_TAIL = 0.025  # on either side of an interval
+_CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VariantStudy(Study):
-    """The result of `study`."""
+    """The result of `study`.
 
-    table: pd.DataFrame  # a row per controller and variant
-    summary: (
-        pd.DataFrame
-    )  # a row per controller: median, worst, where, failures, difference to the first one and its interval
-    figure: Objective  # the number that is judged
+    Args:
+        table: a row per controller and variant, see `run_variants`.
+        summary: a row per controller: worst, worst_in, failures, median, difference to the first one (the median of the paired
+            ones), its 95 % interval from low to high, and in how many variants it is better.
+        groups: the same of every group of cases.
+        figure: the number that is judged.
+        variants: of the study.
+    """
+
+    table: pd.DataFrame
+    summary: pd.DataFrame
+    groups: dict[str, pd.DataFrame]
+    figure: Objective
     variants: Variants
 
     @property
+    def count(self) -> int:
+        """Number of variants."""
+        return len(self.table) // len(self.summary)
+
+    @property
     def view(self) -> View:
-        heads = [
-            Column(h)
-            for h in (
-                "controller",
-                f"median {self.figure.noun}",
-                "worst",
-                "in",
-                "failures",
-                "difference",
-                "95 %",
-                "better in",
-            )
+        title = f"{self.problem}: {self.count} variants"
+        tables = [
+            self._shown(title, self.summary),
+            *(self._shown(f"group {g}", some) for g, some in self.groups.items()),
         ]
-        shown = Table(
-            f"{self.problem}: {len(self.table) // max(len(self.summary), 1)} variants", heads, repr(self.variants)
-        )
-        text, apart = self.figure.text, self.figure.difference
-        for name, row in self.summary.iterrows():
-            interval = "" if math.isnan(row.low) else f"{apart(row.low)} to {apart(row.high)}"
-            difference = "" if math.isnan(row.difference) else apart(row.difference)
-            cells = [
-                text(row["median"]),
-                text(row.worst),
-                row.worst_in,
-                str(row.failures),
-                difference,
-                interval,
-                str(row.better),
-            ]
-            shown.add([str(name), *cells])
-        groups = self.table.loc[self.table.group != ""].groupby(["group", "controller"], sort=False)
-        lists = {
-            "Groups": [f"{g}, {c}: median error {in_percent(float(some.error.median()))}" for (g, c), some in groups]
-        }
         failed = self.table.loc[self.table.outcome != "finished"].groupby("controller", sort=False).first()
-        lists["Why runs failed"] = [f"{n}, {r.variant}: {r.outcome} {r.why}" for n, r in failed.iterrows()]
+        lists = {
+            "Why runs failed": [f"{r.controller}, {r.variant}: {r.outcome} {r.why}".rstrip() for r in _rows(failed)],
+            "Worst runs": [*_commands(self)],
+        }
         facts = {
+            "problem": self.problem,
+            "variants": str(self.variants),
+            "headline": self.figure.column,
             "summary": self.summary.reset_index().to_dict("records"),
-            "variants": repr(self.variants),
+            "groups": {g: some.reset_index().to_dict("records") for g, some in self.groups.items()},
             "versions": self.versions,
         }
-        return self.viewed(list(_sentences(self)), repr(self.variants), (shown,), facts, lists=lists)
+        return self.viewed([*_sentences(self)], f"{self.variants}.", tables, facts, lists=lists)
+
+    def _shown(self, title: str, summary: pd.DataFrame) -> Table:
+        noun = self.figure.noun
+        heads = ["controller", f"worst {noun}", "in", "failures", f"median {noun}", "difference", "95 %", "better in"]
+        shown = Table(title, [*map(Column, heads[:-1]), Column(heads[-1], None)])  # the verdict has it
+        text, apart = self.figure.text, self.figure.difference
+        for row in _rows(summary):
+            between = "" if math.isnan(row.low) else f"{apart(row.low)} to {apart(row.high)}"
+            difference = "" if math.isnan(row.difference) else apart(row.difference)
+            better = f"{row.better} of {row.variants}" if row.controller != summary.index[0] else ""
+            numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between, better]
+            shown.add([row.controller, *numbers])
+        return shown
 
 
 @checked_call
@@ -89,7 +94,7 @@ def study(
     *,
     controllers: Sequence[str] | None = None,
     headline: str | None = None,
-    processes: int = 1,
+    processes: int | None = None,
     compiled: bool = True,
     folder: Path | None = None,
     command: str = "",
@@ -102,7 +107,7 @@ def study(
         variants: `CasesOf`, `Draws` or `Grid`.
         controllers: names, the first of which the others are compared with; None: all.
         headline: the number that is judged; None: the problem's, or the relative error.
-        processes: number of processes.
+        processes: number of processes, see `run_variants`.
         compiled: whether loops run as compiled C.
         folder: where rows are kept, so that the same call goes on after an interruption.
         command: that reproduces it.
@@ -110,69 +115,129 @@ def study(
     """
     begin, chosen = time.perf_counter(), select(task, controllers)
     check_gains(task, chosen)
-    aim = figure(task.headline_metric if headline is None else headline, task.metrics, task.problem)
+    aim = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
     table = run_variants(
         task,
         variants,
         controllers=list(chosen),
         processes=processes,
         compiled=compiled,
+        judged=aim.judged,
         keep=folder and folder / "runs.jsonl",
         progress=progress,
     )
+    named = table.loc[table.group != ""]
+    groups = {str(g): summarised(some, aim) for g, some in named.groupby("group", sort=False)}
     facts = circumstances(task, chosen, command, begin)
-    return VariantStudy(table=table, summary=summarised(table, aim), figure=aim, variants=variants, **facts)
+    summary = summarised(table, aim)
+    return VariantStudy(table=table, summary=summary, groups=groups, figure=aim, variants=variants, **facts)
 
 
 def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
-    """Return a row per controller. Smaller values are better; a run that failed counts as worse than every other one."""
-    column = table["error"] if aim.metric is None else table[aim.name] * (-1 if aim.better == "larger" else 1)
-    values = column.where(table.outcome != "ended early", math.inf).fillna(math.inf)
-    wide = table.assign(value=values).pivot(index="variant", columns="controller", values="value")
-    wide = wide[list(dict.fromkeys(table.controller))]
+    """Return a row per controller, see `VariantStudy`. A run that failed is worse than every other one."""
+    values = table.assign(
+        value=[aim.value(dict(zip(map(str, table), row, strict=True))) for row in table.itertuples(index=False)]
+    )
+    wide = values.pivot(index="variant", columns="controller", values="value")
+    wide = wide.loc[[*dict.fromkeys(table.variant)], [*dict.fromkeys(table.controller)]]
     failures = (table.outcome != "finished").groupby(table.controller).sum()
-    apart = wide.sub(wide.iloc[:, 0], axis=0).where(np.isfinite(wide).all(axis=1), math.nan)
-    rows = {}
-    for name in wide:
-        finite = apart[name].dropna().to_numpy()
-        first = name == wide.columns[0]
-        low, high = (math.nan, math.nan) if first or len(finite) < FEWEST else _interval(finite)
+    first, rows = wide.iloc[:, 0].to_numpy(), {}
+    for name in map(str, wide):
+        own, baseline = wide[name].to_numpy(), name == wide.columns[0]
+        both = np.isinf(own) & np.isinf(first)
+        apart = np.where(both, 0.0, own - np.where(both, 0.0, first))
+        low, high = (math.nan, math.nan) if baseline else interval(apart)
         rows[name] = {
-            "median": wide[name].median(),
-            "worst": wide[name].max(),
-            "worst_in": wide[name].idxmax(),
+            "worst": aim.sign * own.max(),
+            "worst_in": wide.index[int(own.argmax())],
             "failures": int(failures[name]),
-            "difference": math.nan if first or not len(finite) else float(np.median(finite)),
-            "low": low,
-            "high": high,
-            "better": "" if first else f"{int((wide[name] < wide.iloc[:, 0]).sum())} of {len(wide)}",
+            "median": aim.sign * middle(own),
+            "difference": math.nan if baseline else aim.sign * middle(apart),
+            "low": min(aim.sign * low, aim.sign * high),
+            "high": max(aim.sign * low, aim.sign * high),
+            "better": int((own < first).sum()),
+            "variants": len(own),
         }
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("controller")
 
 
-def _interval(values: np.ndarray) -> tuple[float, float]:
-    """The 95 % percentile bootstrap interval of the median."""
-    medians = np.median(np.random.default_rng(0).choice(values, (2000, len(values))), axis=1)
-    low, high = np.quantile(medians, (0.025, 0.975))
-    return float(low), float(high)
+def middle(values: np.ndarray) -> float:
+    """Return the median; an infinite number lies beyond all others, and half-way between the two infinities is zero."""
+    ordered = np.sort(values)
+    low, high = float(ordered[(len(ordered) - 1) // 2]), float(ordered[len(ordered) // 2])
+    return 0.0 if low == -high else (low + high) / 2
+
+
+def interval(values: np.ndarray) -> tuple[float, float]:
+    """Return the interval of order statistics that holds the median of any distribution at least 95 times of 100.
+
+    Below six values there is none, and both ends are NaN.
+    """
+    from scipy.special import bdtr  # scipy.stats takes a second to import
+
+    count = len(values)
+    beyond = int((bdtr(np.arange(count // 2 + 1), count, 0.5) <= _TAIL).sum())
+    ordered = np.sort(values)
+    return (float(ordered[beyond - 1]), float(ordered[count - beyond])) if beyond else (math.nan, math.nan)
+
+
+def share_interval(count: int, total: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of a share of which `count` of `total` were seen; at 0 and 1 all of it is on one side."""
+    from scipy.special import betaincinv
+
+    tail = 2 * _TAIL if count in (0, total) else _TAIL
+    low = 0.0 if count == 0 else float(betaincinv(count, total - count + 1, tail))
+    return low, 1.0 if count == total else float(betaincinv(count + 1, total - count, 1 - tail))
 
 
 def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
-    aim, count = result.figure, len(result.table) // max(len(result.summary), 1)
-    first = result.summary.index[0]
-    for name, row in result.summary.iloc[1:].iterrows():
-        clear = Outcome.BETTER if row.high < 0 else Outcome.WORSE if row.low > 0 else Outcome.NO_DIFFERENCE
-        said = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than"}.get(
-            clear, "is not clearly different from"
-        )
-        yield f"{name} {said} {first} by {aim.noun}: {aim.better} in {row.better}.", clear
-    for name, row in result.summary.loc[result.summary.failures > 0].iterrows():
-        low = betaincinv(row.failures, count - row.failures + 1, 0.025)
-        high = betaincinv(row.failures + 1, count - row.failures, 0.975) if row.failures < count else 1.0
+    aim, summary = result.figure, result.summary
+    than, most = ("smaller", "smallest") if aim.sign > 0 else ("larger", "largest")
+    for row in _rows(summary.iloc[1:]):
+        share = f"{than} in {row.better} of {row.variants}"
+        if math.isnan(row.low):  # too few for an interval
+            yield f"{row.controller} against {summary.index[0]} by {aim.noun}: {share}.", None
+            continue
+        ends = sorted((aim.sign * row.low, aim.sign * row.high))
+        clear = Outcome.BETTER if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
+        said = _CLEAR.get(clear, "is not clearly different from")
         yield (
-            f"{name} fails in {row.failures} of {count} ({in_percent(low)} to {in_percent(high)} of what is drawn so).",
-            None,
+            f"{row.controller} {said} {summary.index[0]} by {aim.noun}: {than} in {row.better} of {row.variants}.",
+            clear,
         )
+    axes = getattr(result.variants, "axes", {})
+    for name, some in result.table.groupby("controller", sort=False) if axes else ():
+        good = some.loc[some.outcome == "finished"]
+        if len(good) and good[aim.column].nunique() > 1:
+            best = int((aim.sign * good[aim.column]).to_numpy().argmin())
+            number, place = aim.text(good[aim.column].iloc[best]), good.variant.iloc[best]
+            yield f"{name}: the {most} {aim.noun} is {number}, at {place}.", None
+    for row in _rows(summary):
+        low, high = share_interval(row.failures, row.variants)
+        drawn = f": {in_percent(low)} to {in_percent(high)} of what is drawn so, with 95 % confidence"
+        if result.variants.random or row.failures:
+            yield (
+                f"{row.controller} fails in {row.failures} of {row.variants}{drawn if result.variants.random else ''}.",
+                None,
+            )
+
+
+def _rows(frame: pd.DataFrame) -> Iterator[Any]:
+    return iter(frame.reset_index().itertuples())
+
+
+def _commands(result: VariantStudy) -> Iterator[str]:
+    """The command that makes the worst run of every controller once more."""
+    seeds = result.table.set_index(["controller", "variant"])["seed"].to_dict()
+    for row in _rows(result.summary):
+        words, of = ["fpirhc", "run", result.problem, row.controller], result.variants
+        if isinstance(of, Draws):
+            words += ["--draw", row.worst_in, "--mismatch", f"{of.percent:.17g}", "--seed", str(of.seed)]
+        elif isinstance(of, CasesOf):
+            words += ["--case", row.worst_in, "--seed", str(seeds[row.controller, row.worst_in])]
+        else:
+            continue
+        yield shlex.join(words)
 
 
 def figure_of(result: VariantStudy) -> Any:
@@ -180,7 +245,8 @@ def figure_of(result: VariantStudy) -> Any:
     from fpirhc.simulation.drawing import PALETTE, draw_legend, new_figure
 
     axes, table = getattr(result.variants, "axes", {}), result.table
-    column = "error" if result.figure.metric is None else result.figure.name
+    column, units = result.figure.column, table.attrs["units"]
+    with_unit = {name: f"{name} [{units[name]}]" if name in units else name for name in (column, *axes)}
     shown = table.assign(shown=table[column].where(table.outcome == "finished"))
     names = list(dict.fromkeys(table.controller))
     if len(axes) == 2:
@@ -191,15 +257,22 @@ def figure_of(result: VariantStudy) -> Any:
             mesh = panel.pcolormesh(
                 cells.columns, cells.index, cells, shading="nearest", vmin=shown.shown.min(), vmax=shown.shown.max()
             )
-            panel.set(title=name, xlabel=x, ylabel=y)
-        figure.colorbar(mesh, ax=list(panels), label=column)
+            panel.set(title=name, xlabel=with_unit[x], ylabel=with_unit[y])
+        figure.colorbar(mesh, ax=list(panels), label=with_unit[column])
         return figure
     figure = new_figure(9, 4.5, f"{result.problem}: {column}")
     axis = figure.subplots()
     for name, colour in zip(names, PALETTE * len(names), strict=False):
         own = shown[shown.controller == name]
         across = own[next(iter(axes))] if axes else np.linspace(0, 100, len(own))
-        axis.semilogy(across, own.shown if axes else np.sort(own.shown), ".-", color=colour, label=name)
-    axis.set(xlabel=next(iter(axes), "share of the variants [%]"), ylabel=column)
+        axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colour, label=name)
+    axis.set_yscale("log" if shown.shown.min() > 0 else "linear")
+    axis.set(xlabel=with_unit[next(iter(axes))] if axes else "share of the variants [%]", ylabel=with_unit[column])
     draw_legend(axis)
     return figure
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> None:
+    """Write a table with the units of its columns in their headings."""
+    units = table.attrs.get("units", {})
+    table.rename(columns={name: f"{name} [{unit}]" for name, unit in units.items()}).to_csv(path, index=False)

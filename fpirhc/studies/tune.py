@@ -7,33 +7,45 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from fpirhc.errors import InvalidProblem, package
+from fpirhc.controllers.base import Controller
+from fpirhc.controllers.contract import resolved
+from fpirhc.describe import digest
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import checked_call
+from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import current_setting, is_whole, with_settings
-from fpirhc.studies.comparison.compare import harm_of_adaptation, select
-from fpirhc.studies.objective import objective
-from fpirhc.studies.variants import Draws, Runner, Variants
+from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting, is_whole, with_settings
+from fpirhc.studies.comparison.compare import check_gains, harm_of_adaptation, select
+from fpirhc.studies.objective import Objective, objective
+from fpirhc.studies.runs import Runner
+from fpirhc.studies.variants import Draws, Variant, Variants
 from fpirhc.studies.view import Progress
-from fpirhc.summary import in_units
+from fpirhc.summary import written_out
 
-FAILED = 10.0  # cost of a run that failed, times up to two
+_STARTS = 10  # first trials, which are random
 
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """The result of `tune`."""
+    """The result of `tune`.
+
+    Args:
+        problem: its name.
+        table: a row per setting: controller, setting, before, best, cost_before, cost, trials.
+        harm: what speaks against the adaptation with the best settings, by controller.
+    """
 
     problem: str
-    table: pd.DataFrame  # a row per setting: controller, setting, before, best, cost_before, cost
-    harm: Mapping[str, tuple[str, ...]]  # what speaks against the adaptation with the best settings, by controller
+    table: pd.DataFrame
+    harm: Mapping[str, tuple[str, ...]]
 
     def settings(self) -> dict[str, dict[str, float]]:
         """Return the best settings by controller and path."""
         return {
-            name: dict(zip(some.setting, some.best, strict=True))
+            str(name): dict(zip(some.setting, some.best, strict=True))
             for name, some in self.table.groupby("controller", sort=False)
         }
 
@@ -50,7 +62,7 @@ def tune(
     *,
     trials: int,
     variants: Variants | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     controllers: Sequence[str] | None = None,
     metric: str | None = None,
     compiled: bool | None = None,
@@ -59,56 +71,105 @@ def tune(
 ) -> Tuning:
     """Try settings of every controller with a search space and return the best; trials that `folder` holds are not repeated.
 
+    The cost is the mean over the variants: of the relative error, or of a metric, the negative one where larger is better; a run
+    that failed costs 10 to 20 times the range of the reference. The settings as they are count too, so the best is never worse.
+    A search that is interrupted goes on to the same end.
+
+    Args:
+        trials: of every controller.
+        variants: that all trials share; None: the problem itself with the noise of `seed`.
+        controllers: names; None: those with a search space.
+        metric: a number of a run; None: the problem's `headline_metric`, or the relative error.
+        compiled: whether loops run as compiled C; None: where runs are long.
+        folder: of the trials.
+        progress: called with (controller, trials done, in all).
+
     Raises:
         InvalidProblem: no search space.
+        InvalidValue: no trial, or a metric that cannot be judged.
         NotInstalled: Optuna.
     """
     optuna: Any = package("optuna", "tune", "tuning")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    if not task.tuning:
-        raise InvalidProblem(
-            f"problem '{task.name}' has no search space; add tuning = {{NAME: {{'deformation.gain': fp.LogSpan(-2, -0.1)}}}}"
-        )
+    if trials < 1:
+        raise InvalidValue(f"trials {trials}: expected at least 1")
+    chosen = select(task, controllers) if controllers or not task.tuning else select(task, [*task.tuning])
+    check_spaces(task, chosen)
+    check_gains(task, chosen)
     aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
-    metrics = [m for m in task.metrics if m.name in ("rms_error", aim.metric.name if aim.metric else "")]
-    every, rows, harm = list((variants or Draws(1, seed=seed)).of(task)), [], {}
+    variants = variants or Draws(1, seed=seed)
+    every, rows, harm = list(variants.of(task)), [], {}
+    metrics = [m for m in task.metrics if m.name == "rms_error" or m is aim.metric]
     folder.mkdir(parents=True, exist_ok=True)
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "trials.log")))
-    for name in select(task, controllers) if controllers else task.tuning:
-        controller, spans = task.controllers[name], task.tuning[name]
-        runner = Runner(task, name, metrics, compiled=compiled)
-
-        def cost(
-            trial: Any, controller: Any = controller, spans: Any = spans, runner: Runner = runner, name: str = name
-        ) -> float:
-            shares = {path: trial.suggest_float(path, 0.0, 1.0) for path in spans}
-            own = {p: span.number(shares[p]) for p, span in spans.items()}
-            own = {p: round(v) if is_whole(controller, p) else v for p, v in own.items()}
+    for name, controller in chosen.items():
+        runner = Runner(task, name, metrics, compiled=compiled, judged=aim.judged)
+        search = _Search(controller, task.tuning[name], runner, every, aim)
+        what = digest(task.problem, controller, task.tuning[name]), f"{variants!r}", aim.column, seed
+        study = optuna.create_study(storage=storage, study_name=f"{name} {what}", load_if_exists=True)
+        for number in range(len(_finished(study)), trials):
+            # A sampler for every trial: where the search was interrupted is then no part of it.
+            own_seed = int(np.random.SeedSequence(seed, spawn_key=(number,)).generate_state(1)[0])
+            study.sampler = optuna.samplers.TPESampler(seed=own_seed, n_startup_trials=_STARTS)
+            study.optimize(search, n_trials=1)
             if progress:
-                progress(name, trial.number + 1, trials)
-            return mean_cost(runner.records([replace(v, settings=own) for v in every]), aim)
-
-        sampler = optuna.samplers.TPESampler(seed=seed)
-        search = optuna.create_study(
-            storage=storage, study_name=f"{name} {variants!r} {aim.name} {seed}", load_if_exists=True, sampler=sampler
-        )
-        search.optimize(cost, n_trials=max(0, trials - len(search.trials)))
-        now = {path: current_setting(controller, path) for path in spans}
-        before = mean_cost(runner.records([replace(v, settings=now) for v in every]), aim)
-        found = (
-            {p: span.number(search.best_params[p]) for p, span in spans.items()} if search.best_value < before else now
-        )
-        found = {p: round(v) if is_whole(controller, p) else v for p, v in found.items()}
-        costs = {"cost_before": before, "cost": min(before, search.best_value)}
-        rows += [{"controller": name, "setting": p, "before": now[p], "best": v, **costs} for p, v in found.items()]
-        harm[name] = harm_of_adaptation(
-            task.problem, name, with_settings(controller, found), seed=seed, compiled=bool(compiled)
-        )
-    return Tuning(task.name, in_units(pd.DataFrame(rows), {}), harm)
+                progress(name, number + 1, trials)
+        done = _finished(study)[:trials]
+        best = min(done, key=lambda trial: trial.value)
+        now = {path: current_setting(controller, path) for path in search.spans}
+        before = search.cost(now)
+        found = search.numbers(best.params) if best.value < before else now
+        facts = {"cost_before": before, "cost": min(before, best.value), "trials": len(done)}
+        rows += [{"controller": name, "setting": p, "before": now[p], "best": v, **facts} for p, v in found.items()]
+        tuned = with_settings(controller, found)
+        harm[name] = harm_of_adaptation(task.problem, name, tuned, seed=seed, compiled=bool(compiled))
+    return Tuning(task.name, pd.DataFrame(rows), harm)
 
 
-def mean_cost(rows: Any, aim: Any) -> float:
-    """Return the mean cost of runs: the relative error or the metric, smaller is better; one that failed costs `FAILED`."""
-    column, sign = ("error", 1) if aim.metric is None else (aim.name, -1 if aim.better == "larger" else 1)
-    costs = [sign * r[column] if r["outcome"] == "finished" else FAILED if aim.metric is None else 1e12 for r in rows]
-    return sum(costs) / len(costs)
+def _finished(study: Any) -> list[Any]:
+    return [trial for trial in study.get_trials(deepcopy=False) if trial.state.name == "COMPLETE"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The cost of a trial of one controller."""
+
+    controller: Controller
+    spans: TuningSpans
+    runner: Runner
+    variants: Sequence[Variant]
+    aim: Objective
+
+    def __call__(self, trial: Any) -> float:
+        return self.cost(self.numbers({path: trial.suggest_float(path, 0.0, 1.0) for path in self.spans}))
+
+    def numbers(self, shares: Mapping[str, float]) -> dict[str, float]:
+        """The settings at these shares of their spans."""
+        own = {path: span.number(shares[path]) for path, span in self.spans.items()}
+        return {path: round(v) if is_whole(self.controller, path) else v for path, v in own.items()}
+
+    def cost(self, own: Mapping[str, float]) -> float:
+        """The mean cost of settings over the variants."""
+        costs = [self.aim.cost(row) for row in self.runner.rows(replace(one, settings=own) for one in self.variants)]
+        return sum(costs) / len(costs)
+
+
+def check_spaces(task: Task, chosen: Mapping[str, Controller]) -> None:
+    """Raise unless all these controllers have a search space, with one that could be written."""
+    lacking = [name for name in chosen if not task.tuning.get(name)]
+    if not lacking:
+        return
+    adapting = [n for n, c in task.controllers.items() if n in lacking and c.deformation.adapts]
+    name = (adapting or lacking)[0]
+    for path, factors in (("deformation.gain", (3.0, 0.1)), ("tracking.rate", (0.3, 3.0))):
+        try:
+            value = current_setting(resolved(task.problem, task.controllers[name]), path)
+            ends = ", ".join(written_out(value * factor, 2) for factor in factors)
+            example = f"{{'{path}': fpirhc.{LogSpan.__name__}({ends})}}"
+            break
+        except FpirhcError:
+            example = "{'PATH': fpirhc.Span(LOW, HIGH)}"
+    raise InvalidProblem(
+        f"problem '{task.name}': no search space for controller {', '.join(map(repr, lacking))}; add to its file, for example, "
+        f"tuning = {{{name!r}: {example}}}"
+    )

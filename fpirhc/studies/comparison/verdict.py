@@ -1,7 +1,7 @@
 """The verdict: what adaptation does to a pair of controllers, as an outcome, a ratio per coordinate, and flags.
 
-An outcome follows from the ratios of the errors. A flag is a row of a table: what is measured of a run, from when on it counts, and a
-sentence; some turn a smaller error into a doubtful one.
+An outcome follows from the ratios of the errors. A flag is a row of a table: what is measured of a run, from when on it counts,
+and a sentence; some turn a smaller error into a doubtful one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.motion import with_space
 from fpirhc.simulation.loop import HeldInput
 from fpirhc.simulation.metrics.entries.errors import rms_error
-from fpirhc.simulation.simulate import judged_run, simulator
+from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
 from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
@@ -53,6 +53,16 @@ MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range,
 _SAMPLES = 2000
 
 
+def left_alone(problem: Problem, seed: int) -> dict[str, float]:
+    """Return the rms errors of the plant whose inputs are held; empty where it does not last, or is outside and so not run."""
+    try:
+        problem.require_equations("a plant outside is not run for the sake of a comparison")
+        run = simulator(problem, HeldInput(), compiled=False).run(seed=seed)
+    except FpirhcError:
+        return {}
+    return {} if run.stop is not None else dict(rms_error.values(problem, run))
+
+
 @dataclass(frozen=True)
 class Yardstick:
     """What errors are measured against, by judged coordinate."""
@@ -73,13 +83,7 @@ class Yardstick:
         weights = (problem.cost.tracked or {}) if problem.cost is not None else {}
         held = {n: weights[n] ** -0.5 if weights.get(n, 0) > 0 else 1.0 for n in places}
         scales = {n: size if size > small[n] else held[n] for n, size in both.items()}
-        try:
-            problem.require_equations("a plant outside is not run for the sake of a comparison")
-            run = judged_run(simulator(problem, HeldInput(), compiled=False), seed=seed)
-            alone = {} if run.stop is not None else dict(rms_error.values(problem, run))
-        except FpirhcError:
-            alone = {}
-        return Yardstick(scales, alone, frozenset(n for n in places if own[n] > small[n]))
+        return Yardstick(scales, left_alone(problem, seed), frozenset(n for n in places if own[n] > small[n]))
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than that of the plant left alone where nothing is to move."""
@@ -211,15 +215,16 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
         Outcome.MIXED if up and down else Outcome.WORSE if up else Outcome.BETTER if down else Outcome.NO_DIFFERENCE
     )
     raised = flags_of((plain, adaptive), yard)
+    said = [text for _, text in raised]
     if any(yard.beyond(plain, n) and yard.beyond(adaptive, n) for n in major):
-        outcome, raised = Outcome.NOT_COMPARABLE, [*raised, (None, "neither follows the reference")]
+        outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
     errors = ", ".join(
         f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(adaptive.run.unit(f'error.{n}'))}" for n in ratios
     )
     text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'})."
-    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for _, s in raised)]), outcome, names, ratios)
+    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
 
 
 def findings(

@@ -1,0 +1,366 @@
+"""Every controller's run in each variant as a row of one table. Rows are kept as they come, so that the same call goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import sys
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import pandas as pd
+
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import believing, resolved
+from fpirhc.describe import digest
+from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
+from fpirhc.problem_files.problem_file import Task, load_problem
+from fpirhc.problem_files.settings import as_declared, current_setting, unit_of_setting, with_settings
+from fpirhc.simulation.metrics.base import Metric, measure
+from fpirhc.simulation.run import Run
+from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator, with_judgements
+from fpirhc.studies.comparison.compare import select
+from fpirhc.studies.comparison.verdict import left_alone
+from fpirhc.studies.variants import Variant, Variants
+from fpirhc.studies.view import Progress, versions
+from fpirhc.summary import in_units
+from fpirhc.task.problem import Problem
+
+BLOCK = 64  # runs of a job at most
+FEW = 8  # runs, for which no other process is begun
+_LOOPS = 64  # that are kept
+_SAMPLES, _ROUNDING = 2000, 1e-9
+
+Row = dict[str, Any]
+
+
+class Runner:
+    """Runs one controller in variants; a loop is built once for all that it serves.
+
+    `judged`: whether runs have the signals that judge them, which take longer than the run.
+    """
+
+    def __init__(
+        self, task: Task, name: str, metrics: Sequence[Metric], *, compiled: bool | None, judged: bool = False
+    ) -> None:
+        self._task, self._name, self._controller = task, name, task.controllers[name]
+        self._metrics, self._compiled, self._judged = metrics, compiled, judged
+        self._loops: dict[object, Simulator | FpirhcError] = {}
+        self._codes: dict[object, Compiled] = {}
+        self._ranges, self._held = ranges(task.problem)
+
+    def rows(self, variants: Iterable[Variant]) -> Iterator[Row]:
+        """Yield the row of every variant. A setting that the controller does not have leaves it as it is."""
+        for one in variants:
+            yield self._row(one, self._own(one.settings))
+
+    def _own(self, settings: Mapping[str, float]) -> dict[str, float]:
+        own = {}
+        for path, value in settings.items():
+            with contextlib.suppress(FpirhcError):
+                current_setting(self._controller, path)
+                own[path] = value
+        return as_declared(self._controller, own)
+
+    def _row(self, one: Variant, own: Mapping[str, float]) -> Row:
+        row: Row = {"controller": self._name, "variant": one.name, "group": one.group, "seed": one.seed, **one.numbers}
+        try:
+            loop, live = self._loop(one, own)
+            settings = own if live else {}
+            run = loop.run(seed=one.seed, variant=one.problem, settings=settings or None)
+            if self._judged:
+                force = loop.in_force(one.problem, settings)
+                run = with_judgements(run, force.problem, force.controller)
+        except FpirhcError as error:
+            return row | {"outcome": "refused", "error": math.nan, "lasted": 0.0, "why": str(error)}
+        return row | self._numbers(one, run)
+
+    def _numbers(self, one: Variant, run: Run) -> Row:
+        metrics = measure(one.problem, run, self._metrics)
+        errors = metrics.rms_error
+        error = math.inf if run.stop else relative(errors, self._ranges)
+        outcome = "ended early" if run.stop else "finished" if self._follows(one, errors, error) else "diverged"
+        flat = {m.key(element): value for m, element, value in metrics}
+        lasted = run.cycles / one.problem.cycles
+        return {"outcome": outcome, "error": error, "lasted": lasted, **flat, "why": run.stop or ""}
+
+    def _follows(self, one: Variant, errors: Mapping[str, float], error: float) -> bool:
+        """Whether the error is smaller than the motion; where a reference rests, than that of the plant left alone."""
+        if error <= 1 or not self._held or not math.isfinite(error):
+            return error <= 1
+        alone = left_alone(one.problem, one.seed)
+        sizes = {c: max(r, alone.get(c, 0.0)) if c in self._held else r for c, r in self._ranges.items()}
+        return relative(errors, sizes) <= 1
+
+    def _loop(self, one: Variant, own: Mapping[str, float]) -> tuple[Simulator, bool]:
+        """The loop of a variant, and whether its settings are live in it; where they cannot be it is built with them."""
+        found = self._built(one, own, live=True)
+        if isinstance(found, FpirhcError) and own:
+            found = self._built(one, own, live=False)
+            if isinstance(found, Simulator):
+                return found, False
+        if isinstance(found, FpirhcError):
+            raise found
+        return found, True
+
+    def _built(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:
+        key = one.build, tuple(own) if live else tuple(own.items())
+        ready = self._loops.pop(key, None)
+        if ready is None or (isinstance(ready, Simulator) and ready.remembers):
+            if len(self._loops) >= _LOOPS:
+                self._loops.pop(next(iter(self._loops)))
+            ready = self._composed(one, own, live=live)
+        self._loops[key] = ready
+        return ready
+
+    def _composed(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:
+        base, controller, paths = one.built or one.problem, self._controller, tuple(own) if live else ()
+        once = one.alone or not live
+        try:
+            controller = controller if live else with_settings(controller, own)
+            if not paths:
+                checked(base, controller)
+            controller = believing(one.believed, controller) if one.believed else controller
+            loop = ComposedLoop.of(base, resolved(base, controller), paths)
+            # A loop that runs once is worth a compiler where the run is long.
+            return loop.simulator(self._compiled and (None if once and not paths else True), known=self._codes)
+        except FpirhcError as error:
+            return error
+
+
+def relative(errors: Mapping[str, float], sizes: Mapping[str, float]) -> float:
+    """Return the rms errors over these sizes, root mean square over the coordinates; infinite where one is no number."""
+    shares = [rms / sizes[c] for c, rms in errors.items()]
+    error = math.hypot(*shares) / math.sqrt(len(shares))
+    return error if math.isfinite(error) else math.inf
+
+
+def ranges(problem: Problem) -> tuple[dict[str, float], frozenset[str]]:
+    """Return the range of the reference of every judged coordinate, its start included, 1 where there is none; and which rest."""
+    times, plant = np.linspace(0.0, problem.duration, _SAMPLES), problem.plant
+    states = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[0].full())
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
+    spans, largest = np.ptp(states[places], axis=1), np.abs(states[places]).max(axis=1)
+    sizes = np.maximum(spans, np.abs(states[places, 0] - problem.start_output[places]))
+    resting = spans <= _ROUNDING * largest
+    names = problem.judged_names
+    whole = {c: float(s) if s > 0 else 1.0 for c, s in zip(names, sizes, strict=True)}
+    return whole, frozenset(c for c, rests in zip(names, resting, strict=True) if rests)
+
+
+def run_variants(
+    task: Task,
+    variants: Variants,
+    *,
+    controllers: Sequence[str] | None = None,
+    metrics: Sequence[Metric] | None = None,
+    processes: int | None = None,
+    compiled: bool | None = True,
+    judged: bool = False,
+    keep: Path | None = None,
+    progress: Progress | None = None,
+) -> pd.DataFrame:
+    """Run every controller in every variant and return a row for each, in order; its `attrs["units"]` are those of the columns.
+
+    Columns: controller, variant, group, seed, a column for every path that a grid changes, outcome ('finished', 'diverged' with an
+    error as large as the motion, 'ended early', 'refused'), error (relative to the references' ranges), lasted (share of the
+    cycles), a column for every number of a metric, and why a run failed.
+
+    Args:
+        controllers: names; None: all.
+        metrics: None: those of the task.
+        processes: number of processes; None: what a `joblib.parallel_config` around the call says, else 1. With
+            `joblib.parallel_config(backend="dask")` and a Dask client the runs go to its cluster.
+        compiled: whether loops are compiled; those that run once are so where the run is long.
+        judged: whether runs have the signals that judge them.
+        keep: file of JSON lines; rows that it holds are not run again, and new ones are added as they come.
+        progress: called with (controller, done, in all).
+
+    Raises:
+        InvalidName: no such controller; the nearest is offered.
+        InvalidProblem: more than one process, and the task is not the one of its file.
+        OutputError: the file holds rows of another study, or cannot be written.
+        WorkerDied: a process was killed.
+    """
+    chosen = replace(task, controllers=select(task, controllers))
+    metrics = task.metrics if metrics is None else metrics
+    every = variants.of(chosen)
+    with Kept(keep, header_of(chosen, {**variants.same, "judged": judged}, metrics)) as kept:
+        titles = {one: k for k, one in enumerate(one.name for one in every)}
+        rows = {(r["controller"], r["variant"]): r for r in kept.rows}
+        counts = {n: sum((n, title) in rows for title in titles) for n in chosen.controllers}
+        jobs = _jobs(rows, titles, chosen.controllers, joblib.effective_n_jobs(processes))
+        for row in _answers(task, variants, jobs, processes, (metrics, compiled, judged), every):
+            kept.append(row)
+            name = row["controller"]
+            rows[name, row["variant"]], counts[name] = row, counts[name] + 1
+            if progress:
+                progress(name, counts[name], len(every))
+    frame = pd.DataFrame([rows[n, title] for n in chosen.controllers for title in titles])
+    return in_units(frame, _units(task.problem, metrics, frame))
+
+
+def _jobs(
+    rows: Mapping[tuple[str, str], Row], titles: Mapping[str, int], names: Mapping[str, object], workers: int
+) -> list[tuple[str, tuple[int, ...]]]:
+    """What is to run: controllers take turns, so that processes begin with different loops."""
+    lacking = {n: [k for title, k in titles.items() if (n, title) not in rows] for n in names}
+    size = max(1, min(BLOCK, -(-max(map(len, lacking.values())) // (2 * workers))))
+    blocks = {n: [tuple(todo[at : at + size]) for at in range(0, len(todo), size)] for n, todo in lacking.items()}
+    if workers == 1:
+        return [(n, block) for n, some in blocks.items() for block in some]
+    most = max(map(len, blocks.values()))
+    return [(n, some[k]) for k in range(most) for n, some in blocks.items() if k < len(some)]
+
+
+def _answers(
+    task: Task,
+    variants: Variants,
+    jobs: Sequence[tuple[str, tuple[int, ...]]],
+    processes: int | None,
+    how: tuple[Sequence[Metric], bool | None, bool],
+    every: Sequence[Variant],
+) -> Iterator[Row]:
+    metrics, compiled, judged = how
+    if joblib.effective_n_jobs(processes) == 1 or sum(len(some) for _, some in jobs) <= FEW:
+        for name, group in _by_name(jobs).items():
+            runner = Runner(task, name, metrics, compiled=compiled, judged=judged)
+            yield from runner.rows(every[k] for k in group)
+        return
+    path, told = str(task.path), _told(task, metrics)
+    _require_same(load_problem(path), told)
+    work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered", batch_size=1)
+    answers = work(joblib.delayed(_remote)(path, told, variants, n, some, compiled, judged) for n, some in jobs)
+    try:
+        for rows in answers:
+            yield from rows
+    except _deaths() as error:
+        raise WorkerDied(
+            "a process of the study was killed, perhaps for want of memory; finished runs are kept: the same call goes on with the "
+            f"others ({type(error).__name__})"
+        ) from None
+    finally:
+        with contextlib.suppress(Exception):
+            answers.close()
+
+
+def _by_name(jobs: Sequence[tuple[str, tuple[int, ...]]]) -> dict[str, list[int]]:
+    found: dict[str, list[int]] = {}
+    for name, some in jobs:
+        found.setdefault(name, []).extend(some)
+    return found
+
+
+def _deaths() -> tuple[type[BaseException], ...]:
+    """What joblib and Dask raise where a worker was killed."""
+    scheduler = sys.modules.get("distributed.scheduler")
+    known = () if scheduler is None else (scheduler.KilledWorker,)
+    return (BrokenProcessPool, *known)
+
+
+def _told(task: Task, metrics: Sequence[Metric]) -> str:
+    return digest(task.problem, task.controllers, [m.name for m in metrics])
+
+
+def _require_same(task: Task, told: str) -> None:
+    if _told(task, task.metrics) != told:
+        raise InvalidProblem(
+            f"problem '{task.name}' is not that of '{task.path}', which other processes load; write the changes into the file, or "
+            "use one process"
+        )
+
+
+_OWN = threading.local()  # a worker of Dask has threads, and a loop serves one
+
+
+def _remote(
+    path: str, told: str, variants: Variants, name: str, some: Sequence[int], compiled: bool | None, judged: bool
+) -> list[Row]:
+    """The rows of some variants, in a process that keeps the loops of one study."""
+    study = told, repr(variants), compiled, judged
+    if getattr(_OWN, "study", None) != study:
+        task = load_problem(path)
+        _require_same(task, told)
+        _OWN.study, _OWN.task, _OWN.every, _OWN.runners = study, task, variants.of(task), {}
+    if name not in _OWN.runners:
+        _OWN.runners[name] = Runner(_OWN.task, name, _OWN.task.metrics, compiled=compiled, judged=judged)
+    return list(_OWN.runners[name].rows([_OWN.every[k] for k in some]))
+
+
+def _units(problem: Problem, metrics: Sequence[Metric], frame: pd.DataFrame) -> dict[str, str]:
+    units = {}
+    for column in map(str, frame):
+        for metric in metrics:
+            element = column.removeprefix(metric.name).removeprefix(".")
+            if column == metric.key(element):
+                units[column] = metric.unit_of(problem, element)
+        with contextlib.suppress(FpirhcError, KeyError):
+            units.setdefault(column, unit_of_setting(column, problem))
+    return units
+
+
+def header_of(task: Task, study: Mapping[str, object], metrics: Sequence[Metric]) -> dict[str, object]:
+    """Return what rows of a study depend on, beside what they say themselves."""
+    content = hashlib.sha256(task.path.read_bytes()).hexdigest()[:16] if task.path.is_file() else ""
+    facts = {"file": content, "problem": digest(task.problem), "metrics": [m.name for m in metrics], **versions()}
+    return {**study, **facts, **{f"controller '{n}'": digest(c) for n, c in task.controllers.items()}}
+
+
+class Kept:
+    """Rows in a file of JSON lines behind a header; without a path nothing is kept."""
+
+    def __init__(self, path: Path | None, header: Mapping[str, object]) -> None:
+        self.rows: list[Row] = []
+        self._path, self._file = path, None
+        if path is None:
+            return
+        first, lines = json.loads(json.dumps(header, default=str)), []
+        with self._writing():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.exists():
+                lines = path.read_text(encoding="utf-8").split("\n")[:-1]  # a torn last line is run again
+        try:
+            head, *self.rows = map(json.loads, lines) if lines else (first,)
+            other = {key for key in first if key in head and head[key] != first[key]}
+        except (ValueError, TypeError, AttributeError):
+            raise OutputError(
+                f"'{path}' holds no rows of a study; give another folder with --out, or remove it"
+            ) from None
+        if other:
+            said = ", ".join(f"{key} was {head[key]}, is {first[key]}" for key in first if key in other)
+            raise OutputError(
+                f"'{path}' holds rows of another study ({said}); give another folder with --out, or remove the file"
+            )
+        with self._writing():
+            path.write_text("".join(f"{line}\n" for line in (json.dumps(head | first), *lines[1:])), encoding="utf-8")
+            self._file = path.open("a", encoding="utf-8")
+
+    def append(self, row: Row) -> None:
+        """Add a row."""
+        if self._file is not None:
+            with self._writing():
+                self._file.write(json.dumps(row) + "\n")
+                self._file.flush()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise not_writable(self._path, error, "--out") from None
+
+    def __enter__(self) -> Kept:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            with contextlib.suppress(OSError):
+                self._file.close()
