@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, NoReturn, Self, TypeVar
@@ -79,7 +79,7 @@ class Planner:
     # the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired one
     tracking: Tracking | None
     # distances that plans keep from limits of states; None: those of the problem's horizon
-    margins: Mapping[str, Sequence[float]] | None = None
+    margins: Mapping[str, float] | None = None
     # whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response is
     # corrected
     consistent: bool | None = False

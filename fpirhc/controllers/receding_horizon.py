@@ -24,8 +24,8 @@ from fpirhc.controllers.replanning import (
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.horizon import in_tuple
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -56,7 +56,7 @@ class RecedingHorizon(Controller):
         deformation: the map between desired response and request; Identity() is plain receding-horizon control.
         replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromPlan).
         cost: of the plan; None: the problem's.
-        margins: by name of a state, the distances that plans keep from the state's limits; see `Horizon`. None: the horizon's.
+        margins: by name of a state, the distance that plans keep from the state's limits; see `Horizon`. None: the horizon's.
         follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
             `fpirhc.controllers.replanning` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
@@ -65,13 +65,8 @@ class RecedingHorizon(Controller):
     deformation: Deformation = field(default_factory=Identity)
     replanning: Replanning = field(default_factory=FromMeasurement)
     cost: Cost | None = None
-    margins: Mapping[str, Sequence[float]] | None = field(default=None, hash=False, metadata={"setting": "where given"})
+    margins: Mapping[str, NotNegative] | None = field(default=None, hash=False, metadata={"setting": "where given"})
     follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
-
-    def __post_init__(self) -> None:
-        if self.margins is not None:
-            margins = {name: in_tuple(margin) for name, margin in self.margins.items()}
-            object.__setattr__(self, "margins", margins)
 
     @property
     def planner(self) -> Planner:

@@ -7,7 +7,7 @@ of states keeps these limits too, and they are verified and named like states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -95,29 +95,6 @@ def ends(
     return [
         ConstraintState(f"{e} at the end", units[e], last * (next_state[places[e]] - target[places[e]]), -GAP, GAP)
         for e in dict.fromkeys(names)
-    ]
-
-
-def narrowed(
-    limits: Limits, plant: Plant, next_state: Expression, margin: Mapping[str, Expression]
-) -> list[ConstraintState]:
-    """Limits of states with a margin m that changes along the horizon, as entries with constant bounds.
-
-    A state between two limits c - h and c + h keeps |x - c| <= h - m, which is |z - c| <= h for z = c + (x - c) h / (h - m).
-    With one limit only, the entry is x + m or x - m.
-    """
-    places, boxes = {e: k for k, e in enumerate(plant.state.elements)}, limits.boxes(plant)
-
-    def value(x: Expression, m: Expression, lower: float, upper: float) -> Expression:
-        if math.isinf(lower) or math.isinf(upper):
-            return x + m if math.isfinite(upper) else x - m
-        centre, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-        return centre + (x - centre) * (half / (half - m))
-
-    bounds = {e: (boxes[e].lower, boxes[e].upper) for e in margin}
-    return [
-        ConstraintState(f"{e} with margin", boxes[e].unit, value(next_state[places[e]], m, *bounds[e]), *bounds[e])
-        for e, m in margin.items()
     ]
 
 

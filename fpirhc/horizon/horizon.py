@@ -36,9 +36,8 @@ class Horizon(Checked):
             limits and costs of input changes with the time since the change before. Prices of limits count every node alike.
         blocks: lengths of blocks of stages over which the inputs are held (move blocking); they add up to the stages. Empty: every
             stage has inputs of its own.
-        margins: by name of a state, the distances by which a plan stays inside the state's limits after stages 1 ... N, in the
-            state's unit: room for what the model does not predict. The problem's limits stay as they
-            are for the run and its metrics.
+        margins: by name of a state, the distance by which a plan stays inside the state's limits, in the state's unit: room for
+            what the model does not predict. The problem's limits stay as they are for the run and its metrics.
         replan: when the next plan is made: after one "stage", after one control "cycle", or after so many cycles, at most those of
             a stage. Where a plan follows sooner than a stage, the horizon begins at the cycle's own time, the last plan is
             interpolated to the new stages, and the change of the first input counts with the time that it takes: the limit of
@@ -49,8 +48,8 @@ class Horizon(Checked):
             from the plan's start. Controllers fill it in where a plan starts elsewhere, see `fpirhc.horizon.nominal`.
 
     Raises:
-        InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, margins that are not one
-            finite number of at least 0 for every stage, plans that follow in no whole number of cycles, or an integrator that is
+        InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, a margin that is not
+            a finite number of at least 0, plans that follow in no whole number of cycles, or an integrator that is
             not made of plain expressions.
     """
 
@@ -59,9 +58,7 @@ class Horizon(Checked):
     discretisation: Integrator = USUAL
     terminal: tuple[str, ...] = ()
     blocks: tuple[Count, ...] = ()
-    margins: Mapping[str, Sequence[NotNegative]] = field(
-        default_factory=dict, hash=False, metadata={"setting": "where given"}
-    )
+    margins: Mapping[str, NotNegative] = field(default_factory=dict, hash=False, metadata={"setting": "where given"})
     lengths: tuple[AtLeastOne, ...] = field(default=(), kw_only=True, metadata={"setting": "where given"})
     measured: tuple[str, ...] = field(default=(), kw_only=True, metadata={"setting": False})
     replan: Literal["stage", "cycle"] | Count = field(
@@ -72,7 +69,6 @@ class Horizon(Checked):
     def __post_init__(self) -> None:
         for name in ("terminal", "blocks", "lengths", "measured"):
             object.__setattr__(self, name, in_tuple(getattr(self, name)))
-        object.__setattr__(self, "margins", {name: in_tuple(margin) for name, margin in self.margins.items()})
         if self.lengths and (len(self.lengths) != self.stages or self.lengths[0] != 1):
             raise InvalidValue(
                 f"horizon: lengths must be {self.stages} finite numbers of at least 1, one for every stage in steps of the first, "
@@ -82,11 +78,6 @@ class Horizon(Checked):
             raise InvalidValue(
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
             )
-        for name, margin in self.margins.items():
-            if len(margin) != self.stages:
-                raise InvalidValue(
-                    f"horizon: margins of '{name}' must be {self.stages} numbers, one for every stage, got {described(margin)}"
-                )
         if self.discretisation.opaque:
             raise InvalidValue("a horizon needs an integrator of plain expressions, such as RungeKutta4() or Collocation()")
 

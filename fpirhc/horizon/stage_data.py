@@ -34,8 +34,6 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     """
     free = (scalar("free"),) if horizon.blocks else ()
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
-    names = tuple(horizon.margins)
-    margin = (Signal("margin", names, tuple(units[e] for e in names)),) if names else ()
     shown = horizon.measured
     offset = (Signal("offset", shown, tuple(units[e] for e in shown)),) if shown else ()
     haste = (scalar("haste"),) if hastened(horizon) else ()
@@ -46,7 +44,6 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
         Signal("feedforward", plant.input.elements, plant.input.units),
         plant.parameter,
         *free,
-        *margin,
         *offset,
         *haste,
         *length,
@@ -87,7 +84,7 @@ def stage_data(
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
     # The live rows come out of the same call where they follow these rows: joining tables would copy both.
-    plain = not (horizon.blocks or horizon.terminal or horizon.margins or horizon.measured) and not hastened(horizon)
+    plain = not (horizon.blocks or horizon.terminal or horizon.measured) and not hastened(horizon)
     joined = bool(live) and plain
     rows = [matrix.sym("live", live)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
@@ -105,9 +102,6 @@ def stage_data(
         free = np.zeros((1, nodes))
         free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
         table = ca.vertcat(table, free)
-    if horizon.margins:
-        margins = np.array([[*horizon.margins[e], 0.0] for e in horizon.margins], dtype=float)
-        table = ca.vertcat(table, margins)
     if horizon.measured:
         table = ca.vertcat(table, np.zeros((len(horizon.measured), nodes)))
     if hastened(horizon):

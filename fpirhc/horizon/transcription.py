@@ -20,7 +20,6 @@ from fpirhc.horizon.constraint_states import (
     inside,
     limited,
     measured,
-    narrowed,
     soft_names,
     softened,
     state_prices,
@@ -80,7 +79,13 @@ def _transcribed(
     nominal(cost).check(plant)
     limits.check(plant)
     _check_names(plant, horizon, limits)
-    same, live = (plant.equations, reference, cost, limits, *others.values()), [n.of(ca.SX) for n in others.values()]
+    whole = limits
+    if horizon.margins:
+        inside_by = {
+            name: (limits.states[name][0] + m, limits.states[name][1] - m) for name, m in horizon.margins.items()
+        }
+        limits = replace(limits, states={**limits.states, **inside_by})
+    same, live = (plant.equations, reference, cost, whole, *others.values()), [n.of(ca.SX) for n in others.values()]
 
     def expressed() -> tuple[_Stage, tuple[ca.Function, ...]]:
         stage = _stage_expressions(plant, reference, horizon, cost, limits, live)
@@ -107,7 +112,7 @@ def _transcribed(
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     functions: dict[object, ca.Function] = {}
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
-    lower, upper = hard_state_bounds(limits, plant, {*horizon.margins, *horizon.measured})
+    lower, upper = hard_state_bounds(limits, plant, horizon.measured)
     of_entries = _sizes_of_entries(plant, horizon, limits, nodes[0], len(binding))
     state = _stage_state(plant, bool(free), binding)
     ocp = OptimalControl(
@@ -304,9 +309,9 @@ def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
         )
     for name in horizon.margins.keys() & limits.states.keys():
         lower, upper = limits.states[name]
-        if 2 * max(horizon.margins[name]) >= upper - lower:
+        if 2 * horizon.margins[name] >= upper - lower:
             mistakes.add(
-                f"margins of '{name}' reach {max(horizon.margins[name]):.6g}, which leaves nothing between its limits "
+                f"margins of '{name}' is {horizon.margins[name]:.6g}, which leaves nothing between its limits "
                 f"{lower:g} and {upper:g}; widen the limits, or adapt faster"
             )
     mistakes.raise_if_any()
@@ -357,10 +362,7 @@ def _written(
         state = Named(plant.state.elements, _seen(plant, horizon, earlier.state.vector, data), "state")
         entries += inside(limits, plant, earlier, state, k)
     seen_next = _seen(plant, horizon, x_next, data)
-    if horizon.margins:
-        margin = dict(zip(horizon.margins, ca.vertsplit(data["margin"]), strict=True))
-        entries += narrowed(limits, plant, seen_next, margin)
-    hard_ones = [name for name in horizon.measured if name not in {*limits.soft, *horizon.margins}]
+    hard_ones = [name for name in horizon.measured if name not in limits.soft]
     entries += measured(hard_ones, limits, plant, seen_next)
     if horizon.terminal:
         entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])

@@ -313,7 +313,7 @@ def _remedy(stuck: list[str], others: list[str]) -> str:
 
 
 def _softened(name: str) -> str:
-    return name.removesuffix(" rate").removesuffix(" with margin")
+    return name.removesuffix(" rate")
 
 
 def _at_their_limits(ocp: OptimalControl, inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> list[str]:

@@ -69,6 +69,6 @@ def test_so_do_soft_limits_and_priced_ones(settings: dict[str, Any]) -> None:
 
 def test_so_do_limits_with_margins() -> None:
     """A tenth of the limit is kept free, of the measured speed."""
-    margins = {"speed": [0.1] * 20}
+    margins = {"speed": 0.1}
     run = simulated(servo(0.7), fp.RecedingHorizon(SOLVED, ADAPTIVE, margins=margins))
     assert 0.88 < fastest(run) < 0.93
