@@ -190,8 +190,7 @@ def ways(horizons: Horizons) -> dict[str, Callable[[], Callable]]:
         "FixedPoint, converged, virtual machine": lambda: follow(fixed, ocp, fixed.converging(ocp)),
         "fatrop, functions compiled": lambda: rival(fp.Fatrop(accuracy=accuracy), ocp, JIT),
         "IPOPT": lambda: rival(fp.Ipopt(accuracy=accuracy), ocp, {}),
-        "SQP (Gauss-Newton) with qrqp, compiled": lambda: rival(fp.SequentialQuadratic(), ocp, JIT),
-        "SQP (Gauss-Newton) with OSQP": lambda: rival(fp.SequentialQuadratic(quadratic=fp.Osqp()), ocp, {}),
+        "SQP (Gauss-Newton) with OSQP": lambda: rival(fp.SequentialQuadratic(), ocp, {}),
     }
 
 

@@ -33,12 +33,11 @@ from .learning.estimators.disturbance_kalman import DisturbanceKalman
 from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
 from .learning.rules.lyapunov_rule import LyapunovRule
 from .learning.rules.projection import Projection
-from .optimisers.anderson import Anderson
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
 from .optimisers.ladder import Ladder
-from .optimisers.nlp import Fatrop, Ipopt, Osqp, Qrqp, SequentialQuadratic
+from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
 from .plant.integrators import Collocation, Cvodes, Euler, RungeKutta4
@@ -97,7 +96,6 @@ __all__ = [
     "RFPT",
     "Affine",
     "Algebraic",
-    "Anderson",
     "Answer",
     "Band",
     "Believed",
@@ -152,7 +150,6 @@ __all__ = [
     "ModelReferenced",
     "Noise",
     "Normal",
-    "Osqp",
     "Output",
     "OverTime",
     "Paired",
@@ -168,7 +165,6 @@ __all__ = [
     "Problem",
     "Projection",
     "Pulse",
-    "Qrqp",
     "Quadratic",
     "Quantity",
     "RFPTVector",
@@ -213,11 +209,10 @@ __all__ = [
     "check",
     "compare",
     "figures",
+    "limits",
     "load_problem",
     "load_run",
     "measure",
-    "limits",
-    "study",
     "outside",
     "probe",
     "review",
@@ -226,6 +221,7 @@ __all__ = [
     "simulate",
     "simulator",
     "solve",
+    "study",
     "tune",
     "with_settings",
     "write_report",

@@ -184,12 +184,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     memory = optimiser.memory(ocp).starting_at(built_first_memory(start, optimiser, ocp, data_of))
     solve = built(optimiser, ocp, "step")
     low, high = problem.limits.input_ends(plant)
-    writes = (
-        like(plant.input, "planned"),
-        Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)),
-        discrete("_solve_status"),
-        *map(scalar, optimiser.logged),
-    )
+    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)), discrete("_solve_status"))
 
     def step(s: Signals) -> dict[str, Value]:
         own = own_values(problem, s)
@@ -218,14 +213,12 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         )  # the plan is held, of least violation or the last one, shifted
         after = memory.split(next_memory)
         remembered_next = {f"{m}_next": v for m, v in after.items()}
-        shown = {name: after[source] for name, source in optimiser.logged.items()}
         return {
             "planned": inputs[:, 0],
             "solve": diagnostics,
             "_solve_status": judged,
             "plan_begun_next": 1,
             **remembered_next,
-            **shown,
         }
 
     def derived(values: Mapping[str, float]) -> Derived:

@@ -79,7 +79,9 @@ class Horizon(Checked):
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
             )
         if self.discretisation.opaque:
-            raise InvalidValue("a horizon needs an integrator of plain expressions, such as RungeKutta4() or Collocation()")
+            raise InvalidValue(
+                "a horizon needs an integrator of plain expressions, such as RungeKutta4() or Collocation()"
+            )
 
     @property
     def relative_lengths(self) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import ClassVar, Literal
 
@@ -45,11 +45,6 @@ class Optimiser(Checked, ABC):
     def unbounded(self) -> str:
         """Why a call may take any time, with a remedy; empty where its work is bounded."""
         return ""
-
-    @property
-    def logged(self) -> Mapping[str, str]:
-        """Scalars of the memory that a run logs: signal -> name in the memory."""
-        return {}
 
     @property
     def in_data(self) -> tuple[str, ...]:

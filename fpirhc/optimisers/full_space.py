@@ -18,7 +18,6 @@ from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl, rollout
-from fpirhc.optimisers.anderson import Anderson, iterated
 from fpirhc.optimisers.base import Optimiser, call_arguments, judged_plan, shift
 from fpirhc.symbolic.expression import expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal
@@ -36,7 +35,6 @@ class FullSpaceFixedPoint(Optimiser):
         tolerance: of the stationarity, in the unit of the inputs.
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/sigma_max(H)^2 along the reference.
         scaled: iterate on variables that make the rows of H of the same size (Ruiz), which helps by orders of magnitude.
-        acceleration: Anderson(m), or None.
     """
 
     cannot_keep = ("inputs",)
@@ -45,7 +43,6 @@ class FullSpaceFixedPoint(Optimiser):
     tolerance: Positive
     map: Deformation | None = None
     scaled: bool = False
-    acceleration: Anderson | None = None
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if anything is bounded, or the map's gain cannot contract.
@@ -88,9 +85,8 @@ class FullSpaceFixedPoint(Optimiser):
         states = ca.if_else(fresh, ca.vec(guess), remembered_parts["plan_states"])
         start = ca.vertcat(states, remembered_parts["plan_inputs"], remembered_parts["plan_multipliers"])
         scale = ca.DM(_scaling(ocp, self.scaled)[0])
-        last = scale * iterated(
-            self._transformation(ocp), start / scale, [s0, data], self.iterations, self.acceleration
-        )
+        repeated = self._transformation(ocp).fold(self.iterations)
+        last = scale * repeated(ca.vertcat(start / scale, s0, ca.vec(data)))[: start.numel()]
         plan = ca.reshape(last[n * ns : n * (ns + nu)], nu, n)
         finite, posed, diagnostics = judged_plan(ocp, arguments, plan, (self.iterations, self.tolerance), last)
         before = ca.reshape(remembered_parts["plan_inputs"], nu, n)
@@ -99,10 +95,10 @@ class FullSpaceFixedPoint(Optimiser):
         return ca.Function("fpirhc_full_space", arguments, results)
 
     def _transformation(self, ocp: OptimalControl) -> ca.Function:
-        """Function (scaled column z, s0, data) -> scaled column z+."""
+        """Function of the column (scaled z, s0, data), of which z goes on."""
         nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
-        column = ca.MX.sym("z", n * (2 * ns + nu))
-        s0, data = ca.MX.sym("s0", ns), ca.MX.sym("data", ocp.data.size, n + 1)
+        column, flat = ca.MX.sym("z", n * (2 * ns + nu)), ca.MX.sym("data", ocp.data.size * (n + 1))
+        s0, data = ca.MX.sym("s0", ns), ca.reshape(flat, ocp.data.size, n + 1)
         factors, largest = _scaling(ocp, self.scaled)
         scale = ca.DM(factors)
         states, inputs, multipliers = ca.vertsplit(scale * column, [0, n * ns, n * (ns + nu), column.numel()])
@@ -112,7 +108,10 @@ class FullSpaceFixedPoint(Optimiser):
         map_in_use = Affine(gain=-2 * _SAFE / largest**2) if self.map is None else self.map
         request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(column.numel())))
         next_column, _ = map_in_use.step(request, error, none, {})
-        return ca.Function("fpirhc_transformed_auxiliary", [column, s0, data], [graph(next_column)])
+        one = ca.Function("fpirhc_transformed_auxiliary", [column, s0, flat], [graph(next_column)])
+        given = ca.MX.sym("given", column.numel() + ns + flat.numel())
+        parts = ca.vertsplit(given, [0, column.numel(), column.numel() + ns, given.numel()])
+        return ca.Function("fpirhc_auxiliary_iteration", [given], [ca.vertcat(one(*parts), *parts[1:])])
 
 
 def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:
@@ -128,7 +127,7 @@ def _scaling(ocp: OptimalControl, scaled: bool) -> tuple[np.ndarray, float]:
     return factors, largest
 
 
-EXAMPLES = (FullSpaceFixedPoint(iterations=300, tolerance=1e-6, scaled=True, acceleration=Anderson(8)),)
+EXAMPLES = (FullSpaceFixedPoint(iterations=3000, tolerance=1e-6, scaled=True),)
 
 
 def _auxiliary(ocp: OptimalControl) -> ca.Function:

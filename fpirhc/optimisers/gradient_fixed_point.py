@@ -17,7 +17,6 @@ from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, steepest_curvature
-from fpirhc.optimisers.anderson import Anderson, iterated
 from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, remembered_plan, shift
 from fpirhc.symbolic.expression import expression, graph
 from fpirhc.symbolic.layout import Layout, Signal
@@ -33,7 +32,6 @@ class GradientFixedPoint(Optimiser):
         iterations: per call.
         tolerance: of the stationarity, in the unit of the inputs.
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/L, L the largest curvature along the reference.
-        acceleration: Anderson(m), or None.
     """
 
     cannot_keep = ("states",)
@@ -41,7 +39,6 @@ class GradientFixedPoint(Optimiser):
     iterations: Count
     tolerance: Positive
     map: Deformation | None = None
-    acceleration: Anderson | None = None
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if states are bounded, or the map's gain cannot contract.
@@ -73,8 +70,10 @@ class GradientFixedPoint(Optimiser):
         nu, n = ocp.input.size, ocp.stages
         s0, data, lower, upper, memory = arguments = call_arguments(ocp, nu * n)
         start = remembered_plan(memory, nu, lower, upper)
-        last = iterated(self._transformation(ocp), start, [s0, data, lower, upper], self.iterations, self.acceleration)
-        inputs = clip(ca.reshape(last, nu, n), lower, upper)
+        transformed, column = self._transformation(ocp), ca.vec(start)
+        for _ in range(self.iterations):
+            column = transformed(column, s0, data, lower, upper)
+        inputs = clip(ca.reshape(column, nu, n), lower, upper)
         finite, posed, diagnostics = judged_plan(ocp, arguments, inputs, (self.iterations, self.tolerance))
         plan = ca.if_else(finite, inputs, start)
         # A remembered plan under which a well-posed problem overflows is given up, so that the next call can succeed.

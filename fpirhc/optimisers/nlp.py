@@ -1,4 +1,4 @@
-"""Nonlinear programming through CasADi by direct multiple shooting: IPOPT, fatrop, and SQP with OSQP or qrqp.
+"""Nonlinear programming through CasADi by direct multiple shooting: IPOPT, fatrop, and SQP with OSQP.
 
     variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F(s_i, u_i) = 0,
 
@@ -8,7 +8,7 @@ Theory: docs/theory-plants.md.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
@@ -16,7 +16,6 @@ from typing import NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.optimisers.base import (
@@ -326,97 +325,40 @@ class Fatrop(MultipleShooting):
 
 
 @dataclass(frozen=True)
-class QuadraticSolver(Checked, ABC):
-    """Contract: a solver of the quadratic programs inside `SequentialQuadratic`."""
-
-    @property
-    @abstractmethod
-    def plugin(self) -> str:
-        """CasADi's name of the solver."""
-
-    @abstractmethod
-    def options(self) -> Options:
-        """CasADi's options of the solver."""
-
-    @property
-    def unbounded(self) -> str:
-        """Why a call may take any time, with a remedy; empty where its work is bounded."""
-        return ""
-
-
-@dataclass(frozen=True)
-class Qrqp(QuadraticSolver):
-    """CasADi's own active-set solver on a sparse QR factorisation.
-
-    Args:
-        iterations: most iterations of one program.
-    """
-
-    iterations: Count = 200
-
-    plugin = "qrqp"
-
-    def options(self) -> Options:
-        quiet = {"print_iter": False, "print_header": False, "print_info": False, "print_lincomb": False}
-        return {**quiet, "max_iter": self.iterations, "error_on_fail": False}
-
-
-@dataclass(frozen=True)
-class Osqp(QuadraticSolver):
-    """OSQP, an operator-splitting method.
-
-    Args:
-        accuracy: of both residuals.
-        iterations: most iterations of one quadratic program. CasADi passes no time limit on.
-    """
-
-    accuracy: Accuracy = 1e-8
-    iterations: Count = 20000
-
-    plugin = "osqp"
-
-    def options(self) -> Options:
-        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.iterations}
-        return {"osqp": inner, "error_on_fail": False}
-
-    @property
-    def unbounded(self) -> str:
-        if self.iterations <= _OSQP_BOUNDED:
-            return ""
-        return (
-            f"OSQP has no time limit, and an infeasible program takes all {self.iterations} iterations: "
-            f"give Osqp(iterations=...), at most {_OSQP_BOUNDED}"
-        )
-
-
-@dataclass(frozen=True)
 class SequentialQuadratic(MultipleShooting):
-    """Gauss-Newton SQP: the cost's own second derivatives, the dynamics linearised.
+    """Gauss-Newton SQP: the cost's own second derivatives, the dynamics linearised, the programs inside solved by OSQP.
 
     Args:
         tolerance: of the stationarity, in the unit of the inputs.
-        quadratic: solves the programs inside. CasADi's interfaces to fatrop and hpipm are not among them: the first has returned
-            infeasible points marked as solved, the second needs finite bounds on everything.
+        accuracy: of both residuals of OSQP, an operator-splitting method.
         iterations: of SQP per call; 1 is a real-time iteration.
+        splittings: most iterations of OSQP in one program. CasADi passes no time limit on.
     """
 
-    quadratic: QuadraticSolver = field(default_factory=Qrqp)
+    accuracy: Accuracy = 1e-8
     iterations: Count = 20
+    splittings: Count = 20000
 
     @property
     def unbounded(self) -> str:
-        return self.quadratic.unbounded
+        if self.splittings <= _OSQP_BOUNDED:
+            return ""
+        return (
+            f"OSQP has no time limit, and an infeasible program takes all {self.splittings} iterations: "
+            f"give SequentialQuadratic(splittings=...), at most {_OSQP_BOUNDED}"
+        )
 
     plugin = "sqpmethod"
 
     def options(self, ocp: OptimalControl) -> Options:
+        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.splittings}
         return {
             **_QUIET,
             "print_header": False,
             "print_iteration": False,
             "print_status": False,
-            "qpsol": self.quadratic.plugin,
-            "qpsol_options": self.quadratic.options(),
+            "qpsol": "osqp",
+            "qpsol_options": {"osqp": inner, "error_on_fail": False},
             "max_iter": self.iterations,
             "tol_pr": 1e-8,
             "tol_du": 1e-8,
@@ -425,19 +367,10 @@ class SequentialQuadratic(MultipleShooting):
         }
 
 
-EXAMPLES = (
-    Ipopt(tolerance=1e-6),
-    Fatrop(tolerance=1e-6),
-    SequentialQuadratic(tolerance=1e-6),
-    SequentialQuadratic(tolerance=1e-6, quadratic=Osqp()),
-)
+EXAMPLES = (Ipopt(tolerance=1e-6), Fatrop(tolerance=1e-6), SequentialQuadratic(tolerance=1e-6))
 CHOICES = {
     "ipopt": ("IPOPT", lambda tolerance: Ipopt(tolerance=tolerance)),
     "fatrop": ("fatrop", lambda tolerance: Fatrop(tolerance=tolerance)),
-    "qrqp": ("SQP qrqp", lambda tolerance: SequentialQuadratic(tolerance=tolerance)),
-    "osqp": ("SQP OSQP", lambda tolerance: SequentialQuadratic(tolerance=tolerance, quadratic=Osqp())),
-    "osqp-rti": (
-        "OSQP, one iteration",
-        lambda tolerance: SequentialQuadratic(tolerance=tolerance, quadratic=Osqp(), iterations=1),
-    ),
+    "osqp": ("SQP OSQP", lambda tolerance: SequentialQuadratic(tolerance=tolerance)),
+    "osqp-rti": ("OSQP, one iteration", lambda tolerance: SequentialQuadratic(tolerance=tolerance, iterations=1)),
 }

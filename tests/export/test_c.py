@@ -379,7 +379,7 @@ def test_a_name_that_c_does_not_take_is_refused(name):
         device_of(problem, controllers["CTC"], "CTC", name=name)
 
 
-@pytest.mark.parametrize("optimiser", [fp.Ipopt(1e-6), fp.Fatrop(1e-6), fp.SequentialQuadratic(1e-6, fp.Osqp())])
+@pytest.mark.parametrize("optimiser", [fp.Ipopt(1e-6), fp.Fatrop(1e-6), fp.SequentialQuadratic(1e-6)])
 def test_a_solver_with_a_library_of_its_own_is_refused_by_name(optimiser):
     problem, _ = two_mass()
     controller = fp.RecedingHorizon(optimiser, fp.Sigmoid(gain=-0.5, scale=50.0))

@@ -390,11 +390,3 @@ def test_prices_are_refused_by_who_cannot_take_them():
         fp.solve(ocp, IPOPT, first, data)
     with pytest.raises(FpirhcError, match="both soft and priced"):
         horizon_of(fp.Limits(states={"angle": (0, 1)}, soft={"angle": 1.0}, prices={"angle": 1.0}))
-
-
-def test_a_plan_stays_in_its_ellipsoid():
-    """By the sum of squares itself, of every stage that is limited."""
-    ocp, data, first = horizon_of(CASES["ellipsoid"][0])
-    states = fp.solve(ocp, FIXED, first, data).states
-    inside = ((states[0, :-1] - 0.1) / 0.7) ** 2 + (states[1, :-1] / 0.9) ** 2
-    assert inside.max() == pytest.approx(1.0, abs=1e-6)

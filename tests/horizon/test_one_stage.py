@@ -18,7 +18,6 @@ OPTIMISERS = {
     "IPOPT": fp.Ipopt(tolerance=1e-5),
     "fatrop": fp.Fatrop(tolerance=1e-5),
     "SQP": fp.SequentialQuadratic(tolerance=1e-5),
-    "ladder": fp.Ladder(fp.FixedPoint(iterations=3, tolerance=1e-7), fp.Ipopt()),
 }
 LIMITS = {
     "none": fp.Limits(),

@@ -143,7 +143,6 @@ OPTIMISERS = {
     "reduced gradient": fp.ReducedGradient(iterations=60, tolerance=1e-5),
     "interior point": fp.Ipopt(tolerance=1e-6),
     "sequential quadratic": fp.SequentialQuadratic(tolerance=1e-6),
-    "ladder": fp.Ladder(fp.FixedPoint(iterations=1, tolerance=1e-6), fp.Ipopt(tolerance=1e-6)),
 }
 
 

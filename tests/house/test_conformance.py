@@ -194,7 +194,7 @@ class Dishonest(Optimiser):
 
     @property
     def near_plan(self):
-        changed = {"wider near a plan": fp.Ladder(self.within, self.within), "off near a plan": Dishonest("off")}
+        changed = {"wider near a plan": fp.Ipopt(), "off near a plan": Dishonest("off")}
         return changed.get(self.change, self)
 
     def memory(self, ocp):

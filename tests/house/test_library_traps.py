@@ -18,7 +18,7 @@ import fpirhc as fp
 from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import status_of
-from fpirhc.optimisers.nlp import Ipopt, Osqp, SequentialQuadratic
+from fpirhc.optimisers.nlp import Ipopt, SequentialQuadratic
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.live import SMOOTHING, signed_power
@@ -59,7 +59,7 @@ def test_a_maximum_hides_nan_in_a_residual():
 def test_osqp_fills_infeasible_answers_with_finite_numbers():
     """A plan without solution is not called a success."""
     ocp = horizon(fp.Limits(inputs={"u": (-0.1, 0.1)}, states={"y": (-0.2, 0.2)}))
-    optimiser = SequentialQuadratic(tolerance=1e-3, quadratic=Osqp())
+    optimiser = SequentialQuadratic(tolerance=1e-3)
     memory = optimiser.memory(ocp).start()
     first = np.array([2.0, 1.0])
     _, diagnosis, _ = optimiser.step(ocp)(first, ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)

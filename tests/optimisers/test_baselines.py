@@ -17,12 +17,11 @@ from fpirhc.optimisers.full_space import auxiliary_hessian
 FIRST = np.array([0.5, -0.5])
 
 
-@pytest.mark.parametrize("acceleration", [None, fp.Anderson(5)], ids=["plain", "Anderson"])
 @pytest.mark.parametrize("high", [100.0, 1.0])
-def test_the_reduced_form_finds_the_same_optimum(acceleration, high):
+def test_the_reduced_form_finds_the_same_optimum(high):
     """Slower than the default, and the same plan, bounds active or not."""
     ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (-high, high)}))
-    slow = fp.GradientFixedPoint(iterations=400, tolerance=1e-7, acceleration=acceleration)
+    slow = fp.GradientFixedPoint(iterations=400, tolerance=1e-7)
     plan = fp.solve(ocp, slow, FIRST, data)
     best = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-8), FIRST, data)
     assert plan.status == fp.Status.OK
@@ -90,13 +89,13 @@ def short(nodes):
 
 
 def test_the_baseline_is_orders_of_magnitude_slower_and_scaling_helps():
-    """After the same 2000 iterations: plain, scaled, scaled with Anderson; the default needs seven."""
+    """After the same 2000 iterations: plain, scaled; the default needs seven."""
     ocp, data = pendulum_problem()
     left = []
-    for settings in ({}, {"scaled": True}, {"scaled": True, "acceleration": fp.Anderson(10)}):
+    for settings in ({}, {"scaled": True}):
         optimiser = fp.FullSpaceFixedPoint(iterations=2000, tolerance=1e-6, **settings)
         left.append(fp.solve(ocp, optimiser, FIRST, data, calls=1).stationarity or 0.0)
-    assert left[0] > left[1] > 100 * left[2]
+    assert left[0] > left[1] > 1e-6
     assert fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), FIRST, data).iterations < 10
 
 
@@ -118,8 +117,6 @@ def test_settings_are_checked(kind):
     for settings in ({"iterations": 0, "tolerance": 1.0}, {"iterations": 1, "tolerance": -1.0}):
         with pytest.raises(ValueError, match=r"expected a whole number from 1|expected a finite number above 0"):
             kind(**settings)
-    with pytest.raises(ValueError, match=r"Anderson.memory: expected a whole number from 1"):
-        fp.Anderson(0)
 
 
 @pytest.mark.parametrize("kind", [fp.GradientFixedPoint, fp.FullSpaceFixedPoint])

@@ -26,7 +26,7 @@ from fpirhc.symbolic.program import generate
 
 SHIPPED: Any = tasks  # whose horizons and controllers are of known kinds
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
-BACKENDS = (fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic(), fp.SequentialQuadratic(quadratic=fp.Osqp()))
+BACKENDS = (fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic())
 FIXED = fp.FixedPoint(iterations=8, tolerance=1e-6)
 EVERY: tuple[Any, ...] = (GRADIENT, FIXED, *BACKENDS)
 BOXES = {

@@ -75,13 +75,12 @@ def test_columns_of_a_report(adaptive):
 
 def test_order_of_a_file():
     assert list(BY_NAME)[:4] == ["cycles", "rms_error", "max_error", "iae"]
-    assert list(BY_NAME)[-7:] == [
+    assert list(BY_NAME)[-6:] == [
         "solve.median_iterations",
         "solve.worst_iterations",
         "solve.median_stationarity",
         "solve.worst_stationarity",
         "solve.worst_feasibility",
-        "solve.second_plans",
         "plans",
     ]
     assert list(BY_NAME).index("settling") < list(BY_NAME).index("effort") < list(BY_NAME).index("status")

@@ -78,13 +78,6 @@ def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every me
     return len(different) if alone else int(np.unique(different, axis=0).shape[0])
 
 
-def second_plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every metric is given the problem
-    """Number of plans of a ladder's second optimiser; None without one."""
-    if "second_plans" not in run.layout or not run.cycles:
-        return None
-    return int(run["second_plans"].max())
-
-
 def residual(value: float) -> str:
     """Return a residual in one digit."""
     return written_out(value, 1)
@@ -133,15 +126,6 @@ METRICS = (
     ),
     Metric(
         "solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94, reads=_SOLVE
-    ),
-    Metric(
-        "solve.second_plans",
-        second_plans,
-        report=False,
-        compared="exact",
-        finite=True,
-        order=94.5,
-        reads=("second_plans",),
     ),
     Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95, reads=_SOLVE),
 )
