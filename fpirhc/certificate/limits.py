@@ -101,9 +101,8 @@ def certify_limits(
         if not over or not plans or problem.horizon is None or last:
             break
         margins = {name: least + _MORE * over.get(name, 0.0) for name, least in margins.items()}
-        none = (0.0,) * problem.horizon.stages
-        wider = {name: tuple(m + more for m in own.get(name, none)) for name, more in margins.items()}
-        if any(2 * max(m) >= np.ptp(problem.limits.states[name]) for name, m in wider.items()):  # nothing is left
+        wider = {name: own.get(name, 0.0) + more for name, more in margins.items()}
+        if any(2 * m >= np.ptp(problem.limits.states[name]) for name, m in wider.items()):  # nothing is left
             break
         problem = replace(problem, horizon=replace(problem.horizon, margins=wider))
     return certificate
