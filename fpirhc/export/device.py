@@ -309,6 +309,6 @@ def _read(text: str, function: re.Match[str]) -> str:
 
 def _static(part: _Part) -> str:
     """The definition, hidden from other files where it is not the visible one."""
-    if part.visible or not part.name or re.search(r"^(#define|static|INLINE|APART|TABLE)\b", part.text, re.MULTILINE):
+    if part.visible or not part.name or re.search(r"^(#define|static|INLINE|APART)\b", part.text, re.MULTILINE):
         return part.text
     return re.sub(r"^(?=\w)", "static ", part.text, count=1, flags=re.MULTILINE)

@@ -17,13 +17,13 @@ typedef const casadi_real* In;
 typedef casadi_real* Out;
 
 /* fmax and fmin without calls of the library: where one is not a number, the other. */
-INLINE casadi_real larger(casadi_real a, casadi_real b) { return EITHER((a > b) | (b != b), a, b); }
-INLINE casadi_real smaller(casadi_real a, casadi_real b) { return EITHER((a < b) | (b != b), a, b); }
+INLINE casadi_real larger(casadi_real a, casadi_real b) { return ((a > b) | (b != b)) ? a : b; }
+INLINE casadi_real smaller(casadi_real a, casadi_real b) { return ((a < b) | (b != b)) ? a : b; }
 
 /* fmin(fmax(v, low), high) without calls of the library: a v that is not a number becomes low there and here. */
 INLINE casadi_real between(casadi_real v, casadi_real low, casadi_real high) {
-  casadi_real above = EITHER(v > low, v, low);
-  return EITHER(above < high, above, high);
+  casadi_real above = v > low ? v : low;
+  return above < high ? above : high;
 }
 
 /* c (rows, columns) += a (rows, inner) b (inner, columns). Blocks of eight and of four rows are added up in registers. */
@@ -65,8 +65,8 @@ INLINE void transpose(Out restrict to, In restrict from, int rows, int columns) 
 INLINE void condense(Out q, Out cross, Out r, In p, In a, In b, Out turned) {
   casadi_real ahead[NS * NS], along[NS * NU], flat[NU * NS];
   int j;
-  for (j = 0; j < NS * NS; ++j) ahead[j] = ALL(0);
-  for (j = 0; j < NS * NU; ++j) along[j] = ALL(0);
+  for (j = 0; j < NS * NS; ++j) ahead[j] = 0;
+  for (j = 0; j < NS * NU; ++j) along[j] = 0;
   multiply(ahead, p, a, NS, NS, NS);
   multiply(along, p, b, NS, NS, NU);
   transpose(turned, a, NS, NS);
@@ -76,9 +76,9 @@ INLINE void condense(Out q, Out cross, Out r, In p, In a, In b, Out turned) {
   multiply(r, flat, along, NU, NS, NU);
 }
 
-INLINE Truth sane(In s0, In data, In lower, In upper) {
+INLINE int sane(In s0, In data, In lower, In upper) {
   int l;
-  Truth ok = all_finite(s0, NS) & all_finite(data, (N + 1) * NT);
+  int ok = all_finite(s0, NS) & all_finite(data, (N + 1) * NT);
   for (l = 0; l < NU; ++l) ok &= (lower[l] <= upper[l]) & (lower[l] <= FINITE) & (upper[l] >= -FINITE);
   return ok;
 }

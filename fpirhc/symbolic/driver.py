@@ -38,16 +38,6 @@ WORDS = """#if defined(__GNUC__)
 #else
 #define INLINE static inline
 #endif
-typedef int Truth;
-typedef casadi_real Number; /* of a table */
-#define TABLE static const
-#define YES 1
-#define NO 0
-#define NOT(m) (!(m))
-#define ANY(m) (m)
-#define EVERY(m) (m)
-#define EITHER(m, a, b) ((m) ? (a) : (b))
-#define ALL(a) (a)
 #if defined(__GNUC__) && !defined(__clang__)
 #define NOT_UNROLLED _Pragma("GCC unroll 1") /* small matrices stay in memory, so that their columns fill wide registers */
 #else
@@ -57,7 +47,7 @@ typedef casadi_real Number; /* of a table */
 #include <string.h>
 /* Whether all are at most FINITE, 2^-27 of the largest number. Their exponents say it, without comparisons of numbers: those that
    are too large carry into the first bit. */
-INLINE Truth all_finite(const casadi_real* v, int n) {
+INLINE int all_finite(const casadi_real* v, int n) {
   int i;
   uint32_t carried = 0;
   for (i = 0; i < n; ++i) {
@@ -85,7 +75,7 @@ class Driver:
 
     # C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys. ROOM
     # is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw; all their
-    # arguments and results have an address. Truths are written by `WORDS`.
+    # arguments and results have an address.
     text: str
     leaves: Mapping[str, ca.Function]  # generated Functions by key
     constants: Mapping[str, object]  # preprocessor definitions by name
@@ -192,38 +182,32 @@ def renamed(function: ca.Function, name: str) -> ca.Function:
 
 _TEXT = f"""
 int ENTRY{SIGNATURE} {{
-  casadi_real sums[8], total = ALL(0);
-  const Number large = 134217728;
-  const casadi_real* x = arg[0];
+  casadi_real sums[8], total = 0;
+  const casadi_real large = 134217728, *x = arg[0];
   int k = 0, j;
-  for (j = 0; j < 8; ++j) sums[j] = ALL(0);
+  for (j = 0; j < 8; ++j) sums[j] = 0;
   for (; k + 8 <= SIZE; k += 8)
     for (j = 0; j < 8; ++j) sums[j] += x[k + j] * large - x[k + j] * large;
   for (; k < SIZE; ++k) total += x[k] * large - x[k] * large;
   for (j = 0; j < 8; ++j) total += sums[j];
-  if (res[0]) res[0][0] = EITHER(total == 0, ALL(1), ALL(0));
+  if (res[0]) res[0][0] = total == 0;
   return 0;
 }}
 """
 
 _KEPT = f"""
 int ENTRY{SIGNATURE} {{
-  casadi_real sums[8], total = ALL(0);
-  const Number large = 134217728;
-  const casadi_real *x = arg[0], *old = arg[1];
-  casadi_real* kept = res[0];
-  Truth good;
+  casadi_real sums[8], total = 0, *kept = res[0];
+  const casadi_real large = 134217728, *x = arg[0], *old = arg[1];
   int k = 0, j;
-  for (j = 0; j < 8; ++j) sums[j] = ALL(0);
+  for (j = 0; j < 8; ++j) sums[j] = 0;
   for (; k + 8 <= SIZE; k += 8)
     for (j = 0; j < 8; ++j) {{ kept[k + j] = x[k + j]; sums[j] += x[k + j] * large - x[k + j] * large; }}
   for (; k < SIZE; ++k) {{ kept[k] = x[k]; total += x[k] * large - x[k] * large; }}
   for (j = 0; j < 8; ++j) total += sums[j];
-  good = total == 0;
-  if (res[1]) res[1][0] = EITHER(good, ALL(1), ALL(0));
-  good &= arg[2][0] != 0;
-  if (!EVERY(good))
-    for (k = 0; k < SIZE; ++k) kept[k] = EITHER(good, kept[k], old[k]);
+  if (res[1]) res[1][0] = total == 0;
+  if (total != 0 || arg[2][0] == 0)
+    for (k = 0; k < SIZE; ++k) kept[k] = old[k];
   return 0;
 }}
 """

@@ -130,7 +130,7 @@ int t_judged(In old, In u, In g, In next, double value, double after, double rea
   for (k = 0; k < N * NU; ++k) best.u[k] = old[k], plan.u[k] = u[k], best.g[k] = g[k], plan.g[k] = next[k];
   best.value = value, plan.value = after;
   s.tau = 1, s.gamma = 1e-3, s.envelope = value, s.reach = reach;
-  return judged(&s, &best, &plan, YES, YES, low, high);
+  return judged(&s, &best, &plan, 1, low, high);
 }
 """
 PIVOT, SHARE, ARMIJO = 1e-9, 0.9, 0.1
