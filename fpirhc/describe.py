@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from types import CodeType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -46,8 +47,14 @@ class FunctionName(str):
 
 def digest(*values: Any) -> str:
     """Return 16 hexadecimal digits of settings: what `describe` says, and the code of the functions that it only names."""
-    code = [one.__code__.co_code for value in values for one in _named(value) if hasattr(one, "__code__")]
+    code = [_said(one.__code__) for value in values for one in _named(value) if hasattr(one, "__code__")]
     return hashlib.sha256(repr(([*map(describe, values)], code)).encode()).hexdigest()[:16]
+
+
+def _said(code: CodeType) -> list[object]:
+    """Instructions, names and numbers of a function, those of functions inside it too."""
+    inside = [_said(one) if isinstance(one, CodeType) else one for one in code.co_consts]
+    return [code.co_code, code.co_names, inside]
 
 
 def identity(value: Any) -> tuple[str, tuple[object, ...]]:

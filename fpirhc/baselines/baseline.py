@@ -6,6 +6,7 @@ integrator's steps, and in CasADi's virtual machine.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -16,8 +17,7 @@ from typing import Any
 
 import pandas as pd
 
-from fpirhc.describe import digest
-from fpirhc.errors import BaselineError
+from fpirhc.errors import BaselineError, not_writable
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.shipped import missing
@@ -70,6 +70,11 @@ def baseline_path(task_file: Path, folder: Path | None = None) -> Path:
     return (folder or task_file.parent / "baselines") / f"{task_file.stem}.json"
 
 
+def file_hash(path: Path) -> str:
+    """Return 16 hexadecimal digits of a problem file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
 def written(facts: dict[str, Any]) -> str:
     """Return the text of a baseline, with a line for every controller."""
     rows = ",\n".join(
@@ -119,18 +124,21 @@ def accept(
             band = max(FACTOR * spread, TIGHT * abs(values[0]), floor)
             if math.isfinite(values[0] + band):
                 expected[metric] = [values[0], float(f"{1.005 * band:.3g}")]
-        controllers[name] = {"outcomes": outcomes, "settings": digest(task.controllers[name]), "metrics": expected}
+        controllers[name] = {"outcomes": outcomes, "metrics": expected}
     facts = {
         "problem": task.name,
         "reason": reason.strip(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": seed,
         "versions": versions(),
-        "settings": digest(task.problem),
+        "file": file_hash(task.path),
         "controllers": controllers,
     }
     path = baseline_path(task.path, baselines)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise not_writable(path.parent, error, "--baselines") from None
     write_whole(written(facts), path, "baseline")
     return path
 
@@ -141,7 +149,7 @@ class Judgement:
 
     problem: str
     rows: pd.DataFrame  # controller, metric, expected, band, fresh, holds
-    stale: tuple[str, ...] = ()  # settings that are not those of the baseline
+    stale: str = ""  # that the file is another one than that of the baseline
     unusable: str = ""  # why there is no comparison
 
     @property
@@ -161,8 +169,9 @@ class Judgement:
             return f"{self.problem}: {self.unusable}"
         if self.holds:
             return f"{self.problem}: {len(self.rows)} metrics hold"
-        head = "".join(f"{self.problem}: {text}\n" for text in self.stale)
-        return f"{head}{self.problem}: {len(self.changed)} of {len(self.rows)} metrics changed\n{self.changed.to_string(index=False)}"
+        head = f"{self.problem}: {self.stale}\n" if self.stale else ""
+        changed = f"{len(self.changed)} of {len(self.rows)} metrics changed\n{self.changed.to_string(index=False)}"
+        return f"{head}{self.problem}: {changed}"
 
 
 @checked_call
@@ -189,16 +198,11 @@ def check(
             none,
             unusable=f"there is no baseline '{path.name}'; write one: fpirhc accept PROBLEM --reason ...",
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         return Judgement(
             task.name, none, unusable=f"'{path.name}' is no whole baseline ({error!r}); measure it again: fpirhc accept"
         )
-    stale = ["the problem is another one than that of the baseline"] * (facts["settings"] != digest(task.problem))
-    stale += [
-        f"the settings of '{n}' are others"
-        for n, one in known.items()
-        if one["settings"] != digest(task.controllers[n])
-    ]
+    stale = "the problem file is another one than that of the baseline" if facts["file"] != file_hash(task.path) else ""
     fresh = run_variants(
         task, Repeats(seed), controllers=list(known), processes=processes, compiled=compiled, progress=progress
     )
@@ -226,7 +230,7 @@ def check(
         .abs()
         .fillna(math.inf)
     )
-    return Judgement(task.name, table.loc[size.sort_values(ascending=False).index], tuple(stale))
+    return Judgement(task.name, table.loc[size.sort_values(ascending=False).index], stale)
 
 
 def problems_here(folder: Path) -> list[Path]:

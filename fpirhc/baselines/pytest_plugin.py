@@ -19,6 +19,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse an empty reason before anything runs."""
+    if (reason := config.getoption("--fpirhc-accept")) is not None and not reason.strip():
+        raise pytest.UsageError("--fpirhc-accept needs a reason: say why the new numbers are right")
+
+
 @pytest.fixture
 def fpirhc_check(request: pytest.FixtureRequest) -> Callable[..., None]:
     """Function (problem, controller) that compares a controller with its baseline, or all controllers when none is named."""
