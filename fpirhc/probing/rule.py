@@ -76,11 +76,14 @@ def estimated_problem(
         duration, times = period * max(len(drift), min(own.cycles, _CYCLES)), period * np.arange(len(drift))
         begin = min(begin, _BEGUN * duration)
         courses = {s: Unknown(Samples(times, w)) for s, w in zip(signals, drift.T, strict=True)}
+    actuated = behind_actuators(plant, lags)
+    added = [name for name in actuated.coordinates if name not in plant.coordinates]
+    at_rest = [float(u) for u, lag in zip(own.inputs_before, lags, strict=True) if lag > 0]
     return replace(
         own,
         plant=problem.plant,
         start=_start(own),
-        reality=Reality(behind_actuators(plant, lags), integrator=finer),
+        reality=Reality(actuated, integrator=finer, start=dict(zip(added, at_rest, strict=True))),
         dead_time=DeadTime(inputs={name: c * period for name, c in zip(own.plant.inputs, cycles, strict=True)}),
         signals={**own.signals, **courses},
         disturbances={},
