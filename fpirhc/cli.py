@@ -1,72 +1,137 @@
-"""The command line: one function per command; its signature is its options, its docstring its help.
-
-Exit codes: 0 finished; 1 review answered no; 2 bad input; 3 a file cannot be written; 4 a run ended early; 5 a metric changed;
-6 no usable baseline; 7 a faulty installation; 70 an error inside fpirhc; 130 interrupted.
-"""
+"""The command line: one function per command; its signature is its options, its docstring its help."""
 
 from __future__ import annotations
 
+import shlex
 import sys
-import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
-app = typer.Typer(
-    no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False, help=__doc__, rich_markup_mode=None
-)
+_ABOUT = """Adaptive receding-horizon control by fixed-point iteration.
 
-Problem = Annotated[str, typer.Argument(help="name of a shipped problem, or path of a problem file")]
-Controller = Annotated[str, typer.Argument(help="name of a controller of the problem")]
+Exit codes: 0 finished; 1 a review or a probe answered no; 2 bad input; 3 a file cannot be written; 4 a run ended early, or a
+plan did not converge; 5 a metric changed; 6 no usable baseline; 7 a faulty installation; 70 an error inside fpirhc;
+130 interrupted; 141 the reader of the output closed it."""
+app = typer.Typer(add_completion=True, pretty_exceptions_enable=False, help=_ABOUT, rich_markup_mode=None)
+MADE: list[Path] = []  # folders that this command has made, the innermost first
+
+
+class _Command(TyperCommand):
+    """A command with examples below its options. Several values may follow one option that may be given again: `-c A B`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        options = {name: p for p in self.params if p.param_type_name == "option" for name in p.opts}
+        places = sum(p.param_type_name == "argument" and p.required for p in self.params)
+        words, last, value = (
+            list[str](),
+            "",
+            False,
+        )  # the option that may have more values; whether its value comes next
+        for word in args:
+            name = word.partition("=")[0]
+            if value:
+                value = False
+            elif name in options:
+                last = name if getattr(options[name], "multiple", False) else ""
+                value = name == word and not getattr(options[name], "is_flag", False)
+            elif places > 0:
+                places -= not word.startswith("-")
+            elif last and not word.startswith("-"):
+                words.append(last)
+            words.append(word)
+        return super().parse_args(ctx, words)
+
+    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
+        formatter.write(f"\nExamples:\n{self.epilog}\n")
+
+
+def _command(*examples: str, name: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    return app.command(name, cls=_Command, epilog="\n".join(f"  fpirhc {one}" for one in examples))
+
+
+def _percent(text: str) -> float:  # also of a default, which is a number
+    try:
+        value = float(str(text).strip().removesuffix("%"))
+    except ValueError:
+        value = -1.0
+    if not 0 <= value < float("inf"):
+        raise typer.BadParameter(f"expected percent of at least 0, such as 20%, got '{text}'")
+    return value
+
+
+Problem = Annotated[str, typer.Argument(metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")]
+Controller = Annotated[str, typer.Argument(metavar="CONTROLLER", help="name of a controller of the problem")]
 Controllers = Annotated[
-    list[str] | None, typer.Option("--controllers", "-c", help="only these controllers; again for each")
+    list[str] | None, typer.Option("--controllers", "-c", metavar="NAME ...", help="only these controllers")
 ]
-Out = Annotated[Path | None, typer.Option(help="folder for the results [default: results/PROBLEM]")]
-Seed = Annotated[int, typer.Option(min=0, help="seed of noise and draws")]
-Mismatch = Annotated[
-    float, typer.Option(min=0, help="exact parameters and dead times within so many percent of the problem's")
-]
+Out = Annotated[Path | None, typer.Option(metavar="FOLDER", help="for the results [default: results/PROBLEM]")]
+Seed = Annotated[int, typer.Option(min=0, help="of noise and draws")]
+Percent = typer.Option(
+    metavar="PERCENT", parser=_percent, help="exact parameters and dead times within so much of the problem's"
+)
+Mismatch = Annotated[float, Percent]
 Set = Annotated[
-    list[str] | None, typer.Option("--set", help="PATH=NUMBER: another number of a setting, exact.m1=1.4 or start.q1=2")
-]
+    list[str] | None,
+    typer.Option("--set", metavar="PATH=NUMBER ...", help="other numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"),
+]  # fmt: skip
 Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="print all that is known, not the main things alone")]
 NoCompile = Annotated[bool, typer.Option("--no-compile", help="run loops in CasADi's virtual machine")]
 Processes = Annotated[int, typer.Option(min=1, help="number of processes")]
+Count = typer.Option(min=1, metavar="N", help="plants drawn at random")
 Cases = Annotated[
-    list[str] | None, typer.Option(help="cases of the problem file, by name or group, or all; again for each")
+    list[str] | None, typer.Option(metavar="NAME ...", help="cases of the problem file: names, groups, or all")
 ]
-Baselines = Annotated[Path | None, typer.Option(help="folder of the baselines [default: baselines beside the problem]")]
+Baselines = Annotated[
+    Path | None, typer.Option(metavar="FOLDER", help="of the baselines [default: baselines beside the problem]")
+]
 
 
-def _task(problem: str, settings: list[str] | None = None) -> Any:
+def _task(problem: str, settings: Sequence[str] | None = None, controllers: Sequence[str] | None = None) -> Any:
     from fpirhc.problem_files.problem_file import load_problem, with_numbers_of_all
 
     task = load_problem(problem)
-    return with_numbers_of_all(task, _numbers(settings), None) if settings else task
+    return with_numbers_of_all(task, _numbers(settings), controllers) if settings else task
 
 
-def _numbers(settings: list[str]) -> dict[str, Any]:
+def _numbers(settings: Sequence[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for text in settings:
         path, _, value = text.partition("=")
         try:
             parts = tuple(map(float, value.split(",")))
         except ValueError:
+            parts = ()
+        if not path.strip() or not parts:
             raise typer.BadParameter(
-                f"--set {text}: expected PATH=NUMBER, or PATH=LOWER,UPPER for an interval"
-            ) from None
-        values[path] = parts if len(parts) > 1 else parts[0]
+                f"--set {text}: expected PATH=NUMBER, such as deformation.gain=-1.2, or PATH=LOWER,UPPER for an interval"
+            )
+        values[path.strip()] = parts if len(parts) > 1 else parts[0]
     return values
 
 
 def _folder(out: Path | None, *default: str) -> Path:
+    """The folder for results, made before anything runs, so that a wrong path fails at once."""
+    from fpirhc.errors import not_writable
+    from fpirhc.whole_file import missing_folders
+
     folder = out or Path("results", *default)
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        MADE.extend(missing_folders(folder))
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / ".fpirhc-probe").touch()
+        (folder / ".fpirhc-probe").unlink()
+    except OSError as error:
+        raise not_writable(folder, error, "--out") from None
     return folder
 
 
-def _publish(view: Any, page: str, folder: Path, as_json: bool) -> None:
+def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -> None:
     from fpirhc.report.terminal import show
     from fpirhc.studies.view import to_json
     from fpirhc.whole_file import write_whole
@@ -74,284 +139,313 @@ def _publish(view: Any, page: str, folder: Path, as_json: bool) -> None:
     facts = to_json(view.facts)
     write_whole(page, folder / "report.html", "report")
     write_whole(f"{facts}\n", folder / "results.json", "report")
-    print(facts) if as_json else show(view, folder / "report.html")
+    print(facts) if as_json else show(view, folder / "report.html", verbose=verbose)
 
 
-def _command() -> str:
-    import shlex
+@_command(
+    "compare two_mass",
+    "compare my_arm.py -c RHC RHC+FPI --set deformation.gain=-1.2",
+    "compare cart_pole --optimisers fixed-point ipopt    every planning controller once with each",
+    "compare cart_pole --plans --optimisers all          their first plans to 1e-6, with certificates, and no run",
+)
+def compare(
+    problem: Problem, controllers: Controllers = None, set_: Set = None,
+    optimisers: Annotated[list[str] | None, typer.Option(metavar="NAME ...", help="plan with each of these, or all")] = None,
+    plans: Annotated[bool, typer.Option("--plans", help="solve and certify the first plans, and run nothing")] = False,
+    seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
+) -> None:  # fmt: skip
+    """Run several controllers on one problem and write a report."""
+    task = _task(problem, set_, controllers)
+    from fpirhc.studies.comparison.compare import compare as run
+    from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.open_loop import first_plans, with_optimisers
 
+    named = list(select(task, controllers)) if controllers else None
+    if plans:
+        return _show_plans(task, first_plans(task, optimisers, named), _folder(out, task.name))
+    if optimisers:
+        task, named = with_optimisers(task, optimisers, named), None
+    folder = _folder(out, task.name)
+    from fpirhc.report.html import render
+    from fpirhc.report.terminal import announce_backend, progress_bars
+
+    with progress_bars(as_json=json) as progress:
+        result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
+    announce_backend(entry.run for entry in result.entries)
+    _publish(result.view, render(result), folder, json, verbose)
+    interrupted = any(why.startswith("interrupted") for why in result.skipped.values())
+    raise typer.Exit(130 if interrupted else 0 if result.entries else 2)
+
+
+def _show_plans(task: Any, solved: Any, folder: Path) -> None:
+    from fpirhc.report.figures import plan_figure, save_figure
+    from fpirhc.report.terminal import show_plans
+    from fpirhc.status import Status
+
+    save_figure(plan_figure(task.problem, solved), folder / "plan.png")
+    show_plans(task.name, solved, folder / "plan.png")
+    raise typer.Exit(0 if all(one.plan.status == Status.OK for one in solved) else 4)
+
+
+def _line() -> str:
     return shlex.join(["fpirhc", *sys.argv[1:]])
 
 
-@app.command()
-def compare(
-    problem: Problem, controllers: Controllers = None, set_: Set = None, optimisers: list[str] | None = None, seed: Seed = 0,
-    out: Out = None, no_compile: NoCompile = False, json: Json = False,
-) -> None:  # fmt: skip
-    """Run several controllers on one problem and write a report."""
-    task = _task(problem, set_)
-    from fpirhc.report.html import render
-    from fpirhc.report.terminal import announce_backend, progress_bars
-    from fpirhc.studies.comparison.compare import compare as run
-    from fpirhc.studies.open_loop import with_optimisers
-
-    if optimisers:
-        task, controllers = with_optimisers(task, optimisers, controllers), None
-    with progress_bars(as_json=json) as progress:
-        result = run(
-            task, seed=seed, controllers=controllers, compiled=not no_compile, command=_command(), progress=progress
-        )
-    announce_backend(entry.run for entry in result.entries)
-    _publish(result.view, render(result), _folder(out, task.name), json)
-    raise typer.Exit(0 if result.entries else 2)
-
-
-@app.command()
+@_command("review two_mass", "review my_arm.py -c RHC+FPI --mismatch 20%    for plants around the problem's, too")
 def review(
-    problem: Problem, controllers: Controllers = None, mismatch: Mismatch = 0.0, seed: Seed = 0, json: Json = False
-) -> None:
+    problem: Problem, controllers: Controllers = None, mismatch: Mismatch = 0.0, seed: Seed = 0, json: Json = False,
+    verbose: Verbose = False,
+) -> None:  # fmt: skip
     """Answer before a run: well posed, gains, limits, margins, convergence. Exit code 1 where an answer is no."""
     task = _task(problem)
     from dataclasses import asdict
 
-    from fpirhc.report.terminal import say
+    from fpirhc.report.terminal import show_review
     from fpirhc.review.review import review as ask
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.view import to_json
 
     found = ask(task.problem, select(task, controllers), mismatch=mismatch, seed=seed)
     if json:
-        print(
-            to_json(
-                {"ready": found.ready, "answers": {n: [asdict(a) for a in some] for n, some in found.answers.items()}}
-            )
-        )
+        answers = {n: [asdict(a) for a in some] for n, some in found.answers.items()}
+        print(to_json({"ready": found.ready, "answers": answers}))
     else:
-        for name, answers in found.answers.items():
-            say(f"\n{name}", "bold")
-            for one in answers:
-                say(f"  {one.verdict:7s} {one.question} ({one.evidence}) {one.change}", wrap=False)
-        say(", ".join(found.counts()))
+        show_review(found, verbose=verbose)
     raise typer.Exit(0 if found.ready else 1)
 
 
-@app.command()
+@_command(
+    "run two_mass RHC+FPI",
+    "run two_mass RHC+FPI --set deformation.gain=-1.2 limits.inputs.Q1=-50,20",
+    "run two_mass RHC+FPI --draw 7 --mismatch 20%    the plant number 7 of study --draws --mismatch 20%",
+    "run anaesthesia CTC+FPI --case 'patient 03'",
+)
 def run(
-    problem: Problem, controller: Controller, set_: Set = None, case: str | None = None, draw: int | None = None,
+    problem: Problem, controller: Controller, set_: Set = None,
+    case: Annotated[str | None, typer.Option(metavar="NAME", help="a case of the problem file")] = None,
+    draw: Annotated[int | None, typer.Option(min=0, metavar="K", help="the drawn plant of this number")] = None,
     mismatch: Mismatch = 0.0, seed: Seed = 0, out: Out = None, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
     """Run one controller and save every signal, as it stands, in a case of the file, or for a drawn plant."""
-    task = _task(problem, set_)
+    task = _task(problem, set_, [controller])
     from dataclasses import replace
 
     from fpirhc.problem_files.problem_file import in_case
+    from fpirhc.studies.comparison.compare import harm_of_adaptation, select
+
+    task = in_case(task, case) if case else task
+    chosen, folder = select(task, [controller])[controller], _folder(out, task.name)
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
-    from fpirhc.studies.comparison.compare import harm_of_adaptation, select
     from fpirhc.studies.variants import Draws
 
-    task = in_case(task, case) if case else task
-    chosen = select(task, [controller])[controller]
     if draw is not None:
         one = Draws(draw + 1, mismatch, seed).of(task)[draw]
         task, seed = replace(task, problem=one.problem), one.seed
     with progress_bars() as progress:
         report = lambda done, total: progress(controller, done, total)  # noqa: E731
         found = simulate(task.problem, chosen, seed=seed, name=controller, compiled=not no_compile, progress=report)
-    stem = _folder(out, task.name) / "".join(c if c.isalnum() or c == "-" else "_" for c in controller)
-    found.save(stem.with_suffix(".npz"))
-    save_figure(found.plot(), stem.with_suffix(".png"))
+    files = [
+        folder / f"{''.join(c if c.isalnum() or c == '-' else '_' for c in controller)}.{s}" for s in ("npz", "png")
+    ]
+    found.save(files[0])
+    save_figure(found.plot(), files[1])
     announce_backend([found])
     harm = harm_of_adaptation(task.problem, controller, chosen, seed=seed)
-    show_run(found, measure(task.problem, found, task.metrics), harm, [stem.with_suffix(s) for s in (".npz", ".png")])
+    show_run(found, measure(task.problem, found, task.metrics), harm, files)
     raise typer.Exit(0 if found.stop is None else 4)
 
 
-@app.command()
+@_command(
+    "study two_mass --draws 100 --mismatch 20%        exact parameters within 20 % of the problem's",
+    "study anaesthesia --cases all --headline in_band",
+    "study two_mass --over deformation.gain=-2:-0.1:40 exact.m1=0.5:2:9:log -c RHC+FPI",
+    "study two_mass --limits latency noise            up to where each controller fails",
+)
 def study(
-    problem: Problem, cases: Cases = None, draws: Annotated[int | None, typer.Option(help="plants drawn at random")] = None,
-    over: Annotated[list[str] | None, typer.Option(help="PATH=LOW:HIGH:COUNT[:log], once or twice")] = None,
-    limits: Annotated[list[str] | None, typer.Option(help="mismatch, plants, latency, noise, lost: up to where a run fails")] = None,
-    mismatch: Mismatch = 0.0, controllers: Controllers = None, headline: str | None = None, processes: Processes = 1,
-    cluster: str | None = None, seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False,
+    problem: Problem, cases: Cases = None, draws: Annotated[int | None, Count] = None,
+    over: Annotated[list[str] | None, typer.Option(metavar="PATH=LOW:HIGH:COUNT[:log] ...", help="settings, one or two")] = None,
+    limits: Annotated[list[str] | None, typer.Option(metavar="WORD ...", help="mismatch, plants, latency, noise, lost")] = None,
+    mismatch: Mismatch = 0.0, controllers: Controllers = None,
+    headline: Annotated[str | None, typer.Option(metavar="METRIC", help="what is judged [default: the error]")] = None,
+    processes: Processes = 1,
+    cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="of a Dask scheduler, tcp://HOST:PORT")] = None,
+    seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
 ) -> None:  # fmt: skip
-    """Run every controller in many variants: cases, drawn plants, settings, or up to where it fails. study.csv has every run."""
+    """Run every controller in many variants: cases, drawn plants, settings, or up to where it fails.
+
+    The first controller is the one that the others are compared with. study.csv has every run; the same command goes on after
+    an interruption.
+    """
+    if sum(map(bool, (cases, draws, over, limits))) != 1:
+        raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
+    if mismatch and not draws:
+        raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     task = _task(problem)
-    from contextlib import ExitStack
-
-    import joblib
-
-    from fpirhc.errors import package
-    from fpirhc.report.html import render_charted
-    from fpirhc.report.terminal import progress_bars
+    from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.limits import limits as find_limits
     from fpirhc.studies.study import figure_of
     from fpirhc.studies.study import study as run_study
-    from fpirhc.studies.variants import CasesOf, Draws, Grid
+    from fpirhc.studies.variants import CasesOf, Draws, Grid, Variants
 
-    if sum(map(bool, (cases, draws, over, limits))) != 1:
-        raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
-    folder, facts = (
-        _folder(out, task.name, "study"),
-        {"controllers": controllers, "compiled": not no_compile, "command": _command()},
-    )
+    select(task, controllers)
+    folder = _folder(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")
+    from fpirhc.report.html import render_charted
+
     with ExitStack() as stack:
-        facts["progress"] = stack.enter_context(progress_bars(as_json=json))
+        facts = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
+        facts["progress"] = stack.enter_context(_progress(json))
         if cluster:
-            stack.enter_context(package("distributed", "cluster", "--cluster").Client(cluster))
-            stack.enter_context(joblib.parallel_config(backend="dask"))
+            stack.enter_context(_dask(cluster))
         if limits:
-            result = find_limits(task, over=limits, **facts)
+            result: Any = find_limits(task, over=limits, **facts)
             page = render_charted(result.view)
         else:
-            variants = (
-                CasesOf(tuple(cases), seed)
-                if cases
-                else Draws(draws, mismatch, seed)
-                if draws
-                else Grid.parsed(over, seed)
-            )
+            drawn: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
+            variants = Grid.parsed(over, seed) if over else drawn
             result = run_study(task, variants, headline=headline, processes=processes, folder=folder, **facts)
             page = render_charted(result.view, figure_of(result), "Every run", "")
     result.table.to_csv(folder / "study.csv", index=False)
-    _publish(result.view, page, folder, json)
+    _publish(result.view, page, folder, json, verbose)
 
 
-@app.command()
+def _progress(as_json: bool = False) -> Any:
+    from fpirhc.report.terminal import progress_bars
+
+    return progress_bars(as_json=as_json)
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[None]:
+    import joblib
+
+    from fpirhc.errors import package
+
+    with package("distributed", "cluster", "--cluster").Client(address), joblib.parallel_config(backend="dask"):
+        yield
+
+
+@_command(
+    "probe my_arm.py                             excitation, candidates, trials, and a line to paste",
+    "probe my_arm.py --cycles 500 --no-trials    for a machine: nothing but the excitation is run",
+    "probe my_arm.py --recording run.csv         from a record of a run",
+)
 def probe(
-    problem: Problem, controller: Annotated[str | None, typer.Option(help="the one that keeps the plant safe")] = None,
-    cycles: int | None = None, amplitude: float | None = None, recording: Path | None = None, chatter: float | None = None,
-    trials: bool = True, seed: Seed = 0, json: Json = False,
+    problem: Problem, controller: Annotated[str | None, typer.Option(metavar="NAME", help="that keeps the plant safe")] = None,
+    cycles: Annotated[int | None, typer.Option(metavar="N", help="of the excitation [default: 300]")] = None,
+    amplitude: Annotated[float | None, typer.Option(help="of the excitation, in the unit of the response")] = None,
+    recording: Annotated[Path | None, typer.Option(metavar="CSV", help="of a run: time, inputs, what is measured")] = None,
+    chatter: Annotated[float | None, typer.Option(help="largest rms step of a command per cycle")] = None,
+    trials: Annotated[bool, typer.Option(help="try candidates on the plant")] = True, seed: Seed = 0, json: Json = False,
 ) -> None:  # fmt: skip
     """Excite a plant that nobody knows, and find the adaptation that suits it. Exit code 1 where none is proposed."""
     task = _task(problem)
     from fpirhc.errors import NotSupported
     from fpirhc.probing.probe import probe as ask
-    from fpirhc.report.terminal import say, show_table
+    from fpirhc.report.terminal import show_probe
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.view import to_json
-    from fpirhc.summary import Column, Table, written_out
 
+    able = list[str]()
     for name, one in select(task, [controller] if controller else None).items():
-        try:
+        with suppress(NotSupported):
             one.with_deformation(one.deformation)
-        except NotSupported:
-            continue
-        break
-    else:
+            able.append(name)
+    if not able:
         raise NotSupported("probe needs a controller with a deformation: choose another one by --controller")
+    name, one = able[0], task.controllers[able[0]]
     settings = {"cycles": cycles, "amplitude": amplitude, "recording": recording, "chatter": chatter}
     answer = ask(task.problem, one, trials=trials, seed=seed, **settings)
-    if json:
-        print(to_json(answer.plain))
-    else:
-        tables = [Table(f"{task.name}: probe with {name}", [Column("estimate", left=True), Column("value (interval)")])]
-        for estimate, value in answer.facts:
-            tables[0].add([estimate, value])
-        if answer.trials:
-            tables.append(
-                Table("trials", [Column("candidate", left=True), Column("error, of that without"), Column("worst")])
-            )
-            for candidate, tried in answer.trials.items():
-                tables[1].add([candidate, written_out(tried.error), written_out(tried.worst)])
-        for table in tables:
-            show_table(table)
-        for note in answer.notes:
-            say(f"note: {note}")
-        say(f"{'chosen' if answer.deformation is not None else 'no adaptation'}: {answer.why}", "bold")
-        if answer.deformation is not None:
-            print(f"\nfor the controller:\n\n{answer.lines}")
+    print(to_json(answer.plain)) if json else show_probe(f"{task.name}: probe with {name}", answer)
     raise typer.Exit(0 if answer.deformation is not None else 1)
 
 
-@app.command()
+@_command(
+    "tune two_mass                                   50 trials of every controller that may be tuned",
+    "tune two_mass --trials 200 --draws 5 --mismatch 20%    each trial on 5 plants; goes on after finished trials",
+)
 def tune(
-    problem: Problem, controllers: Controllers = None, trials: int = 50, draws: int = 1, mismatch: Mismatch = 0.0,
-    cases: Cases = None, metric: str | None = None, seed: Seed = 0, out: Out = None, json: Json = False,
+    problem: Problem, controllers: Controllers = None,
+    trials: Annotated[int, typer.Option(min=1, max=1_000_000, help="of every controller")] = 50,
+    draws: Annotated[int, Count] = 1, mismatch: Mismatch = 0.0, cases: Cases = None,
+    metric: Annotated[str | None, typer.Option(metavar="METRIC", help="that becomes better [default: the error]")] = None,
+    seed: Seed = 0, out: Out = None, json: Json = False,
 ) -> None:  # fmt: skip
     """Find better settings, with the same budget and cost for every controller. The problem file lists them: tuning = {...}."""
     task = _task(problem)
-    from fpirhc.report.terminal import progress_bars, show_harm
+    from fpirhc.report.terminal import show_harm
     from fpirhc.studies.tune import tune as search
     from fpirhc.studies.variants import CasesOf, Draws
 
-    variants = (
-        CasesOf(tuple(cases), seed) if cases else Draws(draws, mismatch, seed + 10**6)
-    )  # never those of a comparison
-    with progress_bars(as_json=json) as progress:
-        found = search(
-            task, trials=trials, variants=variants, seed=seed, controllers=controllers, metric=metric,
-            folder=_folder(out, task.name, "tuning"), progress=progress,
-        )  # fmt: skip
+    # The plants are never those of a comparison.
+    variants = CasesOf(tuple(cases), seed) if cases else Draws(draws, mismatch, seed + 10**6)
+    facts = {"trials": trials, "variants": variants, "seed": seed, "controllers": controllers, "metric": metric}
+    with _progress(json) as progress:
+        found = search(task, folder=_folder(out, task.name, "tuning"), progress=progress, **facts)
     for sentences in found.harm.values():
         show_harm(sentences)
-    print(
-        found.table.to_json(orient="records") if json else f"{found.table.to_string(index=False)}\n\n{found.python()}"
-    )
+    table = found.table
+    print(table.to_json(orient="records") if json else f"{table.to_string(index=False)}\n\n{found.python()}")
 
 
-@app.command()
+@_command(
+    "check                        every problem of ./problems, or of this folder",
+    "check my_arm.py two_mass     these problems",
+    "check --ignore-below 0.1%    another machine or library, whose last digits differ",
+)
 def check(
-    problems: Annotated[list[str] | None, typer.Argument(help="names or files [default: all of this folder]")] = None,
-    ignore_below: Annotated[float, typer.Option(help="percent of a value, below which a change holds")] = 0.0,
+    problems: Annotated[list[str] | None, typer.Argument(metavar="PROBLEM ...", help="[default: all of this folder]")] = None,
+    ignore_below: Annotated[float, typer.Option(metavar="PERCENT", parser=_percent, help="changes below it hold")] = 0.0,
     baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
     """Compare fresh results with the committed baselines. Exit code 5: a metric changed; 6: no usable baseline."""
     from fpirhc.baselines.baseline import check as judge
     from fpirhc.baselines.baseline import problems_here
-    from fpirhc.report.terminal import progress_bars, say
+    from fpirhc.report.terminal import say
 
-    with progress_bars() as progress:
-        facts = {"baselines": baselines, "processes": processes, "compiled": not no_compile, "progress": progress}
-        found = [judge(str(one), ignore=ignore_below / 100, **facts) for one in problems or problems_here(Path())]
+    facts: dict[str, Any] = {"baselines": baselines, "processes": processes, "compiled": not no_compile}
+    with _progress() as progress:
+        names = problems or list(map(str, problems_here(Path())))
+        found = [judge(_task(one), ignore=ignore_below / 100, progress=progress, **facts) for one in names]
     for one in found:
         say(one.text, "" if one.holds else "bold red", wrap=False)
     raise typer.Exit(6 if any(one.unusable for one in found) else 0 if all(one.holds for one in found) else 5)
 
 
-@app.command()
+@_command(
+    'accept my_arm.py --reason "20 -> 30 stages"     the new numbers are right, and why',
+    'accept my_arm.py --reason "new" --seeds 20      bands from more seeds, where there is noise',
+)
 def accept(
-    problem: Problem, reason: Annotated[str, typer.Option(help="why the new numbers are right")], seed: Seed = 0, seeds: int = 8,
+    problem: Problem, reason: Annotated[str, typer.Option(metavar="TEXT", help="why the new numbers are right")],
+    seed: Seed = 0, seeds: Annotated[int, typer.Option(min=2, help="of which the bands are made")] = 8,
     baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
-    """Measure a problem anew and write its baseline."""
-    from fpirhc.baselines.baseline import accept as write
-    from fpirhc.report.terminal import progress_bars
-
-    with progress_bars() as progress:
-        facts = {"baselines": baselines, "processes": processes, "compiled": not no_compile, "progress": progress}
-        print(f"baseline: {write(_task(problem), reason, seed=seed, seeds=seeds, **facts)}")
-
-
-@app.command()
-def solve(problem: Problem, optimisers: list[str] | None = None, tolerance: float = 1e-6, out: Out = None) -> None:
-    """Solve a problem's first horizon open loop, to a tolerance."""
+    """Measure a problem anew and write its baseline, which check compares with."""
     task = _task(problem)
-    from fpirhc.report.figures import plan_figure, save_figure
-    from fpirhc.report.terminal import show_plans
-    from fpirhc.status import Status
-    from fpirhc.studies.open_loop import solve_first
+    from fpirhc.baselines.baseline import accept as write
 
-    solved, picture = solve_first(task, optimisers or ["fixed-point"], tolerance), _folder(out, task.name) / "plan.png"
-    save_figure(plan_figure(task.problem, solved), picture)
-    show_plans(task.name, solved, picture)
-    raise typer.Exit(0 if all(one.plan.status == Status.OK for one in solved) else 4)
+    facts: dict[str, Any] = {"baselines": baselines, "processes": processes, "compiled": not no_compile}
+    with _progress() as progress:
+        path = write(task, reason, seed=seed, seeds=seeds, progress=progress, **facts)
+    print(f"baseline: {path}")
 
 
-@app.command()
-def new(name: str, folder: Annotated[Path, typer.Option("--dir")] = Path()) -> None:
-    """Write a problem file, its test and its baseline to start from."""
-    from fpirhc.scaffold import create_problem, first_baseline
+@_command("new my_arm", "new my_arm --dir problems")
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="of the problem, a name of Python")],
+    folder: Annotated[Path, typer.Option("--dir", metavar="FOLDER", help="for the files [default: here]")] = Path(),
+) -> None:
+    """Write a problem file and its test to start from."""
+    from fpirhc.scaffold import create_problem
 
     problem, test = create_problem(name, folder)
-    print(
-        f"wrote {problem}\nwrote {test}\nwrote {first_baseline(problem)}\nnext: fpirhc compare {problem}; python -m pytest {test}"
-    )
+    print(f"wrote {problem}\nwrote {test}\nnext: fpirhc compare {problem}; python -m pytest {test}")
 
 
-@app.command("list")
+@_command("list", name="list")
 def list_() -> None:
     """List the shipped problems."""
     from fpirhc.problem_files.shipped import shipped_groups, title_of
@@ -360,7 +454,7 @@ def list_() -> None:
         print(title, *(f"  {name:24s} {title_of(path)}" for name, path in problems.items()), sep="\n")
 
 
-@app.command()
+@_command("doctor")
 def doctor(json: Json = False) -> None:
     """Examine the installation: versions, solvers, compiler, cache."""
     from fpirhc.doctor import examine, written
@@ -370,56 +464,48 @@ def doctor(json: Json = False) -> None:
     raise typer.Exit(7 if any(outcome == "fail" for _, outcome, *_ in findings) else 0)
 
 
-@app.command()
+@_command(
+    "export two_mass RHC+FPI --out device                    C99 in the folder device",
+    "export two_mass RHC+FPI --live deformation.gain limits.inputs.Q1",
+    "export two_mass RHC+FPI --to fmu2                       a unit for co-simulation",
+    "export two_mass RHC+FPI --to lab                        a page with sliders",
+)
 def export(
     problem: Problem, controller: Controller,
-    out: Annotated[Path | None, typer.Option(help="folder, new or empty [default: results/PROBLEM/TARGET]")] = None,
-    to: Literal["c", "arduino", "fmu2", "library", "wasm", "lab"] = "c", live: list[str] | None = None, name: str | None = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="new or empty [default: results/PROBLEM/TARGET]")] = None,
+    to: Annotated[str, typer.Option(metavar="TARGET", help="c, arduino, fmu2, library, wasm, or lab")] = "c",
+    live: Annotated[list[str] | None, typer.Option(metavar="PATH ...", help="settings that stay open")] = None,
+    name: Annotated[str | None, typer.Option(help="prefix of everything in C [default: of problem and controller]")] = None,
 ) -> None:  # fmt: skip
     """Write a controller for a device, another simulator, or a page with sliders: without Python, bit by bit the same."""
     task = _task(problem)
-    from fpirhc.export.target import device_of, target_called, write
+    from fpirhc.errors import InvalidName, nearest
+    from fpirhc.export.target import device_of, targets, write
     from fpirhc.studies.comparison.compare import select
 
-    out = out or _folder(None, task.name) / to
+    chosen, folder = select(task, [controller])[controller], out or Path("results", task.name, to)
     if to == "lab":
         from fpirhc.export.lab.lab import lab_of, write_lab
 
-        write_lab(lab_of(task, problem, [controller], live or ()), out / f"{task.name}-lab.html")
+        page = _folder(folder) / f"{task.name}-lab.html"
+        write_lab(lab_of(task, problem, [controller], live or ()), page)
+        print(f"wrote {page}")
         return
-    target, chosen = target_called(to), select(task, [controller])[controller]
+    if to not in targets():
+        raise InvalidName(f"the target '{to}' is unknown.{nearest(to, [*targets(), 'lab'])}")
+    target = targets()[to]
     device = device_of(task.problem, chosen, controller, name=name, live=live or [], cycles=2000, libm=target.libm)
-    for file in write(device, target, out):
+    for file in write(device, target, folder):
         print(f"wrote {file}")
 
 
-def main() -> int:
-    """Run the command line and return its exit code."""
-    from fpirhc.errors import FpirhcError, OutputError
+@app.callback(invoke_without_command=True)
+def about(
+    version: Annotated[bool, typer.Option("--version", help="print the version")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="print the traceback of an error; may stand anywhere")] = False,  # noqa: ARG001
+) -> None:
+    """What stands before a command."""
+    if version:
+        from importlib.metadata import version as version_of
 
-    debug = "--debug" in sys.argv
-    try:
-        return int(app([word for word in sys.argv[1:] if word != "--debug"], standalone_mode=False) or 0)
-    except (typer.Exit, SystemExit) as end:
-        return int(getattr(end, "exit_code", getattr(end, "code", 0)) or 0)
-    except KeyboardInterrupt:
-        text, code = "interrupted; finished results are kept", 130
-    except BrokenPipeError:
-        return 141
-    except OutputError as error:
-        text, code = str(error), 3
-    except FpirhcError as error:
-        text, code = str(error), 2
-    except Exception as error:  # noqa: BLE001 -- the last resort of a program
-        if hasattr(error, "format_message"):  # of typer: a wrong option, with the nearest one
-            text, code = error.format_message(), 2
-        else:
-            text, code = f"an error inside fpirhc: {type(error).__name__}: {error}", 70
-    if debug:
-        traceback.print_exc()
-    print(f"fpirhc: {text}", file=sys.stderr)
-    return code
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        print(f"fpirhc {version_of('fpirhc')}")

@@ -63,19 +63,20 @@ class Table:
     @property
     def filled(self) -> Table:
         """The table without columns in which no row has a text."""
-        return self._of([k for k, _ in enumerate(self.columns) if k < self.names or any(r.cells[k] for r in self.rows)])
+        return self.of([k for k, _ in enumerate(self.columns) if k < self.names or any(r.cells[k] for r in self.rows)])
 
     @property
     def narrow(self) -> Table:
         """The table where there is little room: fewer columns, with their short headings."""
-        fewer = self._of([k for k, one in enumerate(self.columns) if one.short is not None])
+        fewer = self.of([k for k, one in enumerate(self.columns) if one.short is not None])
         return replace(fewer, columns=[replace(c, head=c.short or c.head) for c in fewer.columns])
 
     def html(self, notes: Iterable[str] = ()) -> str:
         """Return the table for a notebook."""
         return table(self.title, [c.head for c in self.columns], [row.cells for row in self.rows], notes)
 
-    def _of(self, places: Sequence[int]) -> Table:
+    def of(self, places: Sequence[int]) -> Table:
+        """Return the table with the columns of these places alone."""
         rows = [
             Row([r.cells[k] for k in places], r.style, frozenset(at for at, k in enumerate(places) if k in r.best))
             for r in self.rows

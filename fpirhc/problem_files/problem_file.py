@@ -194,8 +194,12 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
             except InvalidName as error:
                 lacked.append(error)
         controllers[name] = with_settings(controller, as_declared(controller, has))
-    for lacked in lacking.values():
+    for path, lacked in lacking.items():
         if chosen and len(lacked) == len(chosen):
+            if path in task.problem.moved.parameters:
+                raise InvalidName(
+                    f"setting '{path}': write exact.{path} for the plant, approximate.{path} for the model"
+                )
             raise lacked[-1]
     return replace(task, problem=problem, controllers={**task.controllers, **controllers})
 

@@ -11,8 +11,10 @@ import math
 import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -30,6 +32,8 @@ from fpirhc.studies.comparison.verdict import Outcome
 from fpirhc.summary import Column, Table, number, printable, written_out
 
 if TYPE_CHECKING:
+    from fpirhc.probing.probe import Probe
+    from fpirhc.review.review import Review
     from fpirhc.simulation.metrics import Metrics
     from fpirhc.simulation.run import Run
     from fpirhc.studies.open_loop import Solved
@@ -63,19 +67,55 @@ def say(text: str, style: str = "", more: str = "", *, wrap: bool = True) -> Non
         console.print(line, highlight=False, soft_wrap=True)
 
 
-def show(view: View, report: Path) -> None:
-    """Print the verdict, the tables, everything else that is said of a study, and the path of its report."""
-    say(view.title, "bold")
-    show_sentences(view.sentences)
+def show(view: View, report: Path, *, verbose: bool = False) -> None:
+    """Print the verdict, the first table in one part, and the path of the report.
+
+    `verbose`: print every sentence, every column and everything else that is said of a study.
+    """
+    say(view.title, "bold", f" {view.conditions}")
+    sentences = list(view.sentences)
+    shown = sentences if verbose else sentences[:1]
+    show_sentences(shown)
+    if others := sentences[len(shown) :]:
+        outcomes = Counter(str(outcome) for _, outcome in others if outcome is not None)
+        say(
+            f"other pairs: {', '.join(f'{count} {outcome}' for outcome, count in outcomes.items())}"
+        ) if outcomes else None
+        show_sentences(one for one in others if one[1] is None)
     for table in view.tables:
         if table.rows:
-            show_table(table.narrow)
-    for texts in view.lists.values():
-        for text in texts:
-            say(text)
+            narrow = replace(table.narrow, title="" if table.title == view.title else table.title)
+            show_table(narrow) if verbose else show_brief(narrow)
+    notes = [text for texts in view.lists.values() for text in texts]
+    for text in notes if verbose else ():
+        say(text)
     for name, why in view.skipped.items():
         say(f"skipped {name}: {why}")
-    say(f"report: {report}", wrap=False)
+    more = "" if verbose else f" ({len(notes)} notes there, or by --verbose)" if notes else " (more by --verbose)"
+    say(f"report: {report}", more=more, wrap=False)
+
+
+def show_brief(table: Table, console: Console | None = None) -> None:
+    """Print a table in one part; a column of texts, or of what is alike in all rows, or without room stands below in a line."""
+    width, below, kept, more = (console or Console()).width, list[str](), list[int](), list[str]()
+    for k in range(table.names, len(table.columns)):
+        by_text: dict[str, list[str]] = {}
+        for row in table.rows:
+            by_text.setdefault(row.cells[k], []).append(row.cells[0])
+        if len(by_text) == 1 or table.columns[k].left:
+            most = max(by_text, key=lambda text: len(by_text[text]))
+            apart = [f"{text} ({', '.join(names)})" for text, names in by_text.items() if text != most]
+            below.append(f"{table.columns[k].head}: {', '.join([most or '-', *apart])}")
+        elif len(_parts(table.of([*range(table.names), *kept, k]), width)) == 1:
+            kept.append(k)
+        else:
+            more.append(table.columns[k].head)
+    if kept:
+        show_table(table.of([*range(table.names), *kept]), console)
+    if more:
+        below.append(f"more columns by --verbose: {', '.join(more)}")
+    for text in below:
+        say(text)
 
 
 def show_sentences(sentences: Iterable[tuple[str, Outcome | None]]) -> None:
@@ -300,3 +340,33 @@ def _plan_row(solved: Solved) -> list[str]:
         *bounds,
         plan.status.name.lower().replace("_", " "),
     ]
+
+
+def show_review(found: Review, *, verbose: bool = False) -> None:
+    """Print the answers about the problem and every controller, those that are yes as a count."""
+    for name, answers in found.answers.items():
+        shown = [one for one in answers if verbose or one.verdict != "yes"]
+        say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
+        for one in shown:
+            evidence = f" ({one.evidence})" if one.evidence else ""
+            say(f"  {one.verdict:7s} {one.question}{evidence} {one.change}".rstrip())
+    say(", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
+
+
+def show_probe(title: str, answer: Probe) -> None:
+    """Print estimates, trials, and the line to paste."""
+    estimates = Table(title, [Column("estimate", left=True), Column("value (interval)")])
+    for estimate, value in answer.facts:
+        estimates.add([estimate, value])
+    show_table(estimates)
+    trials = Table("trials", [Column("candidate", left=True), Column("error, of that without"), Column("worst")])
+    for candidate, tried in answer.trials.items():
+        trials.add([candidate, written_out(tried.error), written_out(tried.worst)])
+    if trials.rows:
+        show_table(trials)
+    for note in answer.notes:
+        say(f"note: {note}")
+    found = answer.deformation is not None
+    say(f"{'chosen' if found else 'no adaptation'}: {answer.why}", "bold")
+    if found:
+        print(f"\nfor the controller:\n\n{answer.lines}")

@@ -5,66 +5,35 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.machinery import PathFinder
 from importlib.resources import files as resources
 from pathlib import Path
 
-from fpirhc.baselines.baseline import accept, baseline_path
 from fpirhc.errors import InvalidName, OutputError, not_writable
-from fpirhc.problem_files.problem_file import load_problem
 from fpirhc.problem_files.shipped import shipped_problems
-from fpirhc.whole_file import missing_folders, remove_empty
 
 _LONGEST = 60  # characters of a name
 _FALLBACK = "my_plant"
 
 
-def create_problem(name: str, folder: Path) -> tuple[Path, ...]:
+def create_problem(name: str, folder: Path) -> tuple[Path, Path]:
     """Write NAME.py and test_NAME.py into the folder, which is created where it is missing, and return their paths."""
     check_name(name)
-    baseline = baseline_path(folder / f"{name}.py")
-    if baseline.exists() or baseline.is_symlink():
-        raise OutputError(f"'{baseline}' exists already and is kept; choose another name or --dir")
     texts = {
         folder / f"{name}.py": _template("problem.txt", name),
         folder / f"test_{name}.py": _template("test.txt", name),
     }
+    for path in texts:
+        if path.exists() or path.is_symlink():
+            raise OutputError(f"'{path}' exists already and is kept; choose another name or --dir")
     try:
-        with kept_when_whole(folder) as written:
-            folder.mkdir(parents=True, exist_ok=True)
-            for path, text in texts.items():
-                # Exclusive: a file or link that is there already is never written to.
-                with path.open("x", encoding="utf-8") as file:
-                    written.append(path)
-                    file.write(text)
+        folder.mkdir(parents=True, exist_ok=True)
+        for path, text in texts.items():
+            path.write_text(text, encoding="utf-8")
     except OSError as error:
-        if isinstance(error, FileExistsError) and error.filename != str(folder):
-            raise OutputError(f"'{error.filename}' exists already and is kept; choose another name or --dir") from None
         raise not_writable(folder, error, "--dir") from None
-    return tuple(written)
-
-
-@contextmanager
-def kept_when_whole(folder: Path) -> Iterator[list[Path]]:
-    """Files that are added to the list, and folders that the body makes, are removed where it fails or is interrupted."""
-    files: list[Path] = []
-    folders = missing_folders(baseline_path(folder / "x").parent)
-    try:
-        yield files
-    except BaseException:
-        for file in files:
-            file.unlink(missing_ok=True)
-        remove_empty(folders)
-        raise
-
-
-def first_baseline(problem_file: Path) -> Path:
-    """Measure the first baseline of a new problem and return its path."""
-    task = load_problem(str(problem_file))
-    path = accept(task, "first numbers of a new problem")
-    return path
+    problem, test = texts
+    return problem, test
 
 
 def check_name(name: str) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import with_optimiser
+from fpirhc.describe import identity
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
@@ -31,6 +32,7 @@ from fpirhc.task.exogenous import previewed_values
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
 _REMEMBERED = 4  # horizons whose Functions are kept
 _AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
+TOLERANCE = 1e-6  # of the plans of named optimisers
 _RANK = 1e-9  # relative singular value below which active limits depend on each other
 
 
@@ -248,30 +250,46 @@ def _largest_return(active: _Active, free: np.ndarray) -> float:
 class Solved:
     """One optimiser's plan."""
 
-    name: str  # label of the optimiser
+    name: str  # label of the optimiser, or name of its controller
     plan: Plan
     certificate: Certificate | None  # certificate of the plan; None where the plan is not inside its bounds
 
 
-def solve_first(task: Task, names: Sequence[str], tolerance: float) -> list[Solved]:
+def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[str] | None) -> list[Solved]:
     """Solve the horizon that begins at the start of the problem, with the approximate model.
 
-    `names`: names of optimisers; 'all' among them stands for every optimiser.
+    Args:
+        names: of optimisers, which solve it to `TOLERANCE`; 'all' among them stands for every one. None: each controller's own.
+        controllers: names of those whose optimisers are meant; None: all that plan.
     """
     problem = task.problem
-    if problem.horizon is None or problem.cost is None:
-        raise InvalidProblem(f"problem '{task.name}' has no horizon or no cost; give Problem(horizon=..., cost=...)")
-    choices = chosen_optimisers(names)
-    plant = problem.plant
+    own = {name: task.controllers[name].planner for name in controllers or task.controllers}
+    planners = {name: one for name, one in own.items() if one is not None}
+    if problem.horizon is None or not planners:
+        raise InvalidProblem(
+            f"problem '{task.name}' has no horizon, or none of {', '.join(own)} plans with an optimiser"
+        )
+    if names:
+        wanted = {label: (build(TOLERANCE), problem.cost) for label, build in chosen_optimisers(names).values()}
+    else:
+        alike: dict[object, list[str]] = {}
+        for name, one in planners.items():
+            alike.setdefault(identity((one.optimiser, one.cost)), []).append(name)
+        wanted = {
+            ", ".join(some): (planners[some[0]].optimiser, planners[some[0]].cost or problem.cost)
+            for some in alike.values()
+        }
+    plant, limits, start = problem.plant, problem.limits, problem.start_state
     ahead = previewed_values(plant, problem.signals)
-    limits, start = problem.limits, problem.start_state
-    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
-    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost, signals=ahead)
-    data = np.asarray(data_of(0.0, plant.approximate).full())
-    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
     solved = []
-    for label, build in choices.values():
-        plan = solve(ocp, build(tolerance), first, data)
+    for label, (optimiser, cost) in wanted.items():
+        if cost is None:
+            raise InvalidProblem(f"problem '{task.name}' has no cost; give Problem(cost=...)")
+        ocp = transcribe(plant, problem.reference, problem.horizon, cost, limits, ahead, start)
+        data_of = stage_data(plant, problem.reference, problem.horizon, cost, signals=ahead)
+        data = np.asarray(data_of(0.0, plant.approximate).full())
+        first = np.asarray(ocp.start(start, problem.inputs_before).full()).ravel()
+        plan = solve(ocp, optimiser, first, data)
         solved.append(Solved(label, plan, None if plan.overflow() else certify(plan)))
     return solved
 

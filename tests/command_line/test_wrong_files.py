@@ -7,16 +7,494 @@ expected, and a fix; all mistakes of one file stand in it; the exit code is that
 from __future__ import annotations
 
 import re
+import shlex
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
-from first_files import PENDULUM, REACTOR, TANKS
+from first_files import PENDULUM, REACTOR, TANKS, changes_of, messages_of
 
 import fpirhc as fp
+from fpirhc.__main__ import main
+
+REVIEW = ("review", "mine.py")
+BESIDE = {
+    "notes.txt": "x = 1\n",
+    "two_mess.py": "1 / 0\n",
+    "empty.csv": "",
+    "words.csv": "# of Monday\n\ntime,angle\n0,abc\n",
+    "other.csv": "time,phi\n0,1\n0.02,1\n",
+    "short.csv": "a,b\n1\n",
+    "folder.py/kept": "",
+}
+
+
+@dataclass(frozen=True)
+class Wrong:
+    """A changed file and what must be said about it.
+
+    Args:
+        file: the correct file.
+        changes: (old, new) pieces of it.
+        said: what stands in the message, in this order.
+        words: of the command line.
+        beside: other files of the folder.
+        code: of the exit; None: a review says no, or the file is refused.
+    """
+
+    file: str
+    changes: tuple[tuple[str, str], ...]
+    said: tuple[str, ...]
+    words: tuple[str, ...] = REVIEW
+    beside: dict[str, str] = field(default_factory=dict)
+    code: int | None = None
+
+
+def one(file: str, old: str, new: str, *said: str) -> Wrong:
+    """One change, reviewed."""
+    return Wrong(file, ((old, new),), said)
+
 
 # Changes of a correct file: the name of the mistake, the old piece and the new one, and what must be said, in this order.
+WRONG_PENDULUM = """
+a number with its unit
+  period=1e-2 -> period="10 ms"
+    Problem.period: expected a number ... write the number alone, in the unit that is expected
+one end of a limit
+  "torque": (-15.0, 15.0) -> "torque": 15.0
+    Limits.inputs['torque']: expected (a number, a number), got 15.0; write both ends, such as (-15.0, 15.0)
+a derivative in the reference
+  {"angle": 0.8 * ca.sin(2 * t)} -> {"angle": 0.8 * ca.sin(2 * t), "angle'": 1.6 * ca.cos(2 * t)}
+    'angle'' is taken from 'angle' by differentiation; leave it out
+right-hand side as a vector
+  return {"angle": (u.torque - p.friction * v.angle) / inertia - 9.81 / p.length * ca.sin(q.angle)} ->
+      return ca.vertcat(v.angle, u.torque / inertia)
+    mine.py, line 12: plant = fp.Plant( ... response must return {name: expression}, got a CasADi expression ... return {'name':
+    expression, ...}
+response of x and u
+  def response(q, v, u, p): -> def response(x, u):
+    response takes 2 arguments (mine.py, line 7) ... it is called as response(q, v, u, p) ... Plant.of_states(rates=...)
+order of a velocity
+  order=2 -> order=1
+    called as response(q, u, p); 4 arguments are those of order 2
+parameters as numbers
+  fp.Parameter(approximate=1.4, exact=1.0, unit="kg") -> 1.4
+  fp.Parameter(approximate=0.5, exact=0.6, unit="m") -> (0.5, 0.6)
+    ['mass']: expected a Parameter, got 1.4; write fp.Parameter(approximate=..., exact=..., unit=...) ... ['length']: expected a
+    Parameter
+unit in front
+  fp.Parameter(approximate=1.4, exact=1.0, unit="kg") -> fp.Parameter("kg", 1.0, 1.4)
+    mine.py, line 18 ... the values of 'approximate' and 'unit' are swapped; write Parameter(approximate=..., unit=...)
+names without units
+  {"angle": "rad"} -> ["angle"]
+  {"torque": "N m"} -> "torque"
+    Plant.coordinates: expected {name: a text}, got ['angle'] ... Plant.inputs: expected {name: a text}, got the text 'torque'
+unit as a name
+  {"angle": "rad"} -> {"rad": "angle"}
+    line 9): coordinate 'angle' is unknown. Valid: rad.
+entries by number
+  q.angle -> q[0]
+    line 9): coordinate '0' is unknown. Entries have names, such as .angle, and no numbers.
+MX in a response
+  ca.sin(q.angle) -> ca.sin(ca.MX(1) * q.angle)
+    line 9): the symbols here are of the kind SX, which cannot be mixed with MX
+parameters without a number
+  approximate=1.4, exact=1.0 -> approximate=float("nan"), exact=float("inf")
+    parameter 'mass': approximate is nan, expected a finite number; look at what computes it ... parameter 'mass': exact is inf,
+    expected a finite number
+names of another tool
+  period=1e-2 -> dt=1e-2
+  duration=0.2 -> T=0.2
+  start={ -> x0={
+    no field 'x0'. Did you mean 'start'? ... no field 'dt'. Did you mean 'period'? ... no field 'T'. Did you mean 'duration'? ...
+    Problem needs start, period, duration
+start as an array
+  start={"angle": 0.0} -> start=np.zeros(2)
+    Problem.start: expected {name: a finite number}, got an array of the shape (2,)
+limits by vectors
+  fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(lbu=np.array([-15.0]), ubu=np.array([15.0]))
+    mine.py, line 29 ... no field 'lbu'. Did you mean 'inputs'? ... no field 'ubu'. Did you mean 'inputs'?
+limits as a mapping
+  fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> {"torque": (-15.0, 15.0)}
+    Problem.limits: expected a Limits ... write fp.Limits(inputs=...)
+limits of unknown names
+  fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"tau": (-15.0, 15.0)}, states={"angle_dot": (-3, 3)})
+    input 'tau' is unknown. Valid: torque. ... state 'angle_dot' is unknown. Did you mean 'angle''?
+cost by matrices
+  fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) ->
+      fp.Quadratic(Q=np.diag([1e3, 1.0]), R=np.eye(1))
+    no field 'Q'. Did you mean 'states'? ... no field 'R'. Did you mean 'effort'?
+cost as a function
+  fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) -> lambda x, u: x[0] ** 2
+    Problem.cost: expected a Cost or None, got the function <lambda>(x, u); one of CustomCost, Quadratic
+cost on unknown names
+  fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) ->
+      fp.Quadratic(states={"theta": 1.0}, effort={"force": 1e-2}, terminal={"angle_dot": 1.0})
+    states: 'theta' is unknown ... effort: 'force' is unknown. Did you mean 'torque'? ... terminal: 'angle_dot' is unknown. Did
+    you mean 'angle''?
+cost of an unknown member
+  fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) -> fp.CustomCost(lambda v: {"e": v.x.angle**2})
+    line 31): a View has no 'x' ... Valid: state, reference, input
+horizon by one number
+  fp.Horizon(stages=6, step=2e-2) -> 20
+    expected a Horizon or None, got 20; write fp.Horizon(stages=..., step=...)
+horizon of another tool
+  stages=6, step=2e-2 -> n_horizon=20, t_step=2e-2
+    no field 'n_horizon'. Did you mean 'stages'? ... no field 't_step'. Did you mean 'step'? ... Horizon needs stages, step
+step before stages
+  fp.Horizon(stages=6, step=2e-2) -> fp.Horizon(2e-2, 6)
+    Horizon.stages: expected a whole number from 1 to 1000000, got 0.02
+reference as a number
+  fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}) -> 0.8
+    Problem.reference: expected a Reference, got 0.8; one of Setpoint, Table, Trajectory
+reference without a function
+  fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}) -> fp.Trajectory({"angle": 0.8})
+    mine.py, line 25 ... expected a function of 1 argument ... write lambda t: {'angle': 0.8}
+reference that is not finite
+  0.8 * ca.sin(2 * t) -> ca.sqrt(t)
+    mine.py, line 23 ... reference: at t = 0 s angle' is inf, angle'' is -inf ... give a motion that has these values
+response that divides by zero
+  ca.sin(q.angle) -> ca.sin(q.angle) / q.angle
+    the response of 'angle' (approximate parameters) is not finite at the start (angle = 0, angle' = 0) ... start elsewhere, or
+    change what is divided by zero there
+period of zero
+  period=1e-2 -> period=0
+    Problem.period: expected a number from 1e-12 to 1e12 in the plant's unit of time, got 0
+period above the run
+  period=1e-2 -> period=10.0
+    duration 0.2 s is shorter than one period of 10.0 s ... period 10 s does not divide the horizon step 0.02 s
+measured after the end
+  measure_from=0.05 -> measure_from=5.0
+    measure_from must lie in [0, 0.2), got 5.0
+disturbance without a name
+  measure_from=0.05 -> disturbances=fp.Sine(0.1, 1.0)
+    expected {name: a Disturbance}, got a value of the class Sine; write {'NAME': Sine(...)} with the name of what it belongs to
+disturbance as a number
+  measure_from=0.05 -> disturbances={"torque": 0.5}
+    expected a Disturbance, got 0.5; one of ColouredNoise, Formula, Noise
+dead time as a number
+  measure_from=0.05 -> dead_time=0.05
+    expected a DeadTime, got 0.05; write fp.DeadTime(inputs=...)
+noise as a number
+  measure_from=0.05 -> sensing=fp.Sensing(sensors={"angle": fp.Sensor(noise=0.01)})
+    Sensor.noise: expected a Disturbance or None, got 0.01
+deformation before the optimiser
+  fp.RecedingHorizon(optimiser, adaptive) -> fp.RecedingHorizon(adaptive, optimiser)
+    the values of 'optimiser' and 'deformation' are swapped
+deformation as a number
+  fp.ModelReferenced(fp.Sigmoid(gain=-2.6)) -> fp.ModelReferenced(-2.6)
+    ModelReferenced.map: expected a Deformation, got -2.6; one of Affine
+gains of a PID
+  {"RHC": fp.RecedingHorizon(optimiser) -> {"PID": fp.PID(Kp=9.0, Kd=1.0)
+    no field 'Kp'. Did you mean 'proportional'? ... no field 'Kd'. Did you mean 'derivative'?
+options of a solver
+  fp.FixedPoint(iterations=1, tolerance=1e-2) -> fp.Ipopt(max_iter=100)
+    Ipopt has no field 'max_iter'. Did you mean 'iterations'?
+class of another tool
+  {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> {"MPC": fp.MPC(optimiser)}
+    fpirhc has no name 'MPC'. Did you mean 'RecedingHorizon'? ... more.
+one controller
+  {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> fp.RecedingHorizon(optimiser)
+    line 36: it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}, got a value of the class RecedingHorizon
+controllers under another name
+  controllers = { -> controller = {
+    'controller' is such a mapping, so call it 'controllers'
+parenthesis that stays open
+  reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}), ->
+      reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)},
+    mine.py, line 23: '(' was never closed problem = fp.Problem(
+"""
+WRONG_REACTOR = """
+rates of time
+  def rates(x, u, p) -> def rates(t, x, u, p)
+    rates takes 4 arguments (mine.py, line 7); it is called as rates(x, u, p)
+output as a function
+  fp.Output("K", lambda x, p: x.T) -> lambda x, p: x.T
+    Plant.outputs['temperature']: expected an Output ... write fp.Output(unit=..., expression=...)
+output before its unit
+  fp.Output("K", lambda x, p: x.T) -> fp.Output(lambda x, p: x.T, "K")
+    mine.py, line 20 ... the values of 'unit' and 'expression' are swapped
+output of the state alone
+  lambda x, p: x.T -> lambda x: x.T
+    called as function(x, p) ... got the function <lambda>(x); write lambda x, p: ...
+output of an unknown state
+  lambda x, p: x.T -> lambda x, p: x.C_A
+    'temperature' (mine.py, line 20): state 'C_A' is unknown ... Valid: C, T.
+start in another unit
+  "T": 350.0} -> "T": "77 C"}
+    Problem.start['T']: expected a finite number, got the text '77 C'
+start of an output
+  start={"C": 0.5, "T": 350.0} -> start={"temperature": 350.0}
+    start: state 'temperature' is unknown. Valid: C, T. ... state 'C' has no first value; add 'C' ... state 'T' has no first
+    value
+weights of states behind an output
+  outputs={"temperature": 1.0}, rate -> states={"T": 1.0}, rate
+    weigh temperature, Quadratic(outputs=...)
+"""
+WRONG_TANKS = """
+start outside the limits
+  start={"h1": 1.0 -> start={"h1": 3.0
+    no Do states, rates and paths keep their limits? ... h1 beyond its limit
+limits reversed
+  "pump1": (0.0, 2.0) -> "pump1": (2.0, 0.0)
+  {"h1": (0.0, 2.0)} -> {"h1": (2.0, 0.0)}
+    'pump1' has lower 2.0 above upper 0.0; swap them ... 'h1' has lower 2.0 above upper 0.0; swap them
+gain of the wrong sign
+  gain=-0.7 -> gain=0.7
+    no Is the gain admissible? ... Use the recommended gain
+"""
+OTHERS = {
+    "no input in the response": one(
+        PENDULUM, "u.torque - ", "0 - ", "no input reaches coordinate 'angle'", "use torque in the response"
+    ),
+    "two inputs for one coordinate": Wrong(
+        PENDULUM,
+        (('{"torque": "N m"}', '{"torque": "N m", "brake": "N m"}'), ("u.torque - ", "u.torque - u.brake - ")),
+        (
+            "2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one",
+            "leave an input out",
+            "docs/models.md",
+        ),
+    ),
+    "controlled by one name": Wrong(
+        TANKS,
+        (
+            (', "pump2": "m^3/s"', ""),
+            ("u.pump2 + ", ""),
+            (', "pump2": (0.0, 2.0)', ""),
+            ("order=1,", 'order=1,\n    controlled="h1",'),
+        ),
+        ("Plant.controlled: expected (a text, ...) or None, got the text 'h1'; write ('h1',)",),
+    ),
+    "a horizon that is not there": one(
+        PENDULUM,
+        "    horizon=fp.Horizon(stages=6, step=2e-2),\n",
+        "",
+        "no Does the controller fit the problem? RecedingHorizon needs Problem(horizon=...), which this problem does not have",
+    ),
+    "headline of unknown names": one(
+        PENDULUM,
+        "controllers = {",
+        'headline = ("MPC", "RHC+FPi")\ncontrollers = {',
+        "'MPC' is unknown",
+        "'RHC+FPi' is unknown. Did you mean 'RHC+FPI'?",
+    ),
+    "headline of no pair": one(
+        PENDULUM,
+        "controllers = {",
+        'headline = ("RHC+FPI", "RHC")\ncontrollers = {',
+        "headline ('RHC+FPI', 'RHC') is no pair: expected a controller and the same one with adaptation; write ('RHC', 'RHC+FPI')",
+    ),
+    "mistakes all over the file": Wrong(
+        PENDULUM,
+        (
+            ("import numpy as np\n", "import numpy as np\nimport do_mpc_\n"),
+            ('unit="kg"', 'units="kg"'),
+            ("exact=0.6", 'exact="0.6"'),
+            ("period=1e-2", 'period="1e-2"'),
+            ("stages=6", "n_horizon=6"),
+            ("gain=-2.6", 'gain="big"'),
+        ),
+        ("line 4: import do_mpc_ ModuleNotFoundError: No module named 'do_mpc_'",),
+    ),
+    "key that is not there": one(
+        PENDULUM,
+        "optimiser = fp",
+        "n = {}['max_iter']\noptimiser = fp",
+        "mine.py, line 34: n = {}['max_iter'] KeyError: 'max_iter'",
+    ),
+    "data that are not there": one(
+        PENDULUM,
+        "optimiser = fp",
+        'table = np.loadtxt("gone.csv")\noptimiser = fp',
+        "line 34: table = np.loadtxt",
+        "gone.csv not found",
+    ),
+    "everything in a function": one(
+        PENDULUM,
+        "problem = fp.Problem(",
+        "def main():\n  problem = fp.Problem(",
+        "it must define problem = fpirhc.Problem(...), outside every function",
+    ),
+    "circular imports": Wrong(
+        PENDULUM,
+        (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
+        ("mine.py, line 5: from helper import LENGTH", "circular import"),
+        beside={"helper.py": "from mine import response\nLENGTH = 1.0\n"},
+    ),
+    "name that a neighbour lacks": Wrong(
+        PENDULUM,
+        (("import fpirhc as fp", "import fpirhc as fp\nfrom helper import LENGTH"),),
+        ("mine.py, line 5", "ImportError: cannot import name 'LENGTH' from 'helper'"),
+        beside={"helper.py": "LENGHT = 1.0\n"},
+    ),
+    "equations of MATLAB": Wrong("function dx = f(t, x)\n", (), ("mine.py, line 1: invalid syntax",)),
+    "nothing": Wrong("", (), ("it must define problem = fpirhc.Problem(...)", "it must define controllers = {")),
+}
 
 
+def changed(file: str, table: str) -> dict[str, Wrong]:
+    return {name: Wrong(file, tuple(changes), said) for name, (changes, said) in changes_of(table).items()}
+
+
+FILES = changed(PENDULUM, WRONG_PENDULUM) | changed(REACTOR, WRONG_REACTOR) | changed(TANKS, WRONG_TANKS) | OTHERS
 # Command lines beside a correct file: the words, and what must be said, in this order.
+REFUSED = """
+compare nofile => problem 'nofile' is unknown. Give the path of a problem file, or a name from 'fpirhc list'
+compare mien.py => no file at 'mien.py'. Did you mean 'mine.py'?
+compare mine => problem 'mine' is unknown; for the file write 'mine.py'
+compare Two_Mass => Did you mean 'two_mass'?
+compare . => '.' is a folder; a problem file ends in .py, such as mine.py, two_mess.py
+compare notes.txt => 'notes.txt' is not a Python file; a problem file ends in .py
+mine.py => the command 'mine.py' is unknown. Write fpirhc compare mine.py.
+reveiw mine.py => Did you mean 'review'?
+review mine.py --controler RHC => the option '--controler' is unknown. Did you mean '--controllers'? ... See fpirhc review --help
+--verion => the option '--verion' is unknown. Did you mean '--version'? ... See fpirhc --help
+compare => PROBLEM ... See fpirhc compare --help
+run mine.py => CONTROLLER ... See fpirhc run --help
+compare mine.py --seed abc => '--seed' ... integer
+compare mine.py --seed => '--seed' requires an argument
+compare mine.py two_mass => unexpected extra argument ... two_mass
+compare mine.py --controllers RHC,RHC+FPI => controller 'RHC,RHC+FPI' is unknown ... names are separated by spaces, without commas
+study mine.py --draws 2 --mismatch x => expected percent of at least 0, such as 20%, got 'x'
+study mine.py --mismatch 20 => give one of --cases, --draws, --over, --limits
+study mine.py --limits noise --mismatch 20 => --mismatch is of drawn plants: give --draws N too
+review mine.py --mismatch 120% => mismatch 120: expected percent of at least 0 and below 100, where a parameter keeps its sign
+run mine.py fpi => controller 'fpi' is unknown. Did you mean 'RHC+FPI'?
+run mine.py RHC+FPI --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.gain'?
+run mine.py RHC+FPI --set deformation.gain=-2 => has no 'gain'. Did you mean 'deformation.map.gain'?
+run mine.py RHC --set mass=2 => write exact.mass for the plant, approximate.mass for the model
+new ../my-arm => '../my-arm' is no name for a problem ... Try 'my_arm'; a folder is given by --dir
+new class => 'class' cannot be the name of a problem: it is a word of Python. Try 'my_class'
+new two_mass => 'two_mass' cannot be the name of a problem: a shipped problem has it ... Try 'my_two_mass'
+new numpy => a module of that name is installed, which the file would hide from everything beside it.
+review folder.py => 'folder.py' is a folder; a problem file ends in .py
+review mine.py --controllers => '--controllers' requires an argument
+review mine.py --controllers RCH abc =>
+    1. controller 'RCH' is unknown. Did you mean 'RHC'? ... 2. controller 'abc' is unknown. Valid: RHC, RHC+FPI.
+review mine.py --mismatch -5 => expected percent of at least 0, such as 20%, got '-5'
+review mine.py --mismatch nan => expected percent of at least 0, such as 20%, got 'nan'
+study mine.py --draws 2 --headline rms_error => has a number for every coordinate; give one: 'rms_error.NAME'
+study mine.py --draws 2 --headline rms_error.angel => is unknown. Did you mean 'rms_error.angle'?
+study mine.py --draws 2 --headline max_error.phi => is unknown. Did you mean 'max_error.angle'? Valid: max_error.angle.
+study mine.py --draws 2 --headline effort.torque => metric 'effort.torque' has no better direction
+study mine.py --draws 2 --headline '' => metric '' is unknown. Valid: relative error, cycles, rms_error
+study mine.py --draws 0 => '--draws'
+study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
+study mine.py --over deformation.map.gian=1:2:3 => has no 'gian'. Did you mean 'gain'?
+compare two_mass --optimisers all --controllers CTC => plans with an optimiser
+run mine.py RHC RHC+FPI => unexpected extra argument ... RHC+FPI
+run mine.py RHC --duration 0 => '--duration' is unknown
+run mine.py RHC --set =3 => --set =3: expected PATH=NUMBER
+run mine.py RHC+FPI --set deformation.map.gain=abc => expected PATH=NUMBER, such as deformation.gain=-1.2
+run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number other than zero ... got nan
+run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
+run mine.py RHC --set optimiser.iterations=0 => FixedPoint.iterations: expected a whole number from 1
+run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file
+run mine.py RHC --draw -1 => '--draw'
+compare mine.py --plans --optimisers => '--optimisers' requires an argument
+compare mine.py --plans --optimisers ipot => optimiser 'ipot' is unknown. Did you mean 'ipopt'? Valid: fixed-point, ipopt,
+compare mine.py --plans --controllers RCH => controller 'RCH' is unknown. Did you mean 'RHC'?
+tune mine.py => no search space; add tuning =
+tune two_mass --trials 10000000000 => '--trials'
+tune mine.py --trials 0 => '--trials'
+tune two_mass --metric settling.qq => metric 'settling.qq' is unknown. Did you mean 'settling.q2'?
+check mine.py --ignore-below -1 => expected percent of at least 0, such as 20%, got '-1'
+check nofile => problem 'nofile' is unknown.
+check . => '.' is a folder; a problem file ends in .py, such as mine.py
+accept mine.py --reason '' => say why the new numbers are right
+accept mine.py --reason x --processes -1 => '--processes'
+accept two_mass => '--reason' ... See fpirhc accept --help
+accept two_mass --reason x --seeds 1 => '--seeds'
+export mine.py RHC --live optimiser.iterations => is a whole number or a switch
+export two_mass RHX => problem 'two_mass': controller 'RHX' is unknown. Did you mean 'RHC'? Valid: 'CTC', 'CTC+FPI (eq 3)'
+export two_mass RHC --to matlab => the target 'matlab' is unknown. ... Valid: arduino, c, fmu2, library, wasm, lab
+export two_mass CTC --name int => 'int' cannot be the name of a controller in C: expected at most 40 letters,
+export two_mass CTC --live gain =>
+    setting 'gain': neither the controller nor the problem's cost, limits, dead_time, reference
+probe mine.py --amplitude -1 => expected a number of at least 0, in the unit of the signal
+probe mine.py --chatter 0 => expected a number above 0, in the unit of the signal
+probe two_mass --controller X => problem 'two_mass': controller 'X' is unknown. Valid: 'CTC', 'CTC+FPI (eq 3)'
+probe two_mass --cycles 3 => probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual
+probe mine.py --recording words.csv --cycles 7 =>
+    cycles is of an excitation, and a recording has been excited: leave one of them out
+probe mine.py --recording words.csv => recording words.csv ... abc
+probe mine.py --recording gone.csv => gone.csv
+study two_mass --limits nosuch => quantity 'nosuch' is unknown. Did you mean 'noise'? Valid: mismatch,
+study two_mass --cases heavy => problem 'two_mass' has no cases; add cases = fpirhc.Cases(
+study two_mass --draws 5 => every plant would be the same
+new 'two mass' => 'two mass' is no name for a problem: it must begin with a letter and go on with letters, digits
+new 2mass => Try 'plant_2mass'; a folder is given by --dir
+list --x => the option '--x' is unknown
+run two_mass RHC+FPI --set deformation.gian=-1 => (Sigmoid) has no 'gian'. Did you mean 'gain'? Valid: gain, shift, scale.
+run two_mass RHC --set m1.exact=nan => --set: 'm1.exact': expected a finite number, got nan
+compare two_mass --set exact.m9=1 => --set: 'exact.m9': 'exact.NAME' has a parameter of what moves, and there is no 'm9'.
+run two_mass RHC --set deformation.gain=-1 =>
+    setting 'deformation.gain': 'deformation' of the controller (Identity) has no 'gain'. ... It has no settings; the controller
+    has settings in:
+run two_mass RHC+FPI --set limits.inputs.Q3=1,2 =>
+    setting 'limits.inputs.Q3': 'limits.inputs' of the problem has no 'Q3'. Did you mean 'Q2'? Valid: Q1, Q2.
+run two_mass CTC --set limits.inputs.Q1=5,-5 => problem: limits: 'Q1' has lower 5.0 above upper -5.0; swap them
+"""
+NOT_WRITABLE = """
+new mine => 'mine.py' exists already and is kept; choose another name or --dir
+compare mine.py --out notes.txt/a => cannot write to the folder 'notes.txt/a': it is a file
+accept mine.py --reason x --baselines notes.txt => cannot write to the folder 'notes.txt' ... choose another with --baselines
+compare two_mass --out notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --out
+run two_mass CTC --out notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --out
+study two_mass --limits noise --out notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --out
+tune two_mass --out notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --out
+export two_mass CTC --to lab --out notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --out
+new arm --dir notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --dir
+export two_mass CTC --out folder.py => 'folder.py' is not an empty folder, and nothing in it is replaced; choose another
+"""
+NO_BASELINE = """
+check mine.py => there is no baseline 'mine.json'; write one: fpirhc accept
+"""
+
+
+def lines(table: str, code: int) -> dict[str, Wrong]:
+    return {
+        words: Wrong(PENDULUM, (), tuple(said.split(" ... ")), tuple(shlex.split(words)), BESIDE, code)
+        for words, said in messages_of(table).items()
+    }
+
+
+LINES = lines(REFUSED, 2) | lines(NOT_WRITABLE, 3) | lines(NO_BASELINE, 6)
+WRONG = FILES | LINES
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_or_command_line_is_explained(name, tmp_path, monkeypatch, capsys):
+    wrong = WRONG[name]
+    monkeypatch.chdir(tmp_path)
+    Path("folder.py").mkdir()
+    text = wrong.file
+    for old, new in wrong.changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    for file, content in {"mine.py": text, **wrong.beside}.items():
+        Path(file).write_text(content, encoding="utf-8")
+    before = files(tmp_path)
+    code = main(list(wrong.words))
+    printed = capsys.readouterr()
+    said = " ".join((printed.out + printed.err).split())
+    if wrong.code is None:
+        assert code in (1, 2)
+    else:
+        assert code == wrong.code
+        assert files(tmp_path) == before
+    assert "Traceback" not in said
+    assert "an error inside" not in said
+    assert "usage:" not in said
+    place = -1
+    for words in wrong.said:
+        place = said.find(words, place + 1)
+        assert place >= 0, f"'{words}' is not in its place in: {said}"
 
 
 @pytest.mark.parametrize("file", [PENDULUM, REACTOR, TANKS])

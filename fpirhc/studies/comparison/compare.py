@@ -44,6 +44,8 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
     """Return the named controllers of a task in the given order; all of them when no names are given."""
     mistakes = Mistakes(f"problem '{task.name}'")
     mistakes.unknown("controller", names or (), task.controllers)
+    if not mistakes.none and any("," in name for name in names or ()):
+        mistakes.add("names are separated by spaces, without commas")
     mistakes.raise_if_any()
     return {name: task.controllers[name] for name in names or task.controllers}
 

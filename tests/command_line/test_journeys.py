@@ -1,0 +1,382 @@
+"""The command line as it is used: a table of journeys with exit codes and first lines, and what all commands share."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import typer
+from line import line_text
+
+import fpirhc as fp
+from fpirhc.__main__ import main
+from fpirhc.cli import app
+from fpirhc.problem_files.shipped import shipped_problems
+from fpirhc.symbolic.native import cache_folder
+
+pytest_plugins = ["pytester"]
+ROOT = Path(__file__).resolve().parents[2]
+GROUP = typer.main.get_command(app)
+COMMANDS = GROUP.commands  # type: ignore[attr-defined]
+HORIZON = """measure_from=0.5,
+    horizon=fp.Horizon(stages=10, step=1e-2),
+    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2}),
+    limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
+"""
+PLANNERS = """controllers = {
+    "RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)),
+    "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.Sigmoid(gain=-0.5, scale=50.0)),
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """A working folder with a problem that is short."""
+    monkeypatch.chdir(tmp_path)
+    Path("line.py").write_text(line_text("period=2e-3, duration=1.0, measure_from=0.5"))
+    return tmp_path
+
+
+def edited(old: str, new: str) -> Callable[[], None]:
+    """Function that changes the problem file."""
+
+    def edit() -> None:
+        text = Path("line.py").read_text()
+        assert old in text
+        Path("line.py").write_text(text.replace(old, new))
+
+    return edit
+
+
+def receding() -> None:
+    edited("measure_from=0.5,\n", HORIZON)()
+    edited("controllers = {\n", PLANNERS)()
+
+
+def recorded() -> None:
+    run = fp.simulate(
+        fp.load_problem("line.py").problem, fp.load_problem("line.py").controllers["CTC"], seed=0, compiled=False
+    )
+    columns = {"u": "command.u", "y": "state.y", "y'": "state.y'", "y''": "realised.y"}
+    rows = zip(run.time, *(run[name] for name in columns.values()), strict=True)
+    Path("run.csv").write_text(
+        "\n".join([",".join(["time", *columns]), *(",".join(map(repr, map(float, r))) for r in rows)])
+    )
+
+
+TIGHT = edited('"u": (-30.0, 30.0)}', '"u": (-1.0, 1.0)}, states={"y": (0.8, 1.0)}')
+WEAK = edited("measure_from", 'limits=fp.Limits(inputs={"u": (-0.01, 0.01)}), measure_from')
+DIVERGING = edited("- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.5001 - q.y)")
+TUNABLE = edited(
+    "controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {'
+)
+WRONG_SIGN = edited("gain=-0.5", "gain=0.5, scale=1.0")
+WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.0}})\ncontrollers = {')
+MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
+# What is done before, the words, the exit code, and what the first line says. Those of a row follow one another.
+JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
+    "help": [(None, "", 0, "Usage: fpirhc"), (None, "help run", 0, "Usage: fpirhc run"), (None, "--version", 0, "fpirhc 0.")],
+    "list": [(None, "list", 0, "first examples")],
+    "review": [
+        (None, "review line.py -c CTC", 0, "problem: "),
+        (edited("exact=1.6", "exact=-1.6"), "review line.py", 1, "problem: "),
+    ],
+    "probe": [
+        (None, "probe line.py --cycles 80 --no-trials", 0, "line: probe with CTC"),
+        (recorded, "probe line.py --recording run.csv --json", 0, "{"),
+        (WEAK, "probe line.py --cycles 80", 1, "line: probe with CTC"),
+    ],
+    "compare": [
+        (None, "compare line.py --no-compile", 0, MASS),
+        (None, "compare line.py --no-compile -c CTC CTC+FPI --set deformation.gain=-0.4 exact.k=4", 0, MASS),
+        (None, "compare --controllers CTC --json line.py --no-compile", 0, "{"),
+        (WRONG_SIGN, "compare line.py --no-compile", 2, "fpirhc: problem 'line': controller 'CTC+FPI'"),
+    ],
+    "plans": [
+        (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
+        (receding, "compare line.py --plans", 0, "line, first horizon"),
+        (None, "compare line.py --plans --optimisers fixed-point ipopt", 0, "line, first horizon"),
+        (None, "compare line.py --optimisers fixed-point ipopt --no-compile -c RHC", 0, MASS),
+        (TIGHT, "compare line.py --plans", 4, "line, first horizon"),
+    ],
+    "run": [
+        (None, "run line.py CTC --no-compile --out kept", 0, ""),
+        (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
+        (DIVERGING, "run line.py CTC --no-compile", 4, ""),
+    ],
+    "study": [
+        (None, "study line.py --draws 2 --mismatch 20% --no-compile", 0, "A mass on a line"),
+        (None, "study line.py --draws 3 --mismatch 20% --no-compile --out twice", 0, "A mass on a line"),
+        (None, "study line.py --draws 3 --mismatch 30% --no-compile --out twice", 3, "fpirhc: "),
+        (None, "study line.py --over tracking.rate=2:6:3 exact.k=1:9:2:log -c CTC --no-compile", 0, "A mass on a line"),
+        (None, "study line.py --limits latency -c CTC --no-compile", 0, "A mass on a line"),
+        (WITH_CASES, "study line.py --cases soft --no-compile --json", 0, "{"),
+        (None, "run line.py CTC --case soft --no-compile", 0, ""),
+        (None, "run line.py CTC --case sof --no-compile", 2, "fpirhc: "),
+    ],
+    "tune": [
+        (TUNABLE, "tune line.py --trials 2 --out tuned", 0, "controller"),
+        (None, "tune line.py --trials 3 --out tuned --json", 0, '[{"controller":"CTC+FPI"'),
+    ],
+    "export": [
+        (None, "export line.py CTC --out device --live tracking.rate --name arm", 0, "wrote "),
+        (None, "export line.py CTC --out device", 3, "fpirhc: 'device' is not an empty folder"),
+        (None, "export line.py CTC --out other --name 2nd", 2, "fpirhc: '2nd' cannot be the name"),
+    ],
+    "baselines": [
+        (None, "check --no-compile", 6, "line: there is no baseline"),
+        (None, "accept line.py --reason first --no-compile --seeds 2", 0, "baseline: baselines/line.json"),
+        (None, "check --no-compile", 0, "line: 10 metrics hold"),
+        (edited("2 * t", "3 * t"), "check line.py --no-compile", 5, "line: the problem file is another one"),
+        (None, "accept line.py --reason faster --no-compile --seeds 2", 0, "baseline: baselines/line.json"),
+        (None, "check line.py --no-compile", 0, "line: 10 metrics hold"),
+        (lambda: Path("baselines/line.json").write_text("[]"), "check line.py --no-compile", 6, "line: 'line.json' is no whole"),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", JOURNEYS)
+def test_journey(name, folder, monkeypatch, capsys):
+    """Exit code, first line, no traceback, and no file that was not to be written."""
+    monkeypatch.setenv("COLUMNS", "100")
+    for before, words, code, first in JOURNEYS[name]:
+        if before:
+            before()
+        found = main(shlex.split(words))
+        printed = capsys.readouterr()
+        said = printed.out if code not in (2, 3) else printed.err
+        assert found == code, (words, printed)
+        assert said.lstrip().startswith(first), (words, said)
+        assert "Traceback" not in printed.err
+    assert folder.exists()
+
+
+def test_journeys_have_every_command_and_exit_code():
+    used = {shlex.split(words)[0] for rows in JOURNEYS.values() for _, words, *_ in rows if words}
+    assert {*COMMANDS} - used == {"doctor", "new"}  # below
+    assert {code for rows in JOURNEYS.values() for _, _, code, _ in rows} == {0, 1, 2, 3, 4, 5, 6}
+
+
+def test_options_are_few_and_explained():
+    """Twelve commands; every option and argument has a text."""
+    options = [
+        one for command in (GROUP, *COMMANDS.values()) for one in command.params if one.param_type_name == "option"
+    ]
+    assert len(COMMANDS) == 12
+    assert len(options) <= 75
+    assert all(getattr(one, "help", "") for command in COMMANDS.values() for one in command.params)
+
+
+EXAMPLES = {
+    f"{name} {k}": line for name, one in COMMANDS.items() for k, line in enumerate((one.epilog or "").splitlines())
+}
+
+
+@pytest.mark.parametrize("line", EXAMPLES.values(), ids=EXAMPLES)
+def test_examples_of_help_are_valid(line):
+    """They are parsed, and controllers that they name of shipped problems are there."""
+    words = shlex.split(re.split(r"    +|  +#|\s&&\s", line.strip())[0], comments=True)
+    assert words.pop(0) == "fpirhc"
+    if not words or words[0].startswith("-") or words[0] == "help":
+        return
+    command = COMMANDS[words[0]]
+    context = command.make_context(f"fpirhc {words[0]}", words[1:], resilient_parsing=False)
+    problem, given = context.params.get("problem"), context.params
+    if problem in shipped_problems():
+        task = fp.load_problem(problem)
+        one = given.get("controller")
+        assert {*(given.get("controllers") or ()), *([one] if one else ())} <= {*task.controllers}
+        assert not given.get("cases") or (task.cases and task.cases.matching(given["cases"]))
+
+
+def test_run_saves_every_signal_and_compare_writes_what_it_prints(folder, capsys):
+    assert main(["run", "line.py", "CTC+FPI", "--no-compile", "--out", "kept"]) == 0
+    assert fp.load_run(folder / "kept" / "CTC_FPI.npz")["deformed.y"].shape == (500,)
+    assert "virtual machine, more slowly, because --no-compile was given" in capsys.readouterr().err
+    assert main(["compare", "line.py", "--json", "--seed", "3", "--no-compile"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert json.loads((folder / "results/line/results.json").read_text()) == facts
+    errors = {name: one["metrics"]["rms_error"]["y"] for name, one in facts["controllers"].items()}
+    assert errors["CTC+FPI"] < 0.9 * errors["CTC"]
+    assert facts["seed"] == 3
+
+
+def test_plans_are_certified_side_by_side(folder, capsys, monkeypatch):
+    """A plan to 1e-6 by either optimiser is the same optimum, and its bound says so; a limit that is broken has its name."""
+    monkeypatch.setenv("COLUMNS", "200")
+    receding()
+    assert main(["compare", "line.py", "--plans", "--optimisers", "fixed-point", "ipopt"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] in (["FPI"], ["IPOPT"])]
+    assert len({row[1] for row in rows}) == 1
+    assert all(float(row[4]) < 1 and float(row[5]) < 1e-3 for row in rows)
+    assert (folder / "results/line/plan.png").stat().st_size > 10_000
+    TIGHT()
+    assert main(["compare", "line.py", "--plans"]) == 4
+    assert "'y' is 0.5 m, below 0.8, at stage 0" in capsys.readouterr().out
+
+
+def test_short_output_has_the_verdict_first_and_fits(folder, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main(["compare", "line.py", "--no-compile"]) == 0
+    short = capsys.readouterr().out.splitlines()
+    assert short[1].startswith("- CTC+FPI against CTC: better")
+    assert len(short) <= 20
+    assert max(map(len, short[:-1])) <= 80
+    assert main(["compare", "line.py", "--no-compile", "--verbose"]) == 0
+    assert not any("status" in line and "ok" in line for line in capsys.readouterr().out.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(KeyboardInterrupt(), 130), (ZeroDivisionError("in a model"), 70), (OSError(28, "full"), 3)]
+)
+def test_interrupts_and_crashes_have_codes_of_their_own(error, code, monkeypatch, capsys):
+    """One line each; --debug prints the traceback."""
+
+    def fails() -> None:
+        raise error
+
+    monkeypatch.setattr("fpirhc.problem_files.shipped.shipped_groups", fails)
+    assert main(["list"]) == code
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert main(["list", "--debug"]) == code
+    assert ("Traceback" in capsys.readouterr().err) == (code != 130)
+
+
+def test_ctrl_c_keeps_what_is_finished(folder, capsys, monkeypatch):
+    """The finished controller is reported, the other is named as interrupted."""
+    from fpirhc.studies.comparison import compare as study
+
+    ordinary = vars(study)["judged_run"]
+
+    def interrupted(loop, **settings):
+        if settings["name"] == "CTC+FPI":
+            raise KeyboardInterrupt
+        return ordinary(loop, **settings)
+
+    monkeypatch.setattr(study, "judged_run", interrupted)
+    assert main(["compare", "line.py", "--no-compile"]) == 130
+    assert (folder / "results/line/report.html").exists()
+    assert "CTC+FPI: interrupted before it finished" in capsys.readouterr().out
+
+
+def test_a_reader_that_closes_the_output_ends_it_in_silence():
+    """`fpirhc list | head -1`: no traceback, and not Python's exit code 1, which is an answer."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "fpirhc", "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout
+        assert process.stderr
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 141
+
+
+HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", "pandas", "osqp", "joblib")
+
+
+@pytest.mark.parametrize(
+    ("first", "absent"),
+    [
+        ("from fpirhc.__main__ import main; main([]); main(['list'])", HEAVY),
+        ("import fpirhc as fp; fp.Problem", HEAVY[2:]),
+        ("import fpirhc as fp; fp.load_problem('two_mass')", ("matplotlib", "rich", "jinja2", "pandas", "joblib")),
+        ("from fpirhc.__main__ import main; main(['compare', 'wrong.py'])", HEAVY[3:]),
+        ("import fpirhc.report.html", ("matplotlib",)),
+        ("import fpirhc.studies.comparison.compare", ("scipy",)),
+    ],
+)
+def test_what_comes_first_is_light(first, absent, tmp_path):
+    """Lists need no heavy library, a wrong file nothing that draws, and linear algebra has one thread unless the user says more."""
+    (tmp_path / "wrong.py").write_text("nothing = 3\n")
+    code = f"import sys, os; {first}; print([m for m in {absent} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60, cwd=tmp_path
+    )
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_names_that_an_output_cannot_write_are_escaped(encoding, tmp_path):
+    (tmp_path / "mine.py").write_text(line_text("period=1e-2, duration=0.1").replace('"CTC"', '"θ"'), encoding="utf-8")
+    environment = {"PYTHONIOENCODING": encoding, "PYTHONPATH": str(ROOT), "FPIRHC_CC": "none"}
+    words = [sys.executable, "-m", "fpirhc", "review", "mine.py", "-c", "θ"]
+    done = subprocess.run(words, capture_output=True, cwd=tmp_path, env=environment, check=False, timeout=100)
+    assert done.returncode in (0, 1)
+    assert b"\\u03b8" in done.stdout
+
+
+# --- new and doctor ---------------------------------------------------------------------------------------------------
+
+
+def test_new_files_work_at_once(pytester, monkeypatch, capsys):
+    """Adaptation helps, and the written test passes, with a baseline and without one."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache_folder().parent))  # pytester has a home of its own
+    assert main(["new", "my_arm", "--dir", "arms/left"]) == 0
+    assert "fpirhc compare arms/left/my_arm.py" in capsys.readouterr().out
+    task = fp.load_problem(str(pytester.path / "arms/left/my_arm.py"))
+    errors = {
+        n: fp.measure(task.problem, fp.simulate(task.problem, c, seed=0)).rms_error["y"]
+        for n, c in task.controllers.items()
+    }
+    assert errors["RHC+FPI"] < 0.2 * errors["RHC"]
+    done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-W", "error", "-k", "not test_controller")
+    done.assert_outcomes(passed=2, skipped=1, deselected=3)
+
+
+@pytest.mark.parametrize("taken", ["arm.py", "test_arm.py"])
+def test_new_never_overwrites(folder, capsys, taken):
+    Path("line.py").unlink()
+    Path(taken).write_text("mine")
+    assert main(["new", "arm"]) == 3
+    assert f"'{taken}' exists already and is kept" in capsys.readouterr().err
+    assert {file.name: file.read_text() for file in folder.iterdir()} == {taken: "mine"}
+
+
+def test_new_does_not_follow_a_link(folder):
+    Path("arm.py").symlink_to("elsewhere.py")
+    assert main(["new", "arm"]) == 3
+    assert not (folder / "elsewhere.py").exists()
+
+
+NAMES = {
+    "": "my_plant",
+    "my-arm": "my_arm",
+    "../../etc/passwd": "etc_passwd",
+    "$(id)": "id",
+    "\x1b[31mred": "plant_31mred",
+    "größe": "gr_e",
+    "json": "my_json",
+    "test_arm": "my_test_arm",
+    "x" * 300: "x" * 52,
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_hostile_names_are_refused_with_one_that_is_accepted(folder, capsys, name):
+    assert main(["new", name]) == 2
+    said = capsys.readouterr().err
+    assert f"Try '{NAMES[name]}'" in said
+    assert "\x1b" not in said
+    assert len(said) < 400
+    assert main(["new", NAMES[name]]) == 0
+
+
+def test_doctor_finds_this_installation_and_a_faulty_one(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("FPIRHC_CACHE", str(tmp_path / "cache"))
+    assert main(["doctor", "--json"]) == 0
+    checks = {one["name"]: one for one in json.loads(capsys.readouterr().out)}
+    assert "fpirhc 0." in checks["versions"]["evidence"]
+    assert str(tmp_path / "cache") in checks["cache"]["evidence"]
+    assert "fail" not in {one["outcome"] for one in checks.values()}
+    monkeypatch.setenv("FPIRHC_CC", "none")
+    assert main(["doctor"]) == 0
+    assert re.search(r"warn  compiler: .*FPIRHC_CC=none.*to do: install gcc", capsys.readouterr().out)
+    monkeypatch.setattr("casadi.has_nlpsol", lambda name: 1 / 0)
+    assert main(["doctor"]) == 7
+    assert re.search(r"fail  solvers: ZeroDivisionError", capsys.readouterr().out)
