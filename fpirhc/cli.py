@@ -270,7 +270,7 @@ def study(
     limits: Annotated[list[str] | None, typer.Option(metavar="WORD ...", help="mismatch, plants, latency, noise, lost")] = None,
     mismatch: Mismatch = 0.0, controllers: Controllers = None,
     headline: Annotated[str | None, typer.Option(metavar="METRIC", help="what is judged [default: the error]")] = None,
-    processes: Processes = 1,
+    processes: Annotated[int | None, typer.Option(min=1, help="number of processes [default: 1]")] = None,
     cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="of a Dask scheduler, tcp://HOST:PORT")] = None,
     seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
 ) -> None:  # fmt: skip
@@ -300,7 +300,7 @@ def study(
         if cluster:
             stack.enter_context(_dask(cluster))
         if limits:
-            result: Any = find_limits(task, over=limits, **facts)
+            result: Any = find_limits(task, over=limits, seed=seed, folder=folder, **facts)
             page = render_charted(result.view)
         else:
             drawn: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
@@ -369,7 +369,7 @@ def probe(
 def tune(
     problem: Problem, controllers: Controllers = None,
     trials: Annotated[int, typer.Option(min=1, max=1_000_000, help="of every controller")] = 50,
-    draws: Annotated[int, Count] = 1, mismatch: Mismatch = 0.0, cases: Cases = None,
+    draws: Annotated[int | None, Count] = None, mismatch: Mismatch = 0.0, cases: Cases = None,
     metric: Annotated[str | None, typer.Option(metavar="METRIC", help="that becomes better [default: the error]")] = None,
     seed: Seed = 0, out: Out = None, json: Json = False,
 ) -> None:  # fmt: skip
@@ -379,8 +379,10 @@ def tune(
     from fpirhc.studies.tune import tune as search
     from fpirhc.studies.variants import CasesOf, Draws
 
-    # The plants are never those of a comparison.
-    variants = CasesOf(tuple(cases), seed) if cases else Draws(draws, mismatch, seed + 10**6)
+    if mismatch and not draws:
+        raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
+    drawn = Draws(draws, mismatch, seed + 10**6) if draws else None  # never the plants of a comparison
+    variants = CasesOf(tuple(cases), seed) if cases else drawn
     facts = {"trials": trials, "variants": variants, "seed": seed, "controllers": controllers, "metric": metric}
     with _progress(json) as progress:
         found = search(task, folder=_folder(out, task.name, "tuning"), progress=progress, **facts)

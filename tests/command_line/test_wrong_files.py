@@ -395,7 +395,7 @@ run mine.py RHC --draw -1 => '--draw'
 compare mine.py --plans --optimisers => '--optimisers' requires an argument
 compare mine.py --plans --optimisers ipot => optimiser 'ipot' is unknown. Did you mean 'ipopt'? Valid: fixed-point, ipopt,
 compare mine.py --plans --controllers RCH => controller 'RCH' is unknown. Did you mean 'RHC'?
-tune mine.py => no search space; add tuning =
+tune mine.py => no search space ... add to its file, for example, tuning =
 tune two_mass --trials 10000000000 => '--trials'
 tune mine.py --trials 0 => '--trials'
 tune two_mass --metric settling.qq => metric 'settling.qq' is unknown. Did you mean 'settling.q2'?
@@ -421,8 +421,8 @@ probe mine.py --recording words.csv --cycles 7 =>
 probe mine.py --recording words.csv => recording words.csv ... abc
 probe mine.py --recording gone.csv => gone.csv
 study two_mass --limits nosuch => quantity 'nosuch' is unknown. Did you mean 'noise'? Valid: mismatch,
-study two_mass --cases heavy => problem 'two_mass' has no cases; add cases = fpirhc.Cases(
-study two_mass --draws 5 => every plant would be the same
+study two_mass --cases heavy => problem 'two_mass' has no cases; add to its file cases = fpirhc.Cases(
+study two_mass --draws 5 => all 5 plants would be the same ... give --mismatch
 new 'two mass' => 'two mass' is no name for a problem: it must begin with a letter and go on with letters, digits
 new 2mass => Try 'plant_2mass'; a folder is given by --dir
 list --x => the option '--x' is unknown
