@@ -133,12 +133,12 @@ def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | Non
     before, after = (
         {
             name: value if math.isfinite(value) else math.inf
-            for name, value in rms_error.values(problem, run).items()
+            for name, value in rms_error(problem, run).items()
             if names is None or name in names
         }
         for run in runs
     )
-    stuck = float(np.min([at_limit.values(problem, run)[""] for run in runs]))  # NaN where one of them is
+    stuck = float(np.min([at_limit(problem, run) for run in runs]))  # NaN where one of them is
     return ErrorPair(before, after, _ranges(problem, runs[0]), followed_units(problem.plant), stuck)
 
 

@@ -44,7 +44,7 @@ class Objective:
     @property
     def judged(self) -> bool:
         """Whether it is of the signals that judge a run, which a study computes where somebody asks for them."""
-        return self.metric is not None and bool({*JUDGING} & {*(self.metric.reads or ())})
+        return self.metric is not None and bool({*JUDGING} & {*self.metric.reads})
 
     def text(self, value: float) -> str:
         """Return a number of a run as text."""

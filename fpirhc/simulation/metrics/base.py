@@ -21,7 +21,6 @@ from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import ByName, Checked, FoundByName, checked_call
 from fpirhc.members import within
 from fpirhc.plant.motion import followed_units
-from fpirhc.simulation.metrics.summed import Summed
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table, written_out
@@ -50,7 +49,7 @@ class Metric(Checked):
     Args:
         name: small letters, digits and '_'; one dot may put it in a group, 'solve.worst_iterations'.
         function: (problem, run) -> a number, or with `by` a mapping with one number for every element; None where the run has no
-            such number. NaN means that the run did not reach it. A `Summed` is summed up where runs keep no log, too.
+            such number. NaN means that the run did not reach it.
         by: kind of the elements ('coordinate', 'input', 'term', ...); None for one number.
         unit: of every element: text, or a function (problem, element) -> text; the element of a single number is ''.
         better: direction of an improvement: 'smaller', 'larger' or 'neither'.
@@ -65,7 +64,7 @@ class Metric(Checked):
         floor: size of a difference up to which two numbers count as equal.
         step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
         order: place among the columns, smallest first.
-        reads: names of the signals that its function reads, where it reads nothing else of a run; None: anything.
+        reads: names of the signals that its function reads; with 'cost' or 'contraction' a study computes these of every run.
 
     Raises:
         InvalidName: a name that cannot be a key.
@@ -88,7 +87,7 @@ class Metric(Checked):
     floor: float = 1e-12
     step: Callable[[float, int], float] = _no_step
     order: float = 100.0
-    reads: tuple[str, ...] | None = None
+    reads: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -100,11 +99,6 @@ class Metric(Checked):
     def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[object, ...]:
         """A known metric is pickled by its name, so that metrics of runs can come from other processes."""
         return (known_metric, (self.name,)) if known_metric(self.name) is self else super().__reduce_ex__(protocol)
-
-    @property
-    def summed(self) -> Summed | None:
-        """How it is summed up cycle by cycle, for runs side by side that keep no log; None: its function reads a log."""
-        return self.function if isinstance(self.function, Summed) else None
 
     @property
     def heading(self) -> str:

@@ -159,7 +159,7 @@ def _figure(
         headline=headline,
         finite=True,
         better=better,
-        reads=(what.partition(".")[0], "time") if isinstance(what, str) else None,
+        reads=(what.partition(".")[0],) if isinstance(what, str) else (),
     )
 
 

@@ -187,6 +187,9 @@ def compare(
         changes: of live settings by controller and time.
     """
     begin, selected = time.perf_counter(), select(task, controllers)
+    mistakes = Mistakes("changes")
+    mistakes.unknown("controller", changes or (), selected)
+    mistakes.raise_if_any()
     check_gains(task, selected)
     problem, skipped = task.problem, dict[str, str]()
     composed, entries = dict[str, tuple[ComposedLoop, ComposedStep | None]](), list[Entry]()

@@ -60,7 +60,7 @@ def left_alone(problem: Problem, seed: int) -> dict[str, float]:
         run = simulator(problem, HeldInput(), compiled=False).run(seed=seed)
     except FpirhcError:
         return {}
-    return {} if run.stop is not None else dict(rms_error.values(problem, run))
+    return {} if run.stop is not None else rms_error(problem, run)
 
 
 @dataclass(frozen=True)

@@ -5,58 +5,59 @@ from __future__ import annotations
 import numpy as np
 
 from fpirhc.plant.motion import derivative_unit
-from fpirhc.simulation.metrics.base import Metric, input_unit
-from fpirhc.simulation.metrics.summed import Cycle, Measured, Summed, Term, some
+from fpirhc.simulation.metrics.base import Metric, by_name, input_unit, measured_cycles
+from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
 from fpirhc.symbolic.live import nominal
+from fpirhc.task.problem import Problem
 
 _AT = 1e-9  # of the range between the limits: nearer is at the limit
 
 
-def _ends(run: Measured) -> np.ndarray:
-    """Commands from which on an input is at a limit, lower ones first, a column for the run or for each of its cycles."""
-    lower, upper = _limits(run)
+def effort(problem: Problem, run: Run) -> dict[str, float]:
+    """Return the rms command of every input."""
+    commands = _measured(problem, run)
+    return by_name(run.layout["command"].elements, np.sqrt(_mean(commands * commands)))
+
+
+def total_variation(problem: Problem, run: Run) -> dict[str, float]:
+    """Return sum |u_k+1 - u_k| per unit of time, by input."""
+    commands = _measured(problem, run)
+    moves = np.abs(np.diff(commands, axis=0)).sum(axis=0) / (max(len(commands) - 1, 1) * problem.period)
+    return by_name(run.layout["command"].elements, moves if len(commands) else np.nan * moves)
+
+
+def at_limit(problem: Problem, run: Run) -> float:
+    """Return the share of the cycles in which a command stands at a limit, clipped or planned there."""
+    measured = measured_cycles(problem, run)
+    lower, upper = (end[measured] for end in _limits(problem, run))
     span = upper - lower
     near = _AT * np.where(np.isfinite(span), span, np.fmax(1.0, np.fmin(np.abs(lower), np.abs(upper))))
-    near = np.where(np.isfinite(near), near, 0.0)
-    return np.concatenate([lower + near, upper - near])
+    near, commands = np.where(np.isfinite(near), near, 0.0), _measured(problem, run)
+    return float(_mean(((commands <= lower + near) | (commands >= upper - near)).any(axis=1)))
 
 
-def _limits(run: Measured) -> np.ndarray:
-    """The limits of the inputs that were in force, shape (2, inputs) or (2, inputs, cycles)."""
-    inputs = run.problem.plant.input.elements
-    limits = np.array(nominal(run.problem.limits).input_bounds(run.problem.plant))
-    changes = () if run.run is None else run.run.in_force
+def _measured(problem: Problem, run: Run) -> np.ndarray:
+    """The commands of the measured cycles, shape (cycles, inputs)."""
+    return run["command"].reshape(run.cycles, run.layout["command"].size)[measured_cycles(problem, run)]
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """The mean over cycles; NaN where no cycle is measured."""
+    return np.asarray(values.sum(axis=0) / len(values) if len(values) else np.full(values.shape[1:], np.nan))
+
+
+def _limits(problem: Problem, run: Run) -> np.ndarray:
+    """The limits of the inputs that were in force, shape (2, cycles, inputs)."""
+    inputs = problem.plant.input.elements
+    limits = np.array(nominal(problem.limits).input_bounds(problem.plant))
+    limits = np.repeat(limits[:, None, :], run.cycles, axis=1)
     live = {f"limits.inputs.{name}.{end}": (end, k) for k, name in enumerate(inputs) for end in (0, 1)}
-    if not any(path in live for _, numbers in changes for path in numbers):
-        return limits
-    limits = np.repeat(limits[:, :, None], run.cycles, axis=2)
-    for time, numbers in changes:
-        since = round(time / run.problem.period)
+    for time, numbers in run.in_force:
         for path in live.keys() & numbers.keys():
-            limits[(*live[path], slice(since, None))] = numbers[path]
+            end, k = live[path]
+            limits[end, round(time / problem.period) :, k] = numbers[path]
     return limits
-
-
-def _at_end(cycle: Cycle) -> Term:
-    command = cycle["command"]
-    count = command.shape[0]
-    return some((command <= cycle.constants[:count]) + (command >= cycle.constants[count:]))
-
-
-_COMMAND = ("command",)
-# The rms command of every input.
-effort = Summed(_COMMAND, "command", lambda c: c["command"] * c["command"], lambda sums, run: np.sqrt(sums / run.count))
-# sum |u_k+1 - u_k| per unit of time, by input.
-total_variation = Summed(
-    _COMMAND,
-    "command",
-    lambda c: c.begun * abs(c["command"] - c.before["command"]),
-    lambda sums, run: sums / (max(run.count - 1, 1) * run.problem.period),
-    before=_COMMAND,
-)
-# The share of the cycles in which a command stands at a limit, clipped or planned there.
-at_limit = Summed(_COMMAND, ("",), _at_end, lambda sums, run: sums / max(run.count, 1), constants=_ends)
 
 
 METRICS = (

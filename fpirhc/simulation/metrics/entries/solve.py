@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 
 from fpirhc.simulation.metrics.base import Function, Metric
-from fpirhc.simulation.metrics.summed import Measured, Summed
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import written_out
@@ -22,27 +21,15 @@ def cycles(problem: Problem, run: Run) -> int:  # noqa: ARG001 -- every metric i
     return run.cycles
 
 
-def _counts(sums: np.ndarray, run: Measured) -> np.ndarray:
-    """The cycle in which a run ended early counts as NON_FINITE."""
-    counts = sums.astype(int)
-    counts[:, Status.NON_FINITE] += run.stopped
-    always = np.isin(list(Status), _ALWAYS)
-    return np.ma.masked_array(counts, (counts == 0) & ~always)
-
-
-# The number of cycles of the whole run by status.
-status = Summed(
-    ("status",),
-    tuple(s.name for s in Status),
-    lambda cycle: cycle["status"] == cycle.constants,
-    _counts,
-    all_cycles=True,
-    constants=lambda _: np.array(Status, dtype=float),
-)
+def status(problem: Problem, run: Run) -> dict[str, int]:  # noqa: ARG001 -- every metric is given the problem
+    """Return the number of cycles of the whole run by status; that in which a run ended early counts as NON_FINITE."""
+    counts = {s: int((run["status"] == s).sum()) for s in Status}
+    counts[Status.NON_FINITE] += run.stop is not None
+    return {s.name: count for s, count in counts.items() if count or s in _ALWAYS}
 
 
 _CYCLES = (
-    Metric("cycles", cycles, better="neither", report=False, compared="exact", finite=True, order=5, reads=()),
+    Metric("cycles", cycles, better="neither", report=False, compared="exact", finite=True, order=5),
     Metric("status", status, by="status", better="neither", report=False, compared="exact", finite=True, order=80),
 )
 
@@ -83,7 +70,6 @@ def residual(value: float) -> str:
     return written_out(value, 1)
 
 
-_SOLVE = ("solve",)
 METRICS = (
     *_CYCLES,
     Metric(
@@ -94,17 +80,8 @@ METRICS = (
         text=iterations,
         finite=True,
         order=90,
-        reads=_SOLVE,
     ),
-    Metric(
-        "solve.worst_iterations",
-        _over("iterations", np.max),
-        text=iterations,
-        report=False,
-        finite=True,
-        order=91,
-        reads=_SOLVE,
-    ),
+    Metric("solve.worst_iterations", _over("iterations", np.max), text=iterations, report=False, finite=True, order=91),
     Metric(
         "solve.median_stationarity",
         _over("stationarity", np.median),
@@ -114,18 +91,8 @@ METRICS = (
         report=False,
         compared="not",
         order=92,
-        reads=_SOLVE,
     ),
-    Metric(
-        "solve.worst_stationarity",
-        _over("stationarity", np.max),
-        title="worst residual",
-        compared="not",
-        order=93,
-        reads=_SOLVE,
-    ),
-    Metric(
-        "solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94, reads=_SOLVE
-    ),
-    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95, reads=_SOLVE),
+    Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", compared="not", order=93),
+    Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94),
+    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95),
 )
