@@ -36,7 +36,6 @@ from .learning.rules.projection import Projection
 from .optimisers.fixed_point import FixedPoint
 from .optimisers.full_space import FullSpaceFixedPoint
 from .optimisers.gradient_fixed_point import GradientFixedPoint
-from .optimisers.ladder import Ladder
 from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
@@ -139,7 +138,6 @@ __all__ = [
     "KalmanFilter",
     "Known",
     "LQRTerminal",
-    "Ladder",
     "Limits",
     "LogNormal",
     "LogSpan",
