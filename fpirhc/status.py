@@ -66,8 +66,8 @@ _REMEDIES = {
     "effect and the command was held: see the cycles counted here and the signals around them.",
     Status.NON_FINITE: "a signal became NaN or infinite, and the cycle was skipped: look at the first such signal of the run; the "
     "measurement is outside the model's domain, or the loop diverged.",
-    Status.BAD_SAMPLE: "a measurement was not finite, implausible, or out of date: the cycle was skipped, with the last command "
-    "and every memory as it was; look at the sensor, or widen the plausible range.",
+    Status.BAD_SAMPLE: "a measurement was lost, outside the range of its sensor, or out of date: the cycle was skipped, with the "
+    "last command and every memory as it was; look at the sensor, or widen its range.",
     Status.BAD_TIME: "the time of the step cannot follow that of the last one: it repeats, goes back, or has another unit; the "
     "cycle was skipped. Give every step the time of its cycle.",
     Status.RESTARTED: "the memory was not finite and was forgotten: the controller began anew; look at where the memory is kept.",

@@ -18,7 +18,6 @@ from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.motion import Output
 from fpirhc.plant.plant import Parameter, Plant
-from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
@@ -105,20 +104,7 @@ class Trial:
     @without_warning()
     def stepper(self) -> Stepper:
         """The controller alone, in CasADi's virtual machine."""
-        return Stepper(
-            self.problem,
-            checked(self.problem, self.controller),
-            compiled=False,
-            bounded=False,
-            plausible=anything(self.problem),
-        )
-
-
-def anything(problem: Problem) -> dict[str, tuple[float, float]]:
-    """Ranges in which no sample of a simulated run is implausible, also not of one that diverges."""
-    sensing, plant = problem.sensing, problem.plant
-    names = sensing.measures(plant) if sensing.estimates else (*plant.state.elements, *response_names(plant))
-    return dict.fromkeys(names, (-np.inf, np.inf))
+        return Stepper(self.problem, checked(self.problem, self.controller), compiled=False, bounded=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -152,11 +152,9 @@ def was_skipped(status: Expression) -> Expression:
 
 
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
-DOUBTED = "doubted"  # in the memory: samples in a row that were finite but not plausible
 TAKEN = "taken"  # time stamp of a sample
-_SAMPLE = ("time", "state", "output", "realised", "measured", "arrived", TAKEN)
-_DOUBTED = 20  # samples in a row after which the plant, and not the sensor, is where it should not be
-_WIDER = 100.0  # factor of the range inside which such samples are believed
+LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a machine is one that is not finite
+_SAMPLE = ("time", "state", "output", "realised", "measured", "arrived", TAKEN, LOST.name)
 INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 
@@ -167,7 +165,6 @@ class _Judged:
     fits: ca.SX  # whether the sample fits
     held: ca.SX  # the last command
     stored: ca.SX  # of the last good sample, which may be this one
-    doubted: ca.SX  # count of doubted samples of the next cycle
     counts: Counts  # of gaps, by name; none where no sample can be lost
     told: Counts  # what the step is told, by name
     passes: Expression  # whether a cycle without a sample is one of a gap
@@ -185,9 +182,9 @@ class Gate:
     inner: Composite  # the step of a controller, with the output 'command'
     # what is always good and not checked, such as the 'time' of a simulated clock, or the 'memory' that a loop keeps
     trusted: Sequence[str] = ()
-    # intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where there is
-    # none
-    plausible: Mapping[str, Interval] = field(default_factory=dict)
+    # intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where there is none
+    ranges: Mapping[str, Interval] = field(default_factory=dict)
+    loses: bool = False  # whether the step also reads `LOST`
     # s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
     # not later than the time, and not older than this. None: time stamps are not looked at.
     max_age: float | None = None
@@ -196,7 +193,7 @@ class Gate:
     @cached_property
     def reads(self) -> Layout:
         """What the step reads: as the controller, and the time stamp of the sample where its age counts."""
-        own = Layout(tuple([s for s in self.inner.reads.signals if s not in GAPS]))
+        own = Layout((*(s for s in self.inner.reads.signals if s not in GAPS), *([LOST] if self.loses else [])))
         return own if self.max_age is None else own + Layout((scalar(TAKEN, "s"),))
 
     @cached_property
@@ -216,17 +213,16 @@ class Gate:
 
     @cached_property
     def kept(self) -> Layout:
-        """The last command, what is kept of the last good sample, and the counts of doubted samples, failed steps and gaps."""
+        """The last command, what is kept of the last good sample, and the counts of failed steps and gaps."""
         plant = self.problem.plant
         starts = {plant.output.name: tuple(map(float, self.problem.start_output)), TAKEN: (-FINITE,)}
         starts[plant.state.name] = tuple(map(float, self.problem.start_state))
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)), holds=plant.input.name)
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
-        doubted = [scalar(DOUBTED)] if self.plausible else []
         failed = [] if "memory" in self.trusted else [scalar(FAILED)]
         counts = self.gap.memory if self.gap is not None else ()
-        return Layout((held, *good, *doubted, *failed, *counts))
+        return Layout((held, *good, *failed, *counts))
 
     @cached_property
     def controller_memory(self) -> Layout:
@@ -298,7 +294,7 @@ class Gate:
             ca.SX.sym(n, k) for n, k in (("usable", 1), ("fine", 1), ("command", judged.held.numel()))
         )
         fits, ran = judged.fits, ca.logic_and(judged.fits, fine)
-        following = {HELD: ca.if_else(ran, command, judged.held), DOUBTED: judged.doubted}
+        following = {HELD: ca.if_else(ran, command, judged.held)}
         following |= {
             f"good_{n}": ca.if_else(fine, v, own[f"good_{n}"]) for n, v in self.stored.split(judged.stored).items()
         }
@@ -317,29 +313,24 @@ class Gate:
         inputs = self.problem.plant.input.size
         sample, own, time = ca.SX.sym("sample", self.sample.size), ca.SX.sym("kept", self.kept.size), ca.SX.sym("time")
         values = self.kept.split(own)
-        held, count = values[HELD], values.get(DOUBTED, ca.SX(0))
+        held = values[HELD]
         good = ca.vertcat(ca.SX(0, 1), *(values[f"good_{n}"] for n in self.stored.names))
         command, last = held, good
         trusted = "memory" in self.trusted
         if not trusted:
             names = (HELD, *(f"good_{n}" for n in self.stored.names))
-            start = ca.DM([*np.concatenate([self.kept[n].start_vector() for n in names]), 0.0])
-            column = ca.vertcat(held, good, count)
+            start = ca.DM(np.concatenate([self.kept[n].start_vector() for n in names]))
+            column = ca.vertcat(held, good)
             column = ca.if_else(every_finite(column), column, start)
             command = clip(column[:inputs], *self.problem.limits.input_bounds(self.problem.plant))
-            last, count = column[inputs:-1], column[-1]
-        possible = self._possible(sample, last)
-        inside = self._inside(sample, 1.0)
-        believed = ca.logic_and(count > _DOUBTED - 0.5, self._inside(sample, _WIDER))
-        fits = ca.logic_and(possible, ca.logic_or(inside, believed))
-        strange = ca.logic_and(possible, ca.logic_not(inside))
-        doubted = ca.if_else(strange, count + (count < _DOUBTED - 0.5), ca.if_else(possible, 0, count))
+            last = ca.vertsplit(column, [0, inputs, column.numel()])[1]  # CasADi's empty slice is a row
+        fits = ca.logic_and(self._possible(sample, last), self._inside(sample))
         now = ca.vertcat(ca.SX(0, 1), *(sample[self.sample.slice(n)] for n in self.stored.names))
         stored = ca.if_else(fits, now, last)
         counts: Counts = {} if self.gap is None else self.gap.counts(Signals(values), trusted=trusted)
         told = self.stored.split(stored) | ({} if self.gap is None else self.gap.seen(counts))
         passes = ca.SX(0) if self.gap is None else self.gap.passes(counts, time)
-        return [sample, own, time], _Judged(fits, command, stored, doubted, counts, told, passes)
+        return [sample, own, time], _Judged(fits, command, stored, counts, told, passes)
 
     def _possible(self, sample: Expression, good: Expression) -> Expression:
         """Whether every entry is finite, and the time stamp is new."""
@@ -352,17 +343,13 @@ class Gate:
         )
         return ca.logic_and(possible, fresh)
 
-    def _inside(self, sample: Expression, wider: float) -> Expression:
-        """Whether every entry is inside its interval, made that many times wider; NaN is inside none."""
+    def _inside(self, sample: Expression) -> Expression:
+        """Whether every entry is inside its interval, and no sample is lost; NaN is inside none."""
         inside: Expression = ca.SX(1)
         for k, column in enumerate(self.sample.columns):
-            lower, upper = self.plausible.get(column, (-np.inf, np.inf))
-            middle, half = (upper + lower) / 2, wider * (upper - lower) / 2
-            if np.isfinite(middle) and np.isfinite(half):
-                inside = ca.logic_and(inside, ca.fabs(sample[k] - middle) <= half)
-            else:  # half an interval is made no wider
-                inside = ca.logic_and(inside, sample[k] >= lower) if np.isfinite(lower) else inside
-                inside = ca.logic_and(inside, sample[k] <= upper) if np.isfinite(upper) else inside
+            lower, upper = (-np.inf, 0.0) if column == LOST.name else self.ranges.get(column, (-np.inf, np.inf))
+            inside = ca.logic_and(inside, sample[k] >= lower) if np.isfinite(lower) else inside
+            inside = ca.logic_and(inside, sample[k] <= upper) if np.isfinite(upper) else inside
         return inside
 
     def _stepped(

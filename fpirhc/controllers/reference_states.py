@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi as ca
@@ -89,18 +88,6 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
 _SAMPLES = 100  # instants at which the reference is looked at
 
 
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """How large responses are."""
-
-    largest: tuple[float, ...]  # L of every controlled coordinate; infinite where an input has no finite limits
-    slope: np.ndarray  # largest change of a response per change of an input, shape (n, nu)
-
-    def of(self, places: Sequence[int]) -> Scale:
-        """Return the scale of some responses."""
-        return Scale(tuple(self.largest[k] for k in places), self.slope[list(places)])
-
-
 def largest_response(problem: Problem) -> tuple[float, ...]:
     """Return L of every controlled coordinate, by the limits of the build; infinite where an input has no finite limits.
 
@@ -108,7 +95,7 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
     reference are not known before a run.
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
-    largest = response_scale(problem).largest if problem.plant.equations.known_on_reference else free
+    largest = _largest_response(problem) if problem.plant.equations.known_on_reference else free
     return tuple(_rounded_up(value) if 0 < value < math.inf else value for value in largest)
 
 
@@ -120,14 +107,12 @@ _STEPS = 8  # per doubling
 
 
 @lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
-def response_scale(problem: Problem) -> Scale:
-    """Return the scale of every controlled response, by the limits of the build; of outputs along the model's nominal run."""
+def _largest_response(problem: Problem) -> tuple[float, ...]:
+    """L of every controlled coordinate, not rounded; of outputs along the model's nominal run."""
     task = nominal(problem)
-    plant = task.plant
-    lower, upper = task.limits.input_bounds(plant)
-    size, inputs = len(plant.controlled_names), len(plant.inputs)
+    lower, upper = task.limits.input_bounds(task.plant)
     if not np.isfinite(upper - lower).all():
-        return Scale((float("inf"),) * size, np.zeros((size, inputs)))
+        return (float("inf"),) * len(task.plant.controlled_names)
     states, middle = _states(task), (lower + upper) / 2
     corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
     at_middle, *at_limits = (_responses(task, states, corner) for corner in corners)
@@ -137,10 +122,8 @@ def response_scale(problem: Problem) -> Scale:
             for low, high in zip(at_limits[::2], at_limits[1::2], strict=True)
         ]
         sizes = abs(at_middle) + sum(reach)
-        halves = np.maximum((upper - lower) / 2, 1e-300)
-        slopes = [np.where(np.isfinite(r), r, 0.0).max(axis=1) / h for r, h in zip(reach, halves, strict=True)]
     finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
-    return Scale(tuple(float(v) if v > 0 else float("inf") for v in finite), np.array(slopes).T)
+    return tuple(float(v) if v > 0 else float("inf") for v in finite)
 
 
 def _states(task: Problem) -> np.ndarray:

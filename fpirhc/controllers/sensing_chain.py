@@ -31,6 +31,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _LATEST: Latest[Composite] = Latest(4)
@@ -74,6 +75,20 @@ def raw_signal(problem: Problem) -> Signal | None:
         return None
     late = problem.dead_time.measurement_wait(problem.period)
     return problem.sensing.raw(problem.plant, first_shown(problem), late)
+
+
+def sensor_ranges(problem: Problem) -> dict[str, Interval]:
+    """Return the stated ranges of the sensors by column of the sample: "state.q1", "realised.q1", "output.y", "measured.q1"."""
+    plant, raw = problem.plant, raw_signal(problem)
+    signals = measured_signals(plant) if raw is None else (*given_states(problem), raw)
+    columns = [
+        (column, name) for signal in signals for column, name in zip(signal.columns, signal.elements, strict=True)
+    ]
+    if raw is None:
+        columns += zip(plant.response_signal("realised").columns, response_names(plant), strict=True)
+    sensors = problem.sensing.sensors
+    stated = {column: sensors[name].range for column, name in columns if name in sensors}
+    return {column: ends for column, ends in stated.items() if ends is not None}
 
 
 def seeing_blocks(problem: Problem) -> list[Block]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
 from fpirhc.plant.chain import response_units
@@ -29,18 +29,34 @@ from fpirhc.task.disturbance import Disturbance
 
 @dataclass(frozen=True, eq=False)
 class Sensor(Checked):
-    """Noise, quantisation and lost samples of one measured quantity.
+    """Noise, quantisation, lost samples and range of one measured quantity.
 
     Args:
         noise: signal that adds to the true value, in its unit: Noise, ColouredNoise, Sine (hum), Step (bias), Formula (drift);
             None: no noise.
         quantum: Q, the resolution (of an encoder, for example), in the quantity's unit; None: no quantisation.
-        dropout: probability that a cycle's sample is lost.
+        dropout: probability that a cycle's sample is lost. A cycle in which one quantity is lost is skipped, as on a machine: the
+            command is held, with the status BAD_SAMPLE.
+        range: (lower, upper), what a working sensor shows, in the quantity's unit; one side may be infinite. A sample outside
+            skips the cycle, for as long as it is outside. None: every finite number is believed.
+
+    Raises:
+        InvalidValue: a range whose lower end is not below its upper one.
     """
 
     noise: Disturbance | None = None
     quantum: Positive | None = None
     dropout: BelowOne = 0.0
+    range: tuple[float, float] | None = field(default=None, metadata={"setting": "where given"})
+
+    def __post_init__(self) -> None:
+        if self.range is not None and not self.range[0] < self.range[1]:
+            raise InvalidValue(f"Sensor(range={self.range!r}): expected (lower, upper) with lower < upper")
+
+    @property
+    def acts(self) -> bool:
+        """Whether it changes what is measured."""
+        return self.noise is not None or self.quantum is not None or not stays(self.dropout, 0.0)
 
 
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
@@ -118,7 +134,7 @@ class Sensing(Checked):
     @property
     def ideal(self) -> bool:
         """Whether the controller receives the true state and response."""
-        return not self.sensors and not self.estimates
+        return not any(sensor.acts for sensor in self.sensors.values()) and not self.estimates
 
     @property
     def estimates(self) -> bool:
@@ -241,6 +257,11 @@ class Sensing(Checked):
         # The same number, but CasADi would multiply a quantum that is a constant by the weights of the estimator behind it: that
         # rounds otherwise than a live quantum does, and a last place of a sample is now and then a whole one of the next.
         return ca.copysign(ca.fabs(quanta), quanta)
+
+    def lost(self, column: Expression) -> Expression | None:
+        """Return whether a sample of this row of `drawn` is lost; None where none can be."""
+        lost = [column[k] for k, name in enumerate(self._columns()) if name.endswith(" lost")]
+        return ca.mmax(ca.vertcat(*lost)) if lost else None
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]

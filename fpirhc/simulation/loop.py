@@ -16,11 +16,17 @@ from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Undeformed, given_response
 from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.plausible import plausible_range, response_jumps
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.sensing_chain import compose_with_sensing, seeing_blocks
+from fpirhc.controllers.sensing_chain import compose_with_sensing, seeing_blocks, sensor_ranges
 from fpirhc.plant.motion import time_signal
-from fpirhc.simulation.path import acting_blocks, disturbance_signals, moving, outside_blocks, sensing_blocks
+from fpirhc.simulation.path import (
+    acting_blocks,
+    disturbance_signals,
+    lost_blocks,
+    moving,
+    outside_blocks,
+    sensing_blocks,
+)
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
@@ -45,19 +51,15 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
     task = nominal(problem)
-    # What a body outside measures may be wrong; what the loop computes itself is a result, however far it goes.
-    mover = moving(problem)
-    plausible = plausible_range(task) if mover.doubted else {}
+    mover, lost = moving(problem), lost_blocks(problem)
     inner, gap = across_gaps(compose_with_sensing(problem, ready)), gap_of(task, BRIDGED)
-    acting = Gate(task, inner, trusted=("time", "memory"), plausible=plausible, gap=gap)
+    acting = Gate(task, inner, trusted=("time", "memory"), ranges=sensor_ranges(task), loses=bool(lost), gap=gap)
     disturbed = disturbance_signals(problem)
     seeing = sensing_blocks(problem, given_response(problem, ready), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(problem, disturbed)
-    jumps = response_jumps(task, acting.reads) if mover.doubted else None
-    gated = [acting.block()] if jumps is None else jumps.around(acting.block())
-    around = [clock, *outside_blocks(problem, ready), *seeing, *gated, *judging, *actuating]
+    around = [clock, *outside_blocks(problem, ready), *seeing, *lost, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *mover.reads))
     return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=mover.sent)

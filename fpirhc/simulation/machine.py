@@ -18,8 +18,7 @@ from fpirhc.controllers.base import Controller, fed, under_names
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.plausible import response_jumps
-from fpirhc.controllers.sensing_chain import compose_with_sensing, given_states, raw_signal
+from fpirhc.controllers.sensing_chain import compose_with_sensing, given_states, raw_signal, sensor_ranges
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported
@@ -33,8 +32,6 @@ from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.driver import every_finite
 from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import nominal
-from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _DIVERGES = 1.05  # measured factor from which a cycle counts
@@ -167,10 +164,8 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: 
     longest = round(monitor.saturated_after / (problem.period * SECONDS.get(problem.plant.time_unit, 1.0)))
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=monitor.window)
     own = _identity_block(fingerprint(problem, controller, block.memory))
-    block, jumps = fed(block, "time", Signal(CLOCK)), response_jumps(nominal(problem), gate.reads)
-    gated = [block] if jumps is None else jumps.around(block)
     judged = clock_status_block(problem, _GATED, _STATUS)
-    blocks = [own, clock_block(problem), *gated, judged, watched, _count_block()]
+    blocks = [own, clock_block(problem), fed(block, "time", Signal(CLOCK)), judged, watched, _count_block()]
     return compose("machine", gate.reads, blocks, outputs=("command",))
 
 
@@ -199,12 +194,7 @@ def _count_block() -> Block:
 
 
 def composed_step(
-    live: LiveSettings,
-    ready: Controller,
-    plausible: Mapping[str, Interval],
-    max_age: float | None,
-    monitor: RunMonitor,
-    bridged: int,
+    live: LiveSettings, ready: Controller, max_age: float | None, monitor: RunMonitor, bridged: int
 ) -> tuple[Composite, Layout]:
     """Return the step behind its gate, and the layout of its memory.
 
@@ -215,7 +205,7 @@ def composed_step(
     def compose(problem: Problem, controller: Controller) -> Composite:
         gap = gap_of(live.problem, bridged)
         inner = across_gaps(compose_with_sensing(problem, controller))
-        gates.append(Gate(live.problem, inner, plausible=plausible, max_age=max_age, gap=gap))
+        gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), max_age=max_age, gap=gap))
         return machine_step(live.problem, ready, gates[-1], monitor)
 
     composite = live.composed(compose) if live.paths else compose(live.problem, ready)

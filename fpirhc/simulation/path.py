@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.chain import measured_signals
@@ -39,6 +40,7 @@ SENT = "_acting"  # signal of the inputs that a foreign reality is sent
 CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
 SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _RAW, _HELD = "_foreign", "_foreign_held"
+_LOST_QUEUE = "lost_samples_queue"
 _PAST, _FULL = "_outputs_past", "_outputs_known"
 
 
@@ -129,8 +131,6 @@ class Mover(ABC):
     """Cycles that one call of the compiled loop runs."""
     cycles_interpreted: ClassVar[int] = SHORT
     """The same in the virtual machine."""
-    doubted: ClassVar[bool]
-    """Whether what it shows may be wrong, so that the loop looks for what is not plausible."""
     sent: ClassVar[tuple[str, ...]]
     """Signals that the step returns to it."""
 
@@ -192,7 +192,7 @@ def moving(problem: Problem) -> Mover:
 class Equations(Mover):
     """A plant of equations inside the loop: the reality, or the model itself with its exact parameters."""
 
-    doubted, sent = False, ()
+    sent = ()
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem)
@@ -268,7 +268,7 @@ class Equations(Mover):
 class Body(Mover):
     """A body outside, which is sent inputs and answers with measurements."""
 
-    doubted, sent = True, (SENT,)
+    sent = (SENT,)
     cycles_of_call = cycles_interpreted = 1  # it answers after each
 
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
@@ -368,6 +368,23 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     assert late is not None
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
     return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
+
+
+def lost_blocks(problem: Problem) -> list[Block]:
+    """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
+    drawn, held = problem.sensing.drawn, [one for one in moving(problem).reads if one.name == _HELD]
+    if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
+        return []
+    late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        lost = problem.sensing.lost(ca.vertcat(*(getattr(s, one.name) for one in drawn)))
+        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) for one in held)))
+        arrived, remembered = late.arrived(s, _LOST_QUEUE, now)
+        return {LOST.name: arrived, **remembered}
+
+    memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
+    return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
 
 
 def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Queue | None) -> list[Block]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isnan, nan
 from time import perf_counter
@@ -16,7 +16,6 @@ from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import BRIDGED, HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
-from fpirhc.controllers.plausible import plausible_range
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import ByName, Checked, missing
 from fpirhc.simulation.clock import MEMORY as CLOCK
@@ -36,7 +35,6 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
-from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _TRUTHS = (bool, np.bool_)
@@ -68,7 +66,6 @@ class ComposedStep:
         problem: Problem,
         controller: Controller,
         *,
-        plausible: Mapping[str, Interval] | None = None,
         max_age: float | None = None,
         monitor: RunMonitor | None = None,
         bounded: bool = True,
@@ -81,8 +78,7 @@ class ComposedStep:
             ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
-        ranges = plausible_range(problem, plausible)
-        composite, memory = composed_step(settings, ready, ranges, max_age, monitor or RunMonitor(), bridged)
+        composite, memory = composed_step(settings, ready, max_age, monitor or RunMonitor(), bridged)
         return cls(problem, controller, settings, ready, composite, memory, max_age is not None, bridged)
 
 
@@ -102,16 +98,16 @@ class Stepper(NumbersNow, Checked):
 
     Where the outputs of a plant are estimated, its state stands before them, unless it is believed.
 
-    A bad sample skips the cycle: one that is not finite, outside its plausible range, or (with `max_age`) out of date. The command
-    is the last one, the status is BAD_SAMPLE, and the signal 'skipped' counts. What is remembered stays as it was, but for what
-    goes on with the time: queues, integrals, filters, observers. The next good sample moves them over the gap, with the
-    status BRIDGED. After more than `bridged` cycles they begin anew, and deformations are held until their windows are full, with
-    the status SETTLING. Cycles that the caller missed, by the times of two steps, are gaps too. Before the first good sample the
-    command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. So does a time
-    that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not finite is forgotten, and so is
-    one with which good samples give nothing finite: the controller begins anew, with the status RESTARTED. Where a solver raises,
-    the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands at a limit for long and an iteration
-    that does not contract have the statuses SATURATED and NOT_CONTRACTING.
+    A bad sample skips the cycle: one that is not finite, outside the range of its sensor, or (with `max_age`) out of date. The
+    command is the last one, the status is BAD_SAMPLE, and the signal 'skipped' counts. What is remembered stays as it was, but
+    for what goes on with the time: queues, integrals, filters, observers. The next good sample moves them over the gap, with
+    the status BRIDGED. After more than `bridged` cycles they begin anew, and deformations are held until their windows are
+    full, with the status SETTLING. Cycles that the caller missed, by the times of two steps, are gaps too. Before the first
+    good sample the command is the one before the run. A sample for which the model has no number skips the cycle too, as
+    NON_FINITE. So does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not
+    finite is forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status
+    RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands
+    at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
 
     A step that takes longer than `Stepper(..., deadline=1e-3)` is late: `stepper.deadline` has the number of late steps, whether
     the last one was late, the worst one, and the 99.9th percentile, and so has the stepper's text.
@@ -139,7 +135,6 @@ class Stepper(NumbersNow, Checked):
         controller: Controller,
         *,
         compiled: bool = True,
-        plausible: Mapping[str, Interval] | None = None,
         max_age: float | None = None,
         monitor: RunMonitor | None = None,
         bounded: bool = True,
@@ -151,8 +146,6 @@ class Stepper(NumbersNow, Checked):
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
         Args:
-            plausible: intervals (lower, upper) by name of a state ("q1", "q1'") or response ("q1''"), which replace the automatic
-                ones (see `fpirhc.controllers.plausible`).
             max_age: oldest sample that is used, in the plant's unit of time; the time stamps of samples must then increase. None:
                 they are not looked at.
             monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
@@ -165,14 +158,7 @@ class Stepper(NumbersNow, Checked):
         if self.deadline is not None:
             vars(self)["step"] = self.deadline.timed(self.step)  # a stepper without a deadline pays nothing
         step = ComposedStep.of(
-            problem,
-            controller,
-            plausible=plausible,
-            max_age=max_age,
-            monitor=monitor,
-            bounded=bounded,
-            live=live,
-            bridged=bridged,
+            problem, controller, max_age=max_age, monitor=monitor, bounded=bounded, live=live, bridged=bridged
         )
         self._bind(step, compiled=compiled)
         warn_of_harm(problem, controller)

@@ -97,7 +97,7 @@ def test_wrapped_plant_runs_as_the_plant_itself(controller, sensing):
     for name in set(one.layout.names) - {"contraction"}:
         size = max(1.0, np.abs(one[name]).max())
         assert np.abs(one[name] - other[name]).max() <= 1e-12 * size, name
-    assert set(other.layout.names) - set(one.layout.names) == {"foreign", "foreign_held"}
+    assert set(other.layout.names) - set(one.layout.names) - {"lost_sample"} == {"foreign", "foreign_held"}
 
 
 def test_dead_times_stand_around_the_body():
@@ -202,8 +202,8 @@ def test_bad_answer_ends_the_run_and_loses_nothing(kind):
 
 
 def test_an_implausible_answer_is_a_skipped_cycle():
-    """A body that answers 1e9 m once: the command of that cycle is the last one, and the run goes on as if nothing had been."""
-    problem = task()
+    """A body that answers 1e9 m once, out of range: the command is held, and the run goes on as if nothing had been."""
+    problem = replace(task(), sensing=fp.Sensing({"y": fp.Sensor(range=(-5.0, 5.0))}))
     body = Faulty(problem, lambda answer: np.full_like(answer, 1e9))
     spiked, clean = run(replace(problem, reality=fp.ExternalPlant(body, MEASURES))), run(outside(problem))
     assert spiked.stop is None
@@ -223,6 +223,8 @@ def test_bad_answers_are_held_as_stated(kind):
     assert two.stop is None
     assert np.flatnonzero(two["foreign_held"]).tolist() == [100, 101]
     assert np.array_equal(two["state"][100:102], two["state"][[99, 99]])
+    assert np.flatnonzero(two["status"] == fp.Status.BAD_SAMPLE).tolist() == [100, 101]  # as a lost sample of a machine
+    assert np.array_equal(two["command"][100:102], two["command"][[99, 99]])
     three = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad, range(100, 103)), MEASURES, holds=2)))
     assert three.cycles == 102
     assert str(three.stop).endswith("after 2 in a row that were held; ExternalPlant(holds=3) bridges one more")

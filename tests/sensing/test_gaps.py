@@ -288,7 +288,7 @@ def test_the_deformation_is_held_while_estimates_settle():
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", ["SavitzkyGolay", "StateVariableFilter", "paired", "disturbance filter"])
+@pytest.mark.parametrize("name", ["SavitzkyGolay", "paired", "disturbance filter"])
 def test_compiled_steps_go_over_gaps_alike(name):
     """C and the virtual machine agree after short gaps and long ones."""
     problem, controller = LOOPS[name]

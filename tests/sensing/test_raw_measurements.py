@@ -11,9 +11,8 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import InvalidProblem, InvalidShape
+from fpirhc.errors import InvalidShape
 from fpirhc.simulation.simulate import simulator
-from fpirhc.status import Status
 
 TRACK = fp.Exponential(rate=6.0)
 GENTLE = fp.Affine(gain=-0.05)
@@ -28,17 +27,6 @@ PROBLEM = replace(two_masses(), duration=0.2, sensing=fp.Sensing(estimator=fp.Po
 by_name = pytest.mark.parametrize("name", CONTROLLERS)
 
 
-def test_implausible_position_is_skipped():
-    """The range is that of the measured quantity: the automatic one of a position, and one of the user's own."""
-    measured = PROBLEM.start_state[:2]
-    for own in (None, {"a": (measured[0] - 0.1, measured[0] + 0.1)}):
-        stepper = fp.Stepper(PROBLEM, CONTROLLERS["computed torque"], compiled=False, plausible=own)
-        stepper.step_measured(0.0, measured, stepper.start())
-        assert stepper.trace()["status"][0] != int(Status.BAD_SAMPLE)
-        stepper.step_measured(0.0, measured + np.array([1e3, 0.0]), stepper.start())
-        assert stepper.trace()["status"][0] == int(Status.BAD_SAMPLE)
-
-
 def test_estimates_are_refused_where_raw_measurements_are_expected():
     stepper = fp.Stepper(PROBLEM, CONTROLLERS["computed torque"], compiled=False)
     assert stepper.measures == ("a", "b")
@@ -46,11 +34,6 @@ def test_estimates_are_refused_where_raw_measurements_are_expected():
         stepper.step(0.0, np.zeros(4), np.zeros(2), stepper.start())
     with pytest.raises(InvalidShape, match="'measured' has 2 entries"):
         stepper.step_measured(0.0, np.zeros(3), stepper.start())
-
-
-def test_a_range_of_what_nobody_measures_is_refused():
-    with pytest.raises(InvalidProblem, match=r"measured quantity \"?'?a'.*Did you mean 'a'"):
-        fp.Stepper(PROBLEM, CONTROLLERS["plan"], plausible={"a'": (-1.0, 1.0)})
 
 
 @by_name

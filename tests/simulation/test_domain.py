@@ -163,7 +163,7 @@ def test_loop_goes_on_and_equals_the_stepper(name):
     assert np.array_equal(run["status"].ravel() == Status.NON_FINITE, below)
     held = run["command"][1:][below[1:]]
     assert np.array_equal(held, run["command"][:-1][below[1:]])
-    stepper = fp.Stepper(NOISY, controller, compiled=False, plausible={"h": (-10.0, 10.0)})
+    stepper = fp.Stepper(NOISY, controller, compiled=False)
     memory = stepper.start()
     for k in range(run.cycles):
         command, memory = stepper.step_measured(run.time[k], shown[k], memory)
@@ -182,7 +182,7 @@ def test_estimators_of_a_loop_go_over_a_step_that_is_not_finite(estimator, compi
     shown = raw_measurements(run)
     assert run.stop is None
     assert min((run["status"] == s).sum() for s in (Status.NON_FINITE, Status.BRIDGED)) >= 2
-    stepper = fp.Stepper(problem, controller, compiled=compiled, plausible={"h": (-10.0, 10.0)})
+    stepper = fp.Stepper(problem, controller, compiled=compiled)
     memory = stepper.start()
     for k in range(run.cycles):
         command, memory = stepper.step_measured(run.time[k], shown[k], memory)

@@ -16,9 +16,8 @@ from plants import linear
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.plausible import plausible_range
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidProblem, InvalidShape, InvalidValue, NotSupported
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidShape, InvalidValue, NotSupported
 from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Latest
 
@@ -58,14 +57,6 @@ def test_compiled_gate_is_the_same(name):
         memories = [first, second]
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, equal_nan=False)
         assert status(virtual) == status(compiled)
-
-
-def test_plausible_range_by_name():
-    """An unknown state and an interval that is none are refused by name."""
-    with pytest.raises(InvalidProblem, match=r"'aa' is unknown. Did you mean 'a'"):
-        plausible_range(PROBLEM, {"aa": (0.0, 1.0)})
-    with pytest.raises(InvalidProblem, match="needs lower < upper"):
-        plausible_range(PROBLEM, {"a": (1.0, 0.0)})
 
 
 # Misuse

@@ -74,8 +74,7 @@ def test_results_are_nobody_elses():
 def test_the_command_is_that_of_the_law():
     """The law is q'' = w^2 e - 2 w q', the command u = m (q'' + 2 q), clipped at its limits."""
     law = fp.Exponential(rate=4.0, integral=False)
-    anything = {"y": (-99.0, 99.0), "y'": (-99.0, 99.0)}
-    one = stepper(controller=fp.ComputedTorque(law), plausible=anything)
+    one = stepper(controller=fp.ComputedTorque(law))
     command, memory = one.step(*SAMPLE, one.start())
     wanted = 16.0 * (0.2 - 0.1) - 8.0 * 0.3
     assert command == pytest.approx([1.2 * (wanted + 2.0 * 0.1)])
@@ -155,14 +154,6 @@ def test_time_stamps_are_read_where_their_age_counts():
     assert status(one) == Status.OK
     one.step(0.01, *SAMPLE[1:], memory)
     assert status(one) == Status.OK
-
-
-def test_ranges_of_a_user_replace_the_automatic_ones():
-    one = stepper(plausible={"y": (-0.2, 0.2)})
-    one.step(0.0, np.array([0.21, 0.0]), SAMPLE[2], one.start())
-    assert status(one) == Status.BAD_SAMPLE
-    plain().step(0.0, np.array([0.21, 0.0]), SAMPLE[2], plain().start())
-    assert status(plain()) == Status.OK
 
 
 def test_steps_are_timed_where_there_is_a_deadline():
