@@ -200,7 +200,7 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
                 raise InvalidName(
                     f"setting '{path}': write exact.{path} for the plant, approximate.{path} for the model"
                 )
-            raise lacked[-1]
+            raise max(lacked, key=lambda error: "Did you mean" in str(error))
     return replace(task, problem=problem, controllers={**task.controllers, **controllers})
 
 

@@ -235,7 +235,7 @@ def _answers(
             runner = Runner(task, name, metrics, compiled=compiled, judged=judged)
             yield from runner.rows(every[k] for k in group)
         return
-    path, told = str(task.path), _told(task, metrics)
+    path, told = str(task.path.resolve()), _told(task, metrics)
     _require_same(load_problem(path), told)
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered", batch_size=1)
     answers = work(joblib.delayed(_remote)(path, told, variants, n, some, compiled, judged) for n, some in jobs)
