@@ -236,6 +236,7 @@ def run(
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], _folder(out, task.name)
     from fpirhc.report.figures import save_figure
+    from fpirhc.controllers.contract import believing
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
@@ -243,6 +244,7 @@ def run(
 
     if draw is not None:
         one = Draws(draw + 1, mismatch, seed).of(task)[draw]
+        chosen = believing(task.problem, chosen)  # it does not know what is drawn
         task, seed = replace(task, problem=one.problem), one.seed
     with progress_bars() as progress:
         report = lambda done, total: progress(controller, done, total)  # noqa: E731
@@ -270,7 +272,7 @@ def study(
     limits: Annotated[list[str] | None, typer.Option(metavar="WORD ...", help="mismatch, plants, latency, noise, lost")] = None,
     mismatch: Mismatch = 0.0, controllers: Controllers = None,
     headline: Annotated[str | None, typer.Option(metavar="METRIC", help="what is judged [default: the error]")] = None,
-    processes: Annotated[int | None, typer.Option(min=1, help="number of processes [default: 1]")] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="number of processes [default: one per core]")] = None,
     cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="of a Dask scheduler, tcp://HOST:PORT")] = None,
     seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
 ) -> None:  # fmt: skip
@@ -283,10 +285,14 @@ def study(
         raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
+    if limits and (headline or processes or cluster):
+        raise typer.BadParameter(
+            "--limits searches by the error, run after run: leave out --headline, --processes, --cluster"
+        )
     task = _task(problem)
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.limits import limits as find_limits
-    from fpirhc.studies.study import figure_of
+    from fpirhc.studies.study import figure_of, write_csv
     from fpirhc.studies.study import study as run_study
     from fpirhc.studies.variants import CasesOf, Draws, Grid, Variants
 
@@ -305,9 +311,10 @@ def study(
         else:
             drawn: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
             variants = Grid.parsed(over, seed) if over else drawn
-            result = run_study(task, variants, headline=headline, processes=processes, folder=folder, **facts)
+            facts["processes"] = processes or (None if cluster else -1)
+            result = run_study(task, variants, headline=headline, folder=folder, **facts)
             page = render_charted(result.view, figure_of(result), "Every run", "")
-    result.table.to_csv(folder / "study.csv", index=False)
+    write_csv(result.table, folder / "study.csv")
     _publish(result.view, page, folder, json, verbose)
 
 

@@ -124,7 +124,9 @@ class Draws(Variants):
                 f"all {self.count} plants would be the same: the problem has no disturbances, no noise, and nothing that is drawn; "
                 f"{mend}"
             )
-        times = {side: _with_dead_times(problem, side * self.percent) if late else problem for side in (-1, 0, 1)}
+        times = {side: _with_dead_times(problem, side * self.percent) if late else problem for side in (-1, 1)} | {
+            0: problem
+        }
         return _Lazy(self.count, lru_cache(4096)(partial(self._one, problem, times)))
 
     def _one(self, problem: Problem, times: Mapping[int, Problem], number: int) -> Variant:

@@ -164,9 +164,9 @@ def test_a_cluster_of_dask_gives_the_rows_of_one_process(task):
 @pytest.mark.parametrize("processes", ["1", "2"])
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(task, processes):
     """The command is interrupted once rows are there, with its processes, as a terminal does it: code 130 and one line."""
-    words = ["study", "line.py", "--draws", "60", "--mismatch", "20", "--seed", "5", "--no-compile", "--json"]
+    words = ["study", "line.py", "--draws", "40", "--mismatch", "20", "--seed", "5", "--no-compile", "--json"]
     command = [sys.executable, "-m", "fpirhc", *words, "--out", "out", "--processes", processes]
-    long = LINE.replace("duration=1.5", "duration=60.0")
+    long = LINE.replace("duration=1.5", "duration=20.0")
     Path("line.py").write_text(long)
     pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
     with subprocess.Popen(command, **pipes) as process:
@@ -178,11 +178,11 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(task, proces
     assert process.returncode == 130, said
     assert "Traceback" not in said
     finished = kept("out/runs.jsonl")
-    assert 4 <= len(finished) < 121
+    assert 4 <= len(finished) < 81
     task = fp.load_problem("line.py")
-    again = run_variants(task, Draws(60, 20.0, 5), compiled=False, keep=Path("out/runs.jsonl"))
+    again = run_variants(task, Draws(40, 20.0, 5), compiled=False, keep=Path("out/runs.jsonl"))
     assert kept("out/runs.jsonl")[: len(finished)] == finished
-    same(again, run_variants(task, Draws(60, 20.0, 5), compiled=False))
+    same(again, run_variants(task, Draws(40, 20.0, 5), compiled=False))
 
 
 def test_limits_that_were_found_are_not_searched_again(task, monkeypatch):
