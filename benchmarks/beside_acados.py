@@ -1,7 +1,7 @@
 """acados' pendulum on a cart: acados' plans and ours from the same states, with the right model and with a wrong one.
 
     pip install comma-deps-acados && pip install --no-deps --force-reinstall casadi      (the wheel brings a casadi of its own)
-    .venv/bin/python benchmarks/beside_acados.py [--write]          a minute; --write puts the table into docs/beside-acados.md
+    .venv/bin/python benchmarks/beside_acados.py [--write]          a minute; --write puts the table into docs/beside.md
 
 Model, first state, weights, limits, 40 stages of 20 ms and a plan in every stage are those of acados' closed-loop example
 (examples/acados_python/getting_started): from hanging at rest to upright, |F| <= 80 N. Both discretise by one Runge-Kutta step
@@ -165,7 +165,7 @@ def main() -> None:
         "difference, N",
         "time of a command",
     )
-    write_table("beside acados", heads, rows, ROOT / "docs" / "beside-acados.md")
+    write_table("beside acados", heads, rows, ROOT / "docs" / "beside.md")
     print(f"A command of fpirhc's RHC takes {unit:.3g} ms.")
 
 

@@ -1,7 +1,7 @@
 """do-mpc's stirred tank: do-mpc's own controllers on do-mpc's own simulator, and ours on the same simulator.
 
     pip install do-mpc
-    .venv/bin/python benchmarks/beside_do_mpc.py [--write]          three minutes; --write puts the table into docs/beside-do-mpc.md
+    .venv/bin/python benchmarks/beside_do_mpc.py [--write]          three minutes; --write puts the table into docs/beside.md
 
 The reactor, its first state, set-point, weights, limits, period and horizon are those of do-mpc's example (examples/CSTR; Klatt and
 Engell 1998). Every controller has the nominal model, alpha = beta = 1; the simulator moves with each of the example's nine pairs.
@@ -187,7 +187,7 @@ def main() -> None:
         for name, own in scores.items()
     ]
     heads = ("controller", "median error, mmol/l", "largest", "largest T_R, C", "time of a command")
-    write_table("beside do-mpc", heads, rows, ROOT / "docs" / "beside-do-mpc.md")
+    write_table("beside do-mpc", heads, rows, ROOT / "docs" / "beside.md")
     print(f"do-mpc {do_mpc.__version__}; a command of fpirhc's RHC takes {unit:.3g} ms.")
 
 

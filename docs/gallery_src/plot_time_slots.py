@@ -5,7 +5,7 @@ One input, two coordinates: time slots
 A crane's cart is pushed by one force, and cart and load cannot both be prescribed at
 once. Time slots take turns: for a while the cart follows its reference and the load
 swings freely, then the load is damped and the cart drifts. Neither slot alone is
-asymptotically stable; their alternation is, and this is known before the run. Slots
+asymptotically stable; their alternation is. Slots
 need no optimiser; where there is one, a receding horizon with both coordinates in its
 cost is faster on this plant.
 """
@@ -14,14 +14,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.slots.slotted import floquet_radius
 
 task = fp.load_problem("crane_slots")
 controller = task.controllers["slots+FPI"]
-floquet = floquet_radius(
-    task.problem, controller.slots, controller.schedule, blend=controller.blend
-)
-print(f"Floquet radius {floquet.radius:.4f} per period of {floquet.period:g} s")
 
 # %%
 # The run. Grey: the slots of the cart.

@@ -94,16 +94,20 @@ except fp.FpirhcError as reason:
 # %%
 # 3. The gain is too large
 # ------------------------
-# Beyond the limit the loop chatters, bounded by the saturation of the map. `fpirhc
-# review` says so beforehand.
+# Beyond the limit the loop chatters, bounded by the saturation of the map. It is refused
+# before the run; `fpirhc review` asks the loop with half and twice the gain, too.
 
-large = fp.ComputedTorque(tracking, fp.BeyondLimit(fp.Sigmoid(gain=-4.0, scale=5.0)))
+large = fp.ComputedTorque(tracking, fp.Sigmoid(gain=-4.0, scale=5.0))
+try:
+    fp.simulate(problem, large, seed=0)
+except fp.FpirhcError as reason:
+    print(textwrap.fill(str(reason), 85))
 [answer] = [
     a
-    for a in fp.review(problem, {"large": large}, mismatch=0.0, seed=0).answers
+    for a in fp.review(problem, {"good": good}, mismatch=0.0, seed=0).answers["good"]
     if "gain admissible" in a.question
 ]
-print(textwrap.fill(f"{answer.verdict} - {answer.evidence}", 85))
+print(textwrap.fill(f"{answer.verdict}: {answer.evidence}", 85))
 
 # %%
 # 4. The map cannot keep up

@@ -1,7 +1,4 @@
-"""Runs every attack and writes the figures to docs/reliability.md: `python tests/attack/make_reliability.py`.
-
-`python tests/attack/make_reliability.py files commands` runs these sections only and leaves the others of the page as they are.
-"""
+"""Runs every attack and prints the figures: `python tests/attack/make_reliability.py`, with names of sections these alone."""
 
 from __future__ import annotations
 
@@ -15,13 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]  # also for processes that are started
-PAGE = ROOT / "docs" / "reliability.md"
 FLIPS, KILLS, MISTAKES, LINES = 400, 30, 10_000, 1000
-HEAD = """# Reliability
-
-What a machine must survive, attacked and counted. This page is made by `python tests/attack/make_reliability.py`; the tests in
-`tests/attack` run a share of it, and all of it with `-m slow`.
-"""
 
 
 def loop() -> str:
@@ -45,7 +36,7 @@ def loop() -> str:
             away[fault.name].append(outcome.deviation)
             if outcome.wrong:
                 wrong.append(f"{label}, {fault.name}: {outcome.wrong}")
-        print(label, flush=True)
+        print(label, file=sys.stderr, flush=True)
     counters = (tried, raw, outside, frozen, differs)
     rows = [["attack", "tried", "raw errors", "commands not finite or outside limits", "controllers frozen"]]
     rows[0] += ["not equal to the tick left out", "deviation, median", "deviation, worst tenth"]
@@ -120,19 +111,10 @@ SECTIONS: dict[str, tuple[str, Callable[[], str]]] = {
 
 
 def main(names: Sequence[str]) -> None:
-    """Run the named sections, or all, and write the page after each."""
+    """Run the named sections, or all, and print each."""
     for name in names or SECTIONS:
         title, make = SECTIONS[name]
-        texts = {**_written(), title: make()}
-        parts = [f"## {title}\n\n{texts[title]}\n" for title, _ in SECTIONS.values() if title in texts]
-        PAGE.write_text("\n".join([HEAD, *parts]), encoding="utf-8")
-        print(title, flush=True)
-
-
-def _written() -> dict[str, str]:
-    """The sections of the page as it is, by title."""
-    parts = PAGE.read_text(encoding="utf-8").split("\n## ")[1:] if PAGE.exists() else []
-    return {title: text.strip() for title, _, text in (part.partition("\n") for part in parts)}
+        print(f"## {title}\n\n{make()}\n", flush=True)
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
