@@ -116,7 +116,7 @@ class Motion(Checked):
             raise NotInvertible(
                 f"{len(self.inputs)} inputs ({', '.join(self.inputs)}) for {len(names)} of the {what} ({', '.join(names)}): each "
                 "input holds one. Add an output that the other input moves, leave an input out, or make one input of several: an "
-                "effort that the equations share out among them, by weights ('More inputs than outputs' in docs/models.md)"
+                "effort that the equations share out among them, by weights ('More inputs than outputs' in docs/plants.md)"
             )
         if len(self.inputs) != len(names):
             raise NotInvertible(

@@ -1,4 +1,4 @@
-"""More inputs than outputs, as docs/models.md writes them: efforts that the equations share out by a weighted right inverse.
+"""More inputs than outputs, as docs/plants.md writes them: efforts that the equations share out by a weighted right inverse.
 
 The shares are numpy's pseudo-inverse of the weighted effects, every other share of the same effect is dearer, and the loop is that
 of a textbook: computed torque in numpy on a plant that SciPy integrates, whose thrusters get their commands one by one.
@@ -86,5 +86,5 @@ def test_the_message_says_how():
         response=lambda q, v, u, p: {"x": u.left + u.right + u.bow, "heading": u.right - u.left},
         parameters={},
     )
-    with pytest.raises(NotInvertible, match=r"3 inputs \(left, right, bow\).*by weights.*docs/models.md"):
+    with pytest.raises(NotInvertible, match=r"3 inputs \(left, right, bow\).*by weights.*docs/plants.md"):
         _ = plant.controlled_names
