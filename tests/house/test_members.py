@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -57,21 +55,6 @@ def test_examples_of_wrappers_need_something_inside():
     assert {type(m).__name__ for m in alone}.isdisjoint({"Guarded", "Paired"})
     around = examples("deformations", alone[0])
     assert {type(m).__name__ for m in around} >= {"Guarded", "Paired"}
-
-
-# Names of the package: those of its modules beside the functions that hide them, and those of earlier versions
-
-
-@pytest.mark.parametrize("first", ["", "import fpirhc; fpirhc.review; "])
-def test_modules_of_the_review_are_found_beside_its_function(first):
-    """The function has the name of the package; a module below it is found whichever of the two is met first."""
-    code = (
-        f"{first}import fpirhc.review.question as question; import fpirhc.review.grid; import fpirhc as fp; "
-        "assert fp.review.question is question is sys.modules['fpirhc.review.question']; "
-        "assert fp.review.grid is sys.modules['fpirhc.review.grid']; "
-        "assert callable(fp.review); assert fp.review.__name__ == 'review'"
-    )
-    subprocess.run([sys.executable, "-c", f"import sys; {code}"], check=True, timeout=60)
 
 
 PLANT: Any = fp.Plant
