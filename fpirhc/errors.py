@@ -89,10 +89,6 @@ class NotContractive(FpirhcError, ValueError):
     def __str__(self) -> str:
         return f"{self.fault}; {self.remedy}" if self.remedy else self.fault
 
-    def advised(self, advice: str) -> str:
-        """Return what is wrong with an advice about the whole loop in place of what the iteration by itself would bear."""
-        return f"{self.fault}; {advice}"
-
 
 class NotSupported(FpirhcError, ValueError):
     """A valid setting that this member of a family cannot serve; the message names a member that can."""

@@ -59,9 +59,7 @@ class _Cycles:
     def wait(self) -> int:
         """Cycles after which every pair is one of this run."""
         pairing = self.deformation.iteration.pairing
-        return (
-            0 if pairing is None or pairing.cycles is None else int(np.ceil(pairing.cycles)) + pairing.uncertainty + 2
-        )
+        return 0 if pairing is None else int(np.ceil(pairing.cycles)) + pairing.uncertainty + 2
 
     def __call__(self, errors: Array) -> Array:
         """Requests after every cycle with these response errors; the first is zero."""
@@ -189,7 +187,7 @@ def filter_and_pairing_are_told(trial: _Cycles, generator: np.random.Generator) 
     if pairing is None:
         expected = -gain * (1 - pole ** np.arange(1, answer.size + 1))
         facts = f"the pole {pole:g} and no pairing"
-    elif pole == 0 and pairing.uncertainty == 0 and pairing.cycles is not None and float(pairing.cycles).is_integer():
+    elif pole == 0 and pairing.uncertainty == 0 and float(pairing.cycles).is_integer():
         expected = -gain * (np.arange(answer.size) % (int(pairing.cycles) + 1) == 0)
         facts = f"pairs {pairing.cycles:g} cycles apart"
     else:

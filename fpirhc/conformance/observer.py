@@ -97,17 +97,11 @@ def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa
     is_a_frozen_value(trial.observer)
 
 
-def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:
-    """It believes states of the plant, uses what is measured, and its free errors are directions of the state."""
-    plant, sensing = trial.problem.plant, trial.problem.sensing
-    measured, size = sensing.measures(plant), plant.state.size
-    foreign = [n for n in trial.observer.believes(plant, sensing.known(plant)) if n not in plant.state.elements]
-    hold(not foreign, f"it believes {foreign}, which are no states of the plant")
+def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """It uses what is measured."""
+    measured = trial.problem.sensing.measures(trial.problem.plant)
     unseen = [n for n in trial.observer.uses(measured) if n not in measured]
     hold(not unseen, f"it uses {unseen}, which no sensor shows")
-    slopes, shown = [generator.normal(size=(size, size))], [generator.normal(size=(1, size))]
-    basis = np.asarray(trial.observer.free(slopes, shown, [0]))
-    hold(basis.ndim == 2 and len(basis) == size, f"free() has the shape {basis.shape}, expected ({size}, number)")
 
 
 def right_model_believes_what_is(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -181,27 +175,12 @@ def old_samples_do_nothing(trial: _Trial, generator: np.random.Generator) -> Non
     )
 
 
-def unseen_errors_are_free(trial: _Trial, generator: np.random.Generator) -> None:
-    """An error that no measurement shows is one of those that `free` names; a review judges whether they decay."""
-    size = trial.problem.plant.state.size
-    slopes, shown = [np.zeros((size, size))], [generator.normal(size=(1, size))]
-    basis = np.asarray(trial.observer.free(slopes, shown, [0]))
-    unseen = unobservable(slopes, [np.vstack([shown[0], np.eye(size)[:1]])])
-    rest = unseen - basis @ (np.linalg.pinv(basis) @ unseen) if basis.size else unseen
-    missed = float(np.linalg.norm(rest, axis=0).max(initial=0.0))
-    hold(
-        within(missed, _UNSEEN),
-        f"free() names {basis.shape[1]} directions for a model at rest of which one number is shown and one state is known; "
-        f"{unseen.shape[1]} of {size} never show, and a part of {missed:.2g} of one of them is missing; use unobservable()",
-    )
-
-
 def wrong_start_is_corrected(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """Started wrong in what is measured, with the exact model and no noise, it comes to believe what is measured."""
     plant, used = trial.problem.plant, trial.observer.uses(trial.problem.sensing.measures(trial.problem.plant))
     places = [plant.state.elements.index(n) for n in used if n in plant.state.elements]
     every = np.eye(plant.state.size)
-    free = np.asarray(trial.observer.free([every], [every[places]], places)) if places else np.zeros((0, 0))
+    free = unobservable([every], [every[places]]) if places else np.zeros((0, 0))
     seen = [k for k in places if not free.size or np.abs(free[k]).max() < _UNSEEN]
     if not seen:
         return  # it corrects nothing that is measured, and says so
@@ -219,7 +198,6 @@ LAWS = (
     frozen_value,
     facts_hold,
     exact_parameters_are_unknown,
-    unseen_errors_are_free,
     old_samples_do_nothing,
     wrong_start_is_corrected,
     right_model_believes_what_is,
@@ -234,7 +212,6 @@ class Sample:
     """Numbers of a cycle's evidence."""
 
     measured: Array  # what the sensors show, in the order of the model's names
-    state: Array  # true state, of which the observer is given what it calls known
     command: Array  # that acted
     moves: float = 1.0  # 1, or 0 where the sample still shows the start
     counts: float = 1.0  # 1, or 0 for a sample from before the run
@@ -267,7 +244,7 @@ class Cycle:
         """Any sample, near the start."""
         start, inputs = self.problem.start_state, self.problem.plant.input.size
         state = start + 0.1 * generator.normal(size=start.size)
-        return Sample(self._shown(state, np.zeros(inputs)) + 0.1, state, generator.normal(size=inputs))
+        return Sample(self._shown(state, np.zeros(inputs)) + 0.1, generator.normal(size=inputs))
 
     def errors(self, places: list[int], size: float, cycles: int) -> Array:
         """Largest error of these states after every sample, the first one before them, of a plant that starts elsewhere by `size`.
@@ -281,7 +258,7 @@ class Cycle:
         for k in range(cycles):
             if k:
                 state = np.asarray(self.model.move(state, command, plant.exact, calm, 1.0).full())[:, 0]
-            sample = Sample(self._shown(state, command), state, command, moves=float(k > 0))
+            sample = Sample(self._shown(state, command), command, moves=float(k > 0))
             believed, memory = self._step(sample, memory, plant.exact)
             errors.append(float(np.abs((believed - state)[places]).max()))
         return np.array(errors)
@@ -290,7 +267,7 @@ class Cycle:
         return np.asarray(self._shown_function(state, command, self.problem.plant.exact).full())[:, 0]
 
     def _step(self, sample: Sample, memory: Array, parameters: Array) -> tuple[Array, Array]:
-        numbers = (sample.measured, sample.state, sample.command, parameters, sample.moves, sample.counts, memory)
+        numbers = (sample.measured, sample.command, parameters, sample.moves, sample.counts, memory)
         believed, after = self._evaluator(*numbers)
         return believed.copy(), after.copy()
 
@@ -307,16 +284,13 @@ class Cycle:
     @cached_property
     def _evaluator(self) -> Evaluator:
         plant = self.problem.plant
-        kind: Any = ca.MX if self.observer.opaque else ca.SX
-        sizes = (len(self.model.measured), plant.state.size, plant.input.size, plant.approximate.size, 1, 1)
-        symbols = [kind.sym(f"s{k}", size) for k, size in enumerate((*sizes, self._layout.size))]
-        measured, state, command, parameters, moves, counts, memory = symbols
+        sizes = (len(self.model.measured), plant.input.size, plant.approximate.size, 1, 1)
+        symbols = [ca.SX.sym(f"s{k}", size) for k, size in enumerate((*sizes, self._layout.size))]
+        measured, command, parameters, moves, counts, memory = symbols
         shown: dict[str, Any] = dict(zip(self.model.measured, ca.vertsplit(measured), strict=True))
-        true: dict[str, Any] = dict(zip(plant.state.elements, ca.vertsplit(state), strict=True))
-        evidence = Evidence(shown, {}, command, parameters, moves, counts)
+        evidence = Evidence(shown, command, parameters, moves, counts)
         remembered = self._layout.split(memory)
         predicted = self.observer.predict(self.model)(evidence, remembered)
-        known = {e: true[e] for e in self.problem.sensing.known(plant)}
-        believed, after = self.observer.correct(self.model)(replace(evidence, known=known), remembered, predicted)
+        believed, after = self.observer.correct(self.model)(evidence, remembered, predicted)
         results = [ca.densify(believed), ca.densify(self._layout.join(after))]
         return Evaluator(ca.Function("believed", symbols, results))

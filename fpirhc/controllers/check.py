@@ -107,7 +107,7 @@ def _delayed_weights(problem: Problem, iteration: Iteration) -> list[np.ndarray]
 
 def _paired(iteration: Iteration) -> float:
     """Age of the request that a response is paired with, cycles."""
-    return (iteration.pairing.cycles or 0.0) if iteration.pairing else 0.0
+    return iteration.pairing.cycles if iteration.pairing else 0.0
 
 
 def _late(weights: np.ndarray, cycles: float) -> np.ndarray:

@@ -24,7 +24,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Evidence, Model, StateObserver, members, slowest, values_of
+from fpirhc.sensing.base import Evidence, Model, StateObserver, members, slowest, unobservable, values_of
 from fpirhc.symbolic.block import GAP, Block, Delay, bridged, call
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -49,11 +49,9 @@ class Believing:
         reads = Layout((self.raw, *self._path.reads, *((GAP,) if self.lost else ())))
         writes = Layout((*measured_signals(plant), plant.response_signal("realised")))
         own = Layout((*self._path.memory, *self.observer.memory(self.model).signals)) + self._estimator.memory
-        opaque, lossy = self.observer.opaque, None if self.lost else lambda: replace(self, lost=True).block
-        waits = Block("believe_waits", Layout((*self._path.reads, GAP)), Layout(), self._wait, own, opaque=opaque)
-        return Block(
-            "believe", reads, writes, self._step, own, opaque, waits=waits if self.lost else None, bridged=lossy
-        )
+        lossy = None if self.lost else lambda: replace(self, lost=True).block
+        waits = Block("believe_waits", Layout((*self._path.reads, GAP)), Layout(), self._wait, own)
+        return Block("believe", reads, writes, self._step, own, waits=waits if self.lost else None, bridged=lossy)
 
     @property
     def delay(self) -> Delay:
@@ -86,30 +84,17 @@ class Believing:
         return bridged(block) if self.lost else block
 
     def _step(self, s: Signals) -> dict[str, Expression]:
-        plant, sensing, elements = self.problem.plant, self.problem.sensing, self.problem.plant.state.elements
+        plant = self.problem.plant
         shown_now = dict(zip(self.raw.elements, ca.vertsplit(getattr(s, self.raw.name)), strict=True))
         evidence, results = self._evidence(s, shown_now)
         memory = {m: getattr(s, m) for m in self.observer.memory(self.model).names}
         predicted = self.observer.predict(self.model)(evidence, memory)
         expected = values_of(plant, predicted, evidence.command, evidence.parameters)
         motion, realised, *remembered = self._estimates(s, {**expected, **evidence.measured})
-        shown = self._shown(motion, evidence.measured)
-        correct = self.observer.correct(self.model)
-        known = {e: shown[e] for e in sensing.known(plant)}
-        state, next_memory = correct(replace(evidence, known=known), memory, predicted)
-        names = sensing.believed(plant)
-        believed = dict(zip(elements, ca.vertsplit(state), strict=True))
-        states = [believed[e] if e in names or e not in shown else shown[e] for e in elements]
-        results |= {plant.output.name: motion, "state": ca.vertcat(*states), "realised": realised}
+        state, next_memory = self.observer.correct(self.model)(evidence, memory, predicted)
+        results |= {plant.output.name: motion, "state": state, "realised": realised}
         results |= {f"{m}_next": v for m, v in next_memory.items()}
         return results | {f"{m.name}_next": v for m, v in zip(self._estimator.memory.signals, remembered, strict=True)}
-
-    def _shown(self, motion: Expression, measured: Mapping[str, Expression]) -> dict[str, Expression]:
-        """States as the estimator has them, and as they are measured beside outputs."""
-        plant = self.problem.plant
-        entries = ca.vertsplit(motion)
-        pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
-        return {**measured, **{e: entries[place] for e, place in pairs if place >= 0}}
 
     def _wait(self, s: Signals) -> dict[str, Expression]:
         """Memory after a cycle without a sample: the prediction with nothing to correct it."""
@@ -135,7 +120,7 @@ class Believing:
             command, moves = ca.if_else(whole, mean, command), ca.if_else(whole, 1, (1 - path.fraction) * moves)
             mixed = (1 - path.fraction) * parameters + path.fraction * path.parameters_before(s)
             parameters = ca.if_else(whole, mixed, parameters) if signals else parameters
-        evidence = Evidence(shown, {}, command, parameters, moves, cycles > path.late - 0.5)
+        evidence = Evidence(shown, command, parameters, moves, cycles > path.late - 0.5)
         return evidence, {**commands, **signals}
 
     def _estimates(self, s: Signals, seen: Mapping[str, Expression]) -> tuple[Expression, ...]:
@@ -207,9 +192,8 @@ def unobservable_errors(problem: Problem) -> UnobservableErrors:
     states, slopes, shown = _linearised(problem, names)
     size = np.maximum(np.abs(states).max(axis=0), np.abs(problem.start_state))
     size[size == 0] = 1.0
-    known = [plant.state.elements.index(e) for e in problem.sensing.known(plant)]
     scaled = [a * size / size[:, None] for a in slopes]
-    basis = observer.free(scaled, [c * size for c in shown], known)
+    basis = unobservable(scaled, [c * size for c in shown])
     pole = slowest(scaled, basis, growth_of(plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     return UnobservableErrors(
@@ -218,9 +202,9 @@ def unobservable_errors(problem: Problem) -> UnobservableErrors:
 
 
 def check_observed(problem: Problem) -> None:
-    """Raise if errors are neither observed nor decay, and the observer cannot bear that."""
+    """Raise if errors are neither observed nor decay."""
     observer = problem.sensing.observer
-    if observer is None or not observer.needs_detectability:
+    if observer is None:
         return
     free = unobservable_errors(problem)
     if not free.decays:

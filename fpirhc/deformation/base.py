@@ -110,12 +110,12 @@ class Pairing:
     """The earlier request that a response is paired with: the request of `cycles` cycles before the last one.
 
     Args:
-        cycles: the longest of several dead times; None where the map estimates it on line.
+        cycles: the longest of several dead times.
         uncertainty: half width of the mean over the requests around it, cycles.
         channels: the dead time of every controlled coordinate where there are several; else empty.
     """
 
-    cycles: float | None
+    cycles: float
     uncertainty: int = 0
     channels: tuple[float, ...] = ()
 
@@ -333,10 +333,7 @@ class Wrapper(Deformation, ABC):
         map: the wrapped deformation, the first field of every wrapper.
     """
 
-    passes_pair: ClassVar[bool] = False  # whether a model-referenced form inside is given what it compares
-    chooses_pair: ClassVar[bool] = (
-        False  # whether it says what a response is compared with, in place of the last request
-    )
+    chooses_pair: ClassVar[bool] = False  # whether it says what a response is compared with, not the last request
 
     map: Deformation
 
@@ -378,7 +375,7 @@ def against_wrappers(deformation: Deformation) -> Iterator[str]:
                 f"{name} around {type(pairing[0]).__name__}: each of them says which request a response belongs to; use one of "
                 "them around the map, and state the dead time there"
             )
-        elif not getattr(deformation, "passes_pair", False):
+        else:
             yield from deformation.inner.mirror.against_last_request(
                 f"{name} around a model-referenced form changes what the form compares, the model's response with the measured "
                 f"one; put it inside: ModelReferenced({name}(map, ...))"

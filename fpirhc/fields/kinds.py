@@ -112,12 +112,10 @@ class _JudgedByOwner(Range):
 
 JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
-AboveZero: TypeAlias = Annotated[float, Range("a number above 0", low=0.0, open_low=True)]  # infinite too
 Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
 AtLeastOne: TypeAlias = Annotated[float, Range("a finite number of at least 1", low=1.0, open_high=True)]
 NotZero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero (no adaptation is Identity())")]
-Nonzero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero")]
 BelowOne: TypeAlias = Annotated[float, Range("a number from 0 to below 1", low=0.0, high=1.0, open_high=True)]
 Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
     float, Range("a positive number from 1e-100 to 1e100", low=1e-100, high=1e100)

@@ -14,9 +14,8 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Deviation
 from fpirhc.plant.chain import response_names as response_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -216,8 +215,6 @@ class Evidence:
     """Data of an observer in one cycle."""
 
     measured: Mapping[str, Expression]  # what the sensors show, by name of the quantity
-    # state elements that follow from these alone: measured, or derivatives of measured coordinates
-    known: Mapping[str, Expression]
     command: Expression  # it acted until the sample was taken
     parameters: Expression  # of the model
     # share of a cycle by which the sample is later than the last one: 1, or 0 for a sample that still shows the start.
@@ -241,19 +238,6 @@ class StateObserver(Checked, ABC):
             InvalidProblem: all mistakes together.
         """
 
-    @abstractmethod
-    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        """State elements that the controller is given from the observer.
-
-        Args:
-            known: state elements that follow from what is measured.
-        """
-
-    @property
-    def opaque(self) -> bool:
-        """Whether its step is built as a graph of calls; False: as scalar code."""
-        return False
-
     def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
         """Names of the measured quantities that correct the state; by default all."""
         return measured
@@ -264,26 +248,11 @@ class StateObserver(Checked, ABC):
 
     @abstractmethod
     def predict(self, model: Model) -> Predict:
-        """Function (evidence, memory) -> predicted state x-; of `evidence.known` nothing may be used yet."""
+        """Function (evidence, memory) -> predicted state x-."""
 
     @abstractmethod
     def correct(self, model: Model) -> Correct:
         """Function (evidence, memory, predicted state) -> (state x^, memory one cycle later)."""
-
-    @abstractmethod
-    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        """Basis of the errors of the state that no measurement corrects, shape (nx, number).
-
-        Args:
-            slopes: Jacobians of the rates along the reference, each (nx, nx).
-            shown: Jacobians of the measured quantities there, each (number, nx).
-            known: places of the known state elements.
-        """
-
-    @property
-    def needs_detectability(self) -> bool:
-        """Whether errors that no measurement corrects must decay by themselves, or the observer is refused."""
-        return False
 
 
 def require_named(owner: str, **named: Mapping[str, float]) -> None:
@@ -291,56 +260,6 @@ def require_named(owner: str, **named: Mapping[str, float]) -> None:
     for name, values in named.items():
         if not values:
             raise InvalidValue(f"{owner}({name}={{}}): name at least one")
-
-
-class WeighingObserver(StateObserver):
-    """What observers share that weigh the model against the sensors, by the deviations of both."""
-
-    measured: Mapping[str, Deviation]  # quantity -> deviation of the noise of its sensor
-    noise: Mapping[str, Deviation]  # coordinate -> deviation of what its response has beyond the model
-    start: Mapping[str, Deviation]  # state -> deviation of its first value
-    needs_detectability = True
-
-    def __post_init__(self) -> None:
-        require_named(type(self).__name__, measured=self.measured, noise=self.noise)
-
-    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
-        self._mistakes(plant, measured).raise_if_any()
-
-    def _mistakes(self, plant: Plant, shown: tuple[str, ...]) -> Mistakes:
-        """The mistakes in its names."""
-        mistakes, every = Mistakes(type(self).__name__), quantities(plant)
-        mistakes.unknown("measured: quantity", self.measured, every)
-        for name in self.measured:
-            if name in every and name not in shown:
-                mistakes.add(
-                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(shown)}"
-                )
-        mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
-        mistakes.unknown("start: state", self.start, plant.state.elements)
-        return mistakes
-
-    def believes(self, plant: Plant, known: tuple[str, ...]) -> tuple[str, ...]:
-        del known
-        return plant.state.elements
-
-    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:
-        del measured
-        return tuple(self.measured)
-
-    def free(self, slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray], known: Sequence[int]) -> np.ndarray:
-        del known
-        return unobservable(slopes, shown)
-
-
-def first_covariance(plant: Plant, start: Mapping[str, float]) -> np.ndarray:
-    """Return the covariance of the first state, shape (nx, nx)."""
-    return np.diag([start.get(e, 0.0) ** 2 for e in plant.state.elements])
-
-
-def covariance_entries(plant: Plant) -> tuple[str, ...]:
-    """Names of the entries of a covariance, column by column."""
-    return tuple(f"{i},{j}" for j in plant.state.elements for i in plant.state.elements)
 
 
 _NOTHING = 1e-9  # share of a matrix below which a part of it counts as zero

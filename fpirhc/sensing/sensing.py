@@ -147,17 +147,9 @@ class Sensing(Checked):
             return self.estimator.measures(plant)
         return tuple(n for n in quantities(plant) if n in self.measured)
 
-    def known(self, plant: Plant) -> tuple[str, ...]:
-        """State elements that follow from what is measured; a measured output determines no state by itself."""
-        measures, elements = self.measures(plant), plant.state.elements
-        shown = self.estimator.known(plant, measures)
-        pairs = zip(elements, plant.equations.known_by_outputs, strict=True)
-        by_outputs = {e for e, place in pairs if place >= 0 and plant.output.elements[place] in shown}
-        return tuple(e for e in elements if e in by_outputs or e in measures)
-
     def believed(self, plant: Plant) -> tuple[str, ...]:
         """State elements that a controller is given from the observer."""
-        return self.observer.believes(plant, self.known(plant)) if self.observer is not None else ()
+        return plant.state.elements if self.observer is not None else ()
 
     def believed_response(self, plant: Plant) -> tuple[str, ...]:
         """Quantities that the response follows from and no sensor shows."""

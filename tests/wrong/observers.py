@@ -1,4 +1,4 @@
-"""Six observers that break the contract, each in one thing, and the right one that they are made from."""
+"""Five observers that break the contract, each in one thing, and the right one that they are made from."""
 
 # ruff: noqa: ARG002 - arguments are those of the contract
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.sensing.base import StateObserver, unobservable, values_of
+from fpirhc.sensing.base import StateObserver, values_of
 from fpirhc.symbolic.layout import Layout, Signal
 
 
@@ -21,9 +21,6 @@ class ConstantGain(StateObserver):
 
     def check(self, plant, measured):
         """Accept every plant."""
-
-    def believes(self, plant, known):
-        return plant.state.elements
 
     def memory(self, model):
         state = model.plant.state
@@ -46,16 +43,6 @@ class ConstantGain(StateObserver):
             return state, {"observed_state": state}
 
         return corrected
-
-    def free(self, slopes, shown, known):
-        return unobservable(slopes, shown)
-
-
-class NothingIsFree(ConstantGain):
-    """Says that every error is corrected, also one that never shows."""
-
-    def free(self, slopes, shown, known):
-        return np.zeros((len(slopes[0]), 0))
 
 
 @dataclass(frozen=True)

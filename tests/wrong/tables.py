@@ -47,7 +47,6 @@ OPTIMISERS = {
     optimisers.SaysItMayTakeAnyTime: ("work is bounded as told", "calls no solver"),
 }
 OBSERVERS = {
-    observers.NothingIsFree: ("unseen errors are free", "2 of 4 never show"),
     observers.EverySampleCounts: ("old samples do nothing", "with counts = 0.*by 0.4"),
     observers.EverySampleMoves: ("old samples do nothing", "with moves = 0"),
     observers.KnowsThePlant: ("exact parameters are unknown", "use evidence.parameters"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -37,7 +37,7 @@ class Schedule(Checked, ABC):
 
     @abstractmethod
     def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Return Block (time, error, state, reference, _slot_before, _age_before, _admissible, warm_up) -> slot, its number."""
+        """Return a Block -> slot, its number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +51,17 @@ class Periodic(Schedule):
     durations: Mapping[str, float]
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
-        _check_visits("Periodic", self.durations, names, mistakes)
-        for name, duration in self.durations.items():
-            check_stretch(f"Periodic: duration of '{name}'", duration, problem, mistakes)
+        mistakes.unknown("Periodic: coordinate", self.durations, names)
+        for name in names:
+            if name not in self.durations and {*self.durations} <= {*names}:
+                mistakes.add(f"Periodic: slot '{name}' is never active; give it time, or leave the slot out")
+        unit = problem.time_unit
+        for name, value in self.durations.items():
+            what = f"Periodic: duration of '{name}'"
+            if not (finite_number(value) and value > 0):
+                mistakes.add(f"{what} must be a positive number, in {unit}, got {value!r}")
+            elif value < problem.period * (1 - 1e-9):
+                mistakes.add(f"{what} is {value:g} {unit}, shorter than one control cycle of {problem.period:g} {unit}")
 
     def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
         if len(self.durations) == 1:
@@ -69,40 +77,14 @@ class Periodic(Schedule):
         for name, duration in self.durations.items():
             starts.append((name, at))
             at += rounded(duration / problem.period)
-        return _timed(problem, channels, starts, at)
+        numbers = {c.slot.coordinate: c.number for c in channels}
+        order = [numbers[name] for name, _ in starts]
 
+        def step(s: Signals) -> dict[str, Expression]:
+            cycle = ca.floor(s.time / problem.period + 0.5)
+            phase, slot = ca.fmod(cycle, expressed(at, cycle)), ca.SX(order[0])
+            for before, number, (_, start) in zip(order, order[1:], starts[1:], strict=False):
+                slot += (number - before) * (phase > start - 0.5)
+            return {"slot": slot}
 
-def _check_visits(owner: str, visited: Iterable[str], names: Sequence[str], mistakes: Mistakes) -> None:
-    """Note coordinates that have no slot; where there are none, slots that are never active."""
-    coordinates = list(visited)
-    mistakes.unknown(f"{owner}: coordinate", coordinates, names)
-    for name in names:
-        if name not in coordinates and set(coordinates) <= set(names):
-            mistakes.add(f"{owner}: slot '{name}' is never active; give it time, or leave the slot out")
-
-
-def check_stretch(what: str, value: float, problem: Problem, mistakes: Mistakes) -> None:
-    """Note a length of time that is no positive number or shorter than one control cycle."""
-    unit = problem.time_unit
-    if not (finite_number(value) and value > 0):
-        mistakes.add(f"{what} must be a positive number, in {unit}, got {value!r}")
-    elif value < problem.period * (1 - 1e-9):
-        mistakes.add(f"{what} is {value:g} {unit}, shorter than one control cycle of {problem.period:g} {unit}")
-
-
-def _timed(
-    problem: Problem, channels: Sequence[Channel], starts: Sequence[tuple[str, float]], cycles: float | None = None
-) -> Block:
-    """Block time -> slot from the cycles in which slots start, repeated after `cycles` where that is a number."""
-    numbers = {c.slot.coordinate: c.number for c in channels}
-    order = [numbers[name] for name, _ in starts]
-
-    def step(s: Signals) -> dict[str, Expression]:
-        cycle = ca.floor(s.time / problem.period + 0.5)
-        phase = cycle if cycles is None else ca.fmod(cycle, expressed(cycles, cycle))
-        slot = ca.SX(order[0])
-        for before, number, (_, start) in zip(order, order[1:], starts[1:], strict=False):
-            slot += (number - before) * (phase > start - 0.5)
-        return {"slot": slot}
-
-    return Block("schedule", Layout((time_signal(problem.plant),)), Layout((scalar("slot"),)), step)
+        return Block("schedule", Layout((time_signal(problem.plant),)), Layout((scalar("slot"),)), step)

@@ -162,7 +162,7 @@ class Slotted(Controller):
         channels, realised = self.channels(problem), _realised(problem, self.channels(problem))
         blocks = [*_realised_blocks(problem, channels), reference_block(problem)]
         blocks += [state_block(problem, one, self.smallest_gain) for one in channels]
-        blocks += [admissible_block(channels), self.schedule.block(problem, channels), switch_block(channels)]
+        blocks += [self.schedule.block(problem, channels), switch_block(channels)]
         delays: list[Delay] = []
         for one in channels:
             light, law = one.plant, one.slot.tracking
@@ -370,13 +370,6 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     return Block(
         f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque
     )
-
-
-def admissible_block(channels: Sequence[Channel]) -> Block:
-    """Block that gathers, for the schedule, which slots have a gain that is large enough."""
-    writes = Signal("_admissible", tuple(c.slot.coordinate for c in channels))
-    reads = Layout(tuple(c.signal("good") for c in channels))
-    return Block("admissible", reads, Layout((writes,)), lambda s: {"_admissible": _column(s, channels, "good")})
 
 
 def _column(s: Signals, channels: Sequence[Channel], name: str) -> Expression:

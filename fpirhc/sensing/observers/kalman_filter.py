@@ -11,16 +11,18 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
+from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import Deviation
+from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import (
     Correct,
     Evidence,
     Model,
     Predict,
     Remembered,
-    WeighingObserver,
-    covariance_entries,
-    first_covariance,
+    StateObserver,
+    quantities,
+    require_named,
     values_of,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -30,7 +32,7 @@ _STATE, _COVARIANCE, _VARIANCES = "observer_state", "observer_covariance", "obse
 
 
 @dataclass(frozen=True, eq=False)
-class KalmanFilter(WeighingObserver):
+class KalmanFilter(StateObserver):
     """The whole state from noisy measurements of a part of it.
 
     Args:
@@ -48,16 +50,37 @@ class KalmanFilter(WeighingObserver):
     noise: Mapping[str, Deviation]
     start: Mapping[str, Deviation] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        require_named("KalmanFilter", measured=self.measured, noise=self.noise)
+
+    def check(self, plant: Plant, measured: tuple[str, ...]) -> None:
+        """Raise where a name fits nothing, or no sensor shows a quantity."""
+        mistakes, every = Mistakes("KalmanFilter"), quantities(plant)
+        mistakes.unknown("measured: quantity", self.measured, every)
+        for name in self.measured:
+            if name in every and name not in measured:
+                mistakes.add(
+                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(measured)}"
+                )
+        mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
+        mistakes.unknown("start: state", self.start, plant.state.elements)
+        mistakes.raise_if_any()
+
+    def uses(self, measured: tuple[str, ...]) -> tuple[str, ...]:  # noqa: ARG002
+        return tuple(self.measured)
+
     def memory(self, model: Model) -> Layout:
         """The believed state, its covariance column by column, and the variances of the noises.
 
         The variances are constants of a run. As data they enter the same operations whether they are live or not.
         """
-        state, first = model.plant.state, first_covariance(model.plant, self.start)
+        state = model.plant.state
+        first = np.diag([self.start.get(e, 0.0) ** 2 for e in state.elements])
+        entries = tuple(f"{i},{j}" for j in state.elements for i in state.elements)
         return Layout(
             (
                 Signal(_STATE, state.elements, state.units, tuple(map(float, model.start))),
-                Signal(_COVARIANCE, covariance_entries(model.plant), start=tuple(map(float, first.ravel()))),
+                Signal(_COVARIANCE, entries, start=tuple(map(float, first.ravel()))),
                 Signal(
                     _VARIANCES,
                     (*self.noise, *self.measured),

@@ -1,8 +1,4 @@
-"""A moving horizon of states: Kalman's filter where the model is linear, least squares of the books where it is not.
-
-The batch reactor 2A -> B of Haseltine and Rawlings, Ind. Eng. Chem. Res. 44(8), 2005, starts at a wrong guess: an extended Kalman
-filter goes to a negative pressure and stays there, a horizon with bounds comes to the true one.
-"""
+"""The batch reactor 2A -> B of Haseltine and Rawlings, Ind. Eng. Chem. Res. 44(8), 2005, which starts at a wrong guess."""
 
 from __future__ import annotations
 
@@ -25,15 +21,6 @@ def sensed(name: str, deviation: float, observer: StateObserver) -> fp.Sensing:
 
 def run(problem: fp.Problem, controller: Controller = TRACK, seed: int = 0, compiled: bool = False) -> fp.Run:
     return fp.simulate(problem, controller, seed=seed, compiled=compiled)
-
-
-# A linear model
-
-
-# A curved model: least squares by somebody else
-
-
-# The reactor of Haseltine and Rawlings
 
 
 def reactor() -> fp.Plant:
@@ -75,9 +62,3 @@ def test_a_kalman_filter_goes_to_a_negative_pressure() -> None:
     for result in pressures(fp.KalmanFilter(**KNOWN)):
         assert result["plant_state.A"][-1] == pytest.approx(3 / (1 + 2 * 0.16 * 3 * 9.9), rel=1e-6)
         assert result["state.A"][-1] < -1
-
-
-# One step with the controller
-
-
-# What is refused
