@@ -112,6 +112,7 @@ class _JudgedByOwner(Range):
 
 JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
 Positive: TypeAlias = Annotated[float, Range("a finite number above 0", low=0.0, open_low=True, open_high=True)]
+AboveZero: TypeAlias = Annotated[float, Range("a number above 0", low=0.0, open_low=True)]  # infinite too
 Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
 NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", low=0.0, open_high=True)]
 AtLeastOne: TypeAlias = Annotated[float, Range("a finite number of at least 1", low=1.0, open_high=True)]
