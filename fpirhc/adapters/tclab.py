@@ -1,7 +1,7 @@
 """The Temperature Control Lab as the reality of a problem: its digital twin, or the board.
 
     problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0), ...)             the twin, in simulated time
-    problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0, board=RealTime()), ...)
+    problem = fp.Problem(plant=model, reality=tclab_body(model, period=2.0, board=RealTime(), rest={"Q1": 0.0, "Q2": 0.0}), ...)
 
 Measured are the temperatures T1 and T2, degC, with noise and the steps of the converter; inputs are the heaters Q1 and Q2, %.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import io
 import random
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from fpirhc.adapters.names import adapter, require_seconds
 from fpirhc.adapters.real_time import RealTime
 from fpirhc.errors import Mistakes, package
+from fpirhc.fields.kinds import Finite
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
 
@@ -25,25 +27,33 @@ _SENSORS, _HEATERS = ("T1", "T2"), ("Q1", "Q2")
 
 
 @adapter
-def tclab_body(model: Plant, *, period: float, board: RealTime | None = None) -> ExternalPlant:
+def tclab_body(
+    model: Plant, *, period: float, board: RealTime | None = None, rest: Mapping[str, Finite] | None = None
+) -> ExternalPlant:
     """Return the lab as a reality.
 
     Args:
         model: the controller's model; its states or outputs are named T1 and T2, its inputs Q1 and Q2, one or both.
         period: of the problem, s.
         board: the clock of the board, `RealTime()`; None: it is its digital twin, in simulated time.
+        rest: by input, what the board is sent when a run ends, however it ends: {"Q1": 0.0, "Q2": 0.0}. A board needs it.
 
     Raises:
         NotSupported: tclab is not installed.
-        InvalidProblem: the model has other names.
+        InvalidProblem: the model has other names, or a board has no rest.
     """
     require_seconds("tclab_body", model)
     tclab, mistakes = package("tclab", "outside"), Mistakes("tclab_body")
     mistakes.unknown("measured", model.output.elements, _SENSORS)
     mistakes.unknown("input", model.inputs, _HEATERS)
+    if board is not None and rest is None:
+        wanted = ", ".join(f'"{name}": 0.0' for name in model.inputs)
+        mistakes.add(
+            f"rest: the board would keep its heaters on when a run ends; state what they are sent, rest={{{wanted}}}"
+        )
     mistakes.raise_if_any()
     body = _Twin(tclab, model, period) if board is None else _Board(tclab, model, period, board)
-    return ExternalPlant(body, measures=dict.fromkeys(model.output.elements, "degC"), period=period)
+    return ExternalPlant(body, measures=dict.fromkeys(model.output.elements, "degC"), rest=rest, period=period)
 
 
 class _Twin:
@@ -87,11 +97,16 @@ class _Board(_Twin):
         self._now = now
 
     def _begun(self) -> Any:
-        if self._lab is not None:
-            self._lab.close()
+        self.close()
         lab = self._tclab.TCLab()
         self._now.begin()
         return lab
+
+    def close(self) -> None:
+        """Let the board go."""
+        if self._lab is not None:
+            self._lab.close()
+            self._lab = None
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         """Hold the heaters until the cycle is over."""

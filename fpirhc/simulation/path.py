@@ -99,13 +99,16 @@ class Exchange:
         """Return why the run ends after this cycle, and what to do; None where it goes on."""
         return None
 
+    def end(self) -> None:
+        """Leave what moves as it is to be left, however the run ended."""
+
 
 class _Conversation(Exchange):
     """A body is sent the inputs of every cycle, and answers with measurements."""
 
     def __init__(self, problem: Problem, body: ExternalPlant, seed: int) -> None:
         super().__init__(problem)
-        self._body, self._seed, self._bridged = body, seed, 0
+        self._body, self._seed, self._bridged, self._cycles = body, seed, 0, 0
 
     def ranges(self, trace: Layout) -> Ranges:
         return physical_ranges(self.problem, trace)
@@ -116,12 +119,16 @@ class _Conversation(Exchange):
         self._answer[:] = self._body.first(self._seed)
 
     def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:
+        self._cycles = cycle + 1
         reading = self._body.read(cycle * self.problem.period, sent[0].copy())
         self._bridged = 0 if reading.values is not None else self._bridged + 1
         self._held[0] = float(reading.values is None)
         if reading.values is not None:
             self._answer[:] = reading.values
         return (reading.mistake, self._body.remedy) if self._bridged > self._body.holds else None
+
+    def end(self) -> None:
+        self._body.end(self._cycles * self.problem.period, self.problem.plant.inputs)
 
 
 class Mover(ABC):

@@ -370,34 +370,37 @@ def run_cycles(
     windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
     after, sent = evaluator.results[0], evaluator.results[2:]
     memory[:] = start
-    talk.begin(read[len(tables) :])
-    for at, end in pieces(cycles, count, [cycle for cycle, _, _ in patches]):
-        for cycle, places, values in patches:
-            if cycle == at:
-                memory[places] = values
-        for argument, table in windows:
-            argument[:] = table[at : at + count]
-        run[:] = end - at
-        evaluator.redirect(1, log[at : at + count])
-        why = evaluator.failure()
-        if why:
-            return log[:at].copy(), _failed(at, count, problem, why)
-        rows = log[at:end]
-        bad = dropped.first_bad(rows, log[at - 1] if at else None)
-        if bad is not None:
-            row, column = bad
-            return log[: at + row].copy(), _why(trace, at + row, column, problem)
-        outside = ranges.first_outside(rows)
-        if outside is not None:
-            row, what = outside
-            return log[: at + row].copy(), stopped(problem, at + row, what)
-        memory[:] = after
-        ended = talk.after(end - 1, sent)
-        if ended and end < cycles:
-            return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]
-        if progress:
-            progress(end, cycles)
-    return log[:cycles], None
+    try:
+        talk.begin(read[len(tables) :])
+        for at, end in pieces(cycles, count, [cycle for cycle, _, _ in patches]):
+            for cycle, places, values in patches:
+                if cycle == at:
+                    memory[places] = values
+            for argument, table in windows:
+                argument[:] = table[at : at + count]
+            run[:] = end - at
+            evaluator.redirect(1, log[at : at + count])
+            why = evaluator.failure()
+            if why:
+                return log[:at].copy(), _failed(at, count, problem, why)
+            rows = log[at:end]
+            bad = dropped.first_bad(rows, log[at - 1] if at else None)
+            if bad is not None:
+                row, column = bad
+                return log[: at + row].copy(), _why(trace, at + row, column, problem)
+            outside = ranges.first_outside(rows)
+            if outside is not None:
+                row, what = outside
+                return log[: at + row].copy(), stopped(problem, at + row, what)
+            memory[:] = after
+            ended = talk.after(end - 1, sent)
+            if ended and end < cycles:
+                return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]
+            if progress:
+                progress(end, cycles)
+        return log[:cycles], None
+    finally:
+        talk.end()
 
 
 def _padded(problem: Problem, patches: Sequence[Patch]) -> int:

@@ -6,10 +6,11 @@ Theory: docs/theory-plants.md.
 from __future__ import annotations
 
 import reprlib
+import warnings
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import ClassVar, NoReturn, Protocol
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import CountOrZero, NotNegative, Positive
+from fpirhc.fields.kinds import CountOrZero, Finite, NotNegative, Positive
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
@@ -59,6 +60,9 @@ class ExternalPlant(Checked):
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
             A bad answer is an exception, another shape, or a number that is not finite: a body that has measured nothing in a
             cycle, or waited for it too long, returns NaN.
+        rest: by input, what is sent when a run ends, however it ends: complete, stopped, by an exception or Ctrl-C. Every input of
+            the model; {}: nothing is sent. A body with a method `close` is a machine, which would keep its last command: it must
+            say, and is closed.
         dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
             problem; the body has it already, so it is not simulated.
         lag: by input, in the model's unit of time: the time constant with which the body follows a command. `ModelReferenced` and
@@ -74,6 +78,7 @@ class ExternalPlant(Checked):
     body: Body | None = None
     measures: Mapping[str, str] | Sequence[str] = field(default_factory=dict)
     holds: CountOrZero = 0
+    rest: Mapping[str, Finite] | None = field(default=None, metadata={"setting": "where given"})
     dead_time: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
     lag: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
 
@@ -97,7 +102,7 @@ class ExternalPlant(Checked):
                 mistakes.add(f"measures: {name} is named {times} times; an answer has every quantity once")
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
-        mistake = "" if self.body is None else _wrong_body(self.body)
+        mistake = "" if self.body is None else self._wrong(self.body)
         if mistake:
             raise InvalidValue(f"ExternalPlant: its body is {mistake}")
 
@@ -205,6 +210,11 @@ class ExternalPlant(Checked):
         units = quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
         mistakes.unknown("lag: input", self.lag, model.inputs)
+        rest = self.rest or {}
+        mistakes.unknown("rest: input", rest, model.inputs)
+        for name in model.inputs if rest else ():
+            if name not in rest:
+                mistakes.add(f"rest: input '{name}' has no value; state what every input is sent when a run ends")
         for name in measured:
             if name not in self.measures:
                 mistakes.add(
@@ -228,7 +238,7 @@ class ExternalPlant(Checked):
                 body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)
             except Exception as error:  # noqa: BLE001  # a stranger's function may raise anything
                 raise InvalidProblem(f"reality: make raised {_words(error)}") from None
-            if mistake := _wrong_body(body):
+            if mistake := self._wrong(body):
                 raise InvalidProblem(f"reality: make returned {mistake}")
             self._present[:] = [body]
         reading = self._answer(lambda: self._present[0].reset(seed), "reset")
@@ -239,6 +249,31 @@ class ExternalPlant(Checked):
     def read(self, time: float, command: np.ndarray) -> Reading:
         """Return the answer to a command."""
         return self._answer(lambda: self._present[0].step(time, command), "step")
+
+    def end(self, time: float, inputs: Iterable[str]) -> None:
+        """Send what rests at the end of a run, and close the body where it has `close`; what fails is warned of."""
+        resting = np.array([self.rest[name] for name in inputs]) if self.rest else None
+        for body in self._present:
+            try:
+                if resting is not None:
+                    answer = self._answer(partial(body.step, time, resting), "step")
+                    if answer.mistake:
+                        warnings.warn(
+                            f"reality: the inputs at rest may not have arrived: {answer.mistake}", stacklevel=2
+                        )
+            finally:
+                close = getattr(body, "close", None)
+                if callable(close):
+                    close()
+
+    def _wrong(self, body: object) -> str:
+        """What is wrong with a body, and what to write; empty where nothing is."""
+        if self.rest is None and not isinstance(body, type) and callable(getattr(body, "close", None)):
+            return (
+                f"a machine, as {type(body).__name__} has close(), and would keep its last command when a run ends; state what it "
+                "is sent then, rest={'u': 0.0} with every input, or rest={} where nothing is to be sent"
+            )
+        return _wrong_body(body)
 
     @cached_property
     def _present(self) -> list[Body]:

@@ -13,7 +13,6 @@ from tank import TANK
 import fpirhc as fp
 from fpirhc.adapters.gymnasium import gymnasium_body
 from fpirhc.adapters.names import derivatives, finite_numbers, steps_per_cycle
-from fpirhc.adapters.real_time import Setup, device
 from fpirhc.adapters.rotorpy import rotorpy_body
 from fpirhc.adapters.tclab import tclab_body
 from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue, Mistakes
@@ -27,7 +26,7 @@ def test_a_wrong_argument_of_an_adapter_is_named():
         functions = inspect.getmembers(module, inspect.isfunction)
         own = [(name, one) for name, one in functions if one.__module__ == module.__name__]
         adapters += [one for name, one in own if name.endswith("_body") or name in ("arm", "plant_of", "as_env")]
-    assert len(adapters) == 12
+    assert len(adapters) == 7
     for adapter in adapters:
         parameters = list(inspect.signature(adapter).parameters.values())
         needed = [one for one in parameters if one.default is one.empty]
@@ -53,22 +52,12 @@ def test_a_wrong_object_or_address_is_told_at_once(use, words):
         use()
 
 
-def test_a_device_has_the_period_that_it_was_made_with():
-    """Commands would else be held for another time than the problem's cycle, and nobody would see it."""
-    setup = Setup("mine", 0.1, None, 0, None, "1")
-    body = device(setup, TANK, {"h": 1}, {"q": 2}, lambda _sent, _read: None)  # type: ignore[arg-type,return-value]
-    with pytest.raises(InvalidProblem, match=re.escape("one step of it takes 0.1, and the problem's period is 0.2")):
-        body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.2)
-    body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.1)
-
-
 MINUTES = fp.Plant({"x": "m"}, {"u": "m/min^2"}, {}, lambda q, v, u, p: {"x": u.u}, time_unit="min")
 
 
 @pytest.mark.parametrize(
     "use",
     [
-        lambda where: device(Setup(where, 1.0, None, 0, None, "1"), MINUTES, {}, {}, lambda _sent, _read: None),  # type: ignore[arg-type,return-value]
         lambda where: steps_per_cycle(where, MINUTES, 1.0, 0.5),  # of MuJoCo and CommonRoad
         lambda _where: tclab_body(MINUTES, period=1.0),
         lambda _where: rotorpy_body(MINUTES, period=1.0),

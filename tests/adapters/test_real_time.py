@@ -1,92 +1,172 @@
-"""Cycles by the clock on the wall, which is the test's own: what a bus that fails or is slow costs, and what it does not send."""
+"""Machines: cycles by the clock on the wall, which is the test's own, and what a machine is left with when a run ends."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import os
+import signal
+import warnings
+from contextlib import suppress
 
 import numpy as np
 import pytest
 from tank import PERIOD, TANK, Tank
 
 import fpirhc as fp
-from fpirhc.adapters.real_time import Setup, device
+from fpirhc.errors import InvalidProblem, InvalidValue
 
 LONG = 2.95  # s, for which a write hangs
 
 
-class Bus:
-    """A link whose third command is `bad`: the times of its commands are kept."""
+class Machine:
+    """A tank on a bus, as a user writes it. Its third command, or the twentieth, is `bad`; what is sent is kept."""
 
-    def __init__(self, bad: str) -> None:
-        self.bad, self.sent, self.times = bad, 0.0, [0.0]
+    def __init__(self, bad: str = "") -> None:
+        self.bad, self.sent, self.times, self.log = bad, 0.0, [], []
         self.tank = Tank(lambda: self.sent, lambda _level: None)
+        self.clock = self.tank.clock
 
-    def open(self) -> None:
-        self.times = []
+    def reset(self, _seed):
+        self.log.append("open")
+        self.clock.begin()
+        return [self.tank.level]
 
-    def write(self, command: Iterable[float]) -> None:
-        (self.sent,) = command
-        self.times.append(self.tank.now)
-        if self.bad == "refused" and len(self.times) == 3:
-            raise ConnectionError
-        if self.bad == "hangs" and len(self.times) == 3:
-            self.tank.sleep(LONG)
+    def step(self, time, command):
+        with self.clock.cycle(time, PERIOD):
+            [self.sent] = command
+            self.log.append(float(self.sent))
+            self.times.append(self.tank.now)
+            if self.bad == "refused" and len(self.times) == 3:
+                raise ConnectionError
+            if self.bad == "hangs" and len(self.times) == 3:
+                self.tank.sleep(LONG)
+            if self.bad == "network" and len(self.times) >= 20:
+                raise OSError("network is gone")
+            if self.bad == "Ctrl-C" and len(self.times) == 20:
+                os.kill(os.getpid(), signal.SIGINT)
+        return [self.tank.level]
 
-    def read(self) -> Iterator[tuple[float, float]]:
-        yield self.tank.level, 0.0
+    def close(self):
+        self.log.append("close")
 
 
-def on(bus: Bus, holds: int = 0) -> fp.ExternalPlant:
-    setup = Setup("mine", PERIOD, None, holds, bus.tank.clock, "1")
-    return device(setup, TANK, {"h": 1}, {"q": 2}, lambda _sent, _read: bus)
+def task(machine: Machine, holds: int = 0, rest=None) -> fp.Problem:
+    return fp.Problem(
+        plant=TANK,
+        reality=fp.ExternalPlant(machine, ["h"], holds=holds, rest={"q": 0.25} if rest is None else rest),
+        sensing=fp.Sensing(estimator=fp.PositionDifference()),
+        reference=fp.Trajectory(lambda t: {"h": 1.0 + 0.1 * t}),
+        start={"h": 1.0},
+        period=PERIOD,
+        duration=5.0,
+    )
 
 
-def mistakes(bus: Bus, own: list[float]) -> list[str]:
+def run(problem: fp.Problem) -> fp.Run:
+    return fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=2.0)), seed=0, compiled=False)
+
+
+def mistakes(machine: Machine, own: list[float]) -> list[str]:
     """Why the answer of each cycle is bad, or nothing; the controller takes its own time, s, before each."""
-    body = on(bus)
+    body = fp.ExternalPlant(machine, ["h"], rest={})
     body.first(0)
     found = []
     for k, seconds in enumerate(own):
-        bus.tank.sleep(seconds)
+        machine.tank.sleep(seconds)
         found.append(body.read(k * PERIOD, np.array([0.5])).mistake)
     return found
 
 
 def test_a_command_that_is_refused_lasts_its_cycle():
     """All `holds` would else be used at one instant, while a buffer is full."""
-    bus = Bus("refused")
-    assert [bool(mistake) for mistake in mistakes(bus, [0.0] * 5)] == [False, False, True, False, False]
-    assert np.diff(bus.times) == pytest.approx([PERIOD] * 4)
+    machine = Machine("refused")
+    assert [bool(mistake) for mistake in mistakes(machine, [0.0] * 5)] == [False, False, True, False, False]
+    assert np.diff(machine.times) == pytest.approx([PERIOD] * 4)
 
 
 def test_a_command_that_hangs_is_told_and_no_burst_follows():
     """The commands of the missed cycles would else go out at one instant, and the run would be complete."""
-    bus = Bus("hangs")
-    told = mistakes(bus, [0.0] * 6)
+    machine = Machine("hangs")
+    told = mistakes(machine, [0.0] * 6)
     assert [bool(mistake) for mistake in told] == [False, False, True, False, False, False]
     assert "the cycle of 0.1 s ended 2.85 s late; choose a longer period, or a quicker bus or controller" in told[2]
-    assert np.diff(bus.times) == pytest.approx([PERIOD, PERIOD, LONG, PERIOD, PERIOD])
+    assert np.diff(machine.times) == pytest.approx([PERIOD, PERIOD, LONG, PERIOD, PERIOD])
 
 
 def test_a_cycle_that_is_a_little_late_is_caught_up():
     """The clock does not drift with the controller's own time; time 0 is that of the first command."""
-    bus = Bus("")
-    assert not any(mistakes(bus, [1.0, 0.15, 0.0, 0.0]))
-    assert bus.tank.now == pytest.approx(1.0 + 4 * PERIOD)
+    machine = Machine()
+    assert not any(mistakes(machine, [1.0, 0.15, 0.0, 0.0]))
+    assert machine.tank.now == pytest.approx(1.0 + 4 * PERIOD)
 
 
 def test_a_run_goes_on_behind_a_command_that_hangs():
-    bus = Bus("hangs")
-    task = fp.Problem(
-        plant=TANK,
-        reality=on(bus, holds=1),
-        sensing=fp.Sensing(estimator=fp.PositionDifference()),
-        reference=fp.Trajectory(lambda t: {"h": 1.0 + 0.1 * t}),
-        start={"h": 1.0},
-        period=PERIOD,
-        duration=2.0,
+    machine = Machine("hangs")
+    one = run(task(machine, holds=1))
+    assert one.stop is None
+    assert list(np.flatnonzero(one["foreign_held"])) == [3]
+
+
+@pytest.mark.parametrize(
+    ("bad", "cycles", "ends"),
+    [
+        ("", 50, None),
+        ("network", 20, "network is gone"),
+        ("Ctrl-C", 20, KeyboardInterrupt),
+        ("refused", 3, "ConnectionError"),
+    ],
+)
+def test_a_machine_is_left_with_what_rests_however_a_run_ends(bad, cycles, ends):
+    """A finished run, a lost network, Ctrl-C, a refused command: the stated input is sent last, and the connection closed."""
+    machine, one = Machine(bad), None
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        if ends is KeyboardInterrupt:
+            with pytest.raises(KeyboardInterrupt):
+                run(task(machine))
+        else:
+            one = run(task(machine))
+    assert machine.log[0] == "open"
+    assert machine.log[-2:] == [0.25, "close"]
+    assert machine.log.count("close") == 1
+    assert len(machine.times) == cycles + 1
+    if isinstance(ends, str):
+        assert ends in str(one.stop)
+    assert [str(w.message) for w in told if "at rest may not have arrived" in str(w.message)] == (
+        ["reality: the inputs at rest may not have arrived: step of Machine raised OSError: network is gone"]
+        if bad == "network"
+        else []
     )
-    run = fp.simulate(task, fp.ComputedTorque(fp.Exponential(rate=2.0)), seed=0, compiled=False)
-    assert run.stop is None
-    assert len(bus.times) == 20
-    assert list(np.flatnonzero(run["foreign_held"])) == [3]
+
+
+def test_an_exception_of_a_caller_ends_the_machine_too():
+    machine = Machine()
+
+    def progress(done, _cycles):
+        if done == 10:
+            raise ZeroDivisionError
+
+    with suppress(ZeroDivisionError):
+        controller = fp.ComputedTorque(fp.Exponential(rate=2.0))
+        fp.simulate(task(machine), controller, seed=0, compiled=False, progress=progress)
+    assert machine.log[-2:] == [0.25, "close"]
+    assert len(machine.times) == 11
+
+
+def test_what_rests_is_stated():
+    """A machine has no default that nobody chose; a body without `close` is not a machine, and {} sends nothing."""
+    with pytest.raises(InvalidValue, match=r"has close\(\), and would keep its last command .* rest={'u': 0.0}"):
+        fp.ExternalPlant(Machine(), ["h"])
+    with pytest.raises(InvalidProblem, match="input 'p' is unknown"):
+        task(Machine(), rest={"p": 0.0})
+    machine = Machine()
+    run(task(machine, rest={}))
+    assert len(machine.times) == 50
+    assert machine.log[-1] == "close"
+
+
+def test_a_body_has_the_period_that_it_was_made_with():
+    """Commands would else be held for another time than the problem's cycle, and nobody would see it."""
+    body = fp.ExternalPlant(Machine(), ["h"], rest={}, period=0.1)
+    with pytest.raises(InvalidProblem, match=r"one step of it takes 0\.1, and the problem's period is 0\.2"):
+        body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.2)
+    body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.1)

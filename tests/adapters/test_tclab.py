@@ -90,7 +90,7 @@ def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
         now[0] += seconds
 
     monkeypatch.setattr(tclab, "TCLab", Board)
-    body: Any = tclab_body(LAB, period=PERIOD, board=RealTime(lambda: now[0], sleep)).body
+    body: Any = tclab_body(LAB, period=PERIOD, board=RealTime(lambda: now[0], sleep), rest={"Q1": 0.0, "Q2": 0.0}).body
     body.reset(0)
     body.step(0.0, np.array([50.0, 0.0]))
     now[0] += 0.5  # the controller's own time
@@ -103,6 +103,11 @@ def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
     now[0] = 100.0
     body.reset(0)
     assert first.closed
+
+
+def test_a_board_says_what_its_heaters_are_sent_at_the_end():
+    with pytest.raises(InvalidProblem, match=r'keep its heaters on when a run ends; .* rest={"Q1": 0.0, "Q2": 0.0}'):
+        tclab_body(LAB, period=PERIOD, board=RealTime())
 
 
 def test_other_names_are_refused():
