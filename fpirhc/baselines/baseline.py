@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -234,10 +235,17 @@ def check(
 
 
 def problems_here(folder: Path) -> list[Path]:
-    """Return the problem files of a folder, or of its folder 'problems', whose packages are installed."""
+    """Return the problem files of a folder, or of its folder 'problems', whose packages are installed.
+
+    Those that a file baselines/unchecked.toml beside them names, with the reason, are left out.
+    """
     place = folder / "problems" if (folder / "problems").is_dir() else folder
-    files = [f for p in (place, *sorted(p for p in place.iterdir() if p.is_dir())) for f in sorted(p.glob("*.py"))]
-    found = [f for f in files if "controllers = " in f.read_text(encoding="utf-8") and not missing(f)]
+    found = list[Path]()
+    for inner in (place, *sorted(one for one in place.iterdir() if one.is_dir())):
+        reasons = inner / "baselines" / "unchecked.toml"
+        unchecked = tomllib.loads(reasons.read_text(encoding="utf-8")) if reasons.is_file() else {}
+        files = [one for one in sorted(inner.glob("*.py")) if one.stem not in unchecked]
+        found += [f for f in files if "controllers = " in f.read_text(encoding="utf-8") and not missing(f)]
     if not found:
         raise BaselineError(f"no problem to check in '{place}'")
     return found

@@ -120,11 +120,13 @@ def test_one_controller_is_checked_alone_and_small_changes_can_be_ignored(folder
 
 
 def test_problems_of_a_folder_and_the_folders_inside_it(tmp_path):
-    """Those whose packages are installed; a file without controllers is none."""
+    """Those whose packages are installed, and that are not left out for a reason; a file without controllers is none."""
     (tmp_path / "problems/gallery").mkdir(parents=True)
     (tmp_path / "problems/notes").mkdir()
+    (tmp_path / "problems/gallery/baselines").mkdir()
+    (tmp_path / "problems/gallery/baselines/unchecked.toml").write_text('slow = "takes a minute"')
     texts = {"one.py": "controllers = {}", "gallery/two.py": "controllers = {}", "gallery/data.py": "x = 1"}
-    texts |= {"gallery/far.py": 'needs = ("no_such_package",)\ncontrollers = {}'}
+    texts |= {"gallery/slow.py": "controllers = {}", "gallery/far.py": 'needs = ("no_such_package",)\ncontrollers = {}'}
     for name, text in texts.items():
         (tmp_path / "problems" / name).write_text(text)
     found = problems_here(tmp_path)

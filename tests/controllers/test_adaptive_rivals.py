@@ -360,13 +360,13 @@ def test_planar_arm():
     assert errors_by_name["AID+FPI"] < 0.5 * errors_by_name["Slotine-Li"]
 
 
-def test_slotine_li_is_the_better_choice_behind_coarse_encoders():
-    """More precise, and the torque changes a tenth as much per cycle; 4096 counts are seen as 140 rad/s^2."""
+def test_slotine_li_is_the_better_choice_behind_coarse_velocities():
+    """More precise, and the torque changes a fifth as much per cycle; a step of a velocity is seen as 30 rad/s^2."""
     errors_by_name = settled("three_link_arm", ("CT+FPI", "Slotine-Li"), 7.0, 4.0)
     precise = {name: value for name, (value, _) in errors_by_name.items()}
     rough = {name: np.std(np.diff(run["command.tau1"])) for name, (_, run) in errors_by_name.items()}
     assert precise["Slotine-Li"] < 0.9 * precise["CT+FPI"]
-    assert rough["Slotine-Li"] < 0.1 * rough["CT+FPI"]
+    assert rough["Slotine-Li"] < 0.2 * rough["CT+FPI"]
 
 
 def test_puma_learns_its_load():
