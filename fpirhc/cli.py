@@ -235,8 +235,8 @@ def run(
 
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], _folder(out, task.name)
-    from fpirhc.report.figures import save_figure
     from fpirhc.controllers.contract import believing
+    from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
@@ -255,7 +255,7 @@ def run(
     found.save(files[0])
     save_figure(found.plot(), files[1])
     announce_backend([found])
-    harm = harm_of_adaptation(task.problem, controller, chosen, seed=seed)
+    harm = harm_of_adaptation(task.problem, controller, chosen)
     show_run(found, measure(task.problem, found, task.metrics), harm, files)
     raise typer.Exit(0 if found.stop is None else 4)
 

@@ -89,7 +89,7 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> 
         return Objective()
     for metric in metrics:
         element = name.removeprefix(metric.name).removeprefix(".")
-        if name != metric.key(element):
+        if name != metric.key(element) or (element and metric.by is None):
             continue
         if metric.by is not None and not element:
             raise InvalidValue(

@@ -122,7 +122,7 @@ def tune(
         facts = {"cost_before": before, "cost": min(before, best.value), "trials": len(done)}
         rows += [{"controller": name, "setting": p, "before": now[p], "best": v, **facts} for p, v in found.items()]
         tuned = with_settings(controller, found)
-        harm[name] = harm_of_adaptation(task.problem, name, tuned, seed=seed, compiled=bool(compiled))
+        harm[name] = harm_of_adaptation(task.problem, name, tuned)
     return Tuning(task.name, pd.DataFrame(rows), harm)
 
 

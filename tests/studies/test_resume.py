@@ -1,4 +1,4 @@
-"""Rows of a study are kept, whoever dies on the way: processes, clusters and an interruption end in the rows of one calm process."""
+"""Rows of a study are kept: killed processes, clusters and an interruption end in the rows of one calm process."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_processes_change_nothing(task):
     """Nor does the number of plants in a job; another task than that of the file is refused, because they load the file."""
     same(run_variants(task, DRAWS, processes=2, compiled=False), run_variants(task, DRAWS, compiled=False))
     changed = replace(task, problem=replace(task.problem, duration=1.0))
-    with pytest.raises(InvalidProblem, match="is not that of .*line.py', which other processes load"):
+    with pytest.raises(InvalidProblem, match=r"is not that of .*line.py', which other processes load"):
         run_variants(changed, DRAWS, processes=2, compiled=False)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -14,10 +14,10 @@ from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import innermost, resolved, without_deformation
-from fpirhc.controllers.live_settings import Numbers
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
+from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.pairs import pair_of
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.review import recommended_for
@@ -28,11 +28,12 @@ from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import ComposedLoop, judged_run
+from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, Trials, errors_of, harm_in, weighed
 from fpirhc.studies.comparison.verdict import Finding, Outcome, Yardstick, findings
+from fpirhc.studies.objective import objective
 from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
 from fpirhc.summary import Column, Table
 from fpirhc.symbolic.evaluate import attempted
@@ -192,89 +193,97 @@ def compare(
     mistakes.raise_if_any()
     check_gains(task, selected)
     problem, skipped = task.problem, dict[str, str]()
-    composed, entries = dict[str, tuple[ComposedLoop, ComposedStep | None]](), list[Entry]()
+    rows, entries = _Rows(task, selected, seed, compiled), list[Entry]()
     with compiling_ahead() as compiling:
-        for name, controller in selected.items():
+        for name in selected:
             try:
-                live = tuple(dict.fromkeys(p for numbers in (changes or {}).get(name, {}).values() for p in numbers))
-                loop = ComposedLoop.of(problem, resolved(problem, controller), live)
-                step = attempted(
-                    "the time of a cycle", ComposedStep.of, problem, loop.live.controller, bounded=False, broken=[]
-                )
-                composed[name] = loop, step
-                if loop.worth_compiling(compiled):
-                    compiling(loop.function, calls=loop.calls)
-                    if step is not None:
-                        compiling(step.function)
+                rows.compose(name, (changes or {}).get(name, {}), compiling)
             except FpirhcError as error:
                 skipped[name] = str(error)
-        for name, (loop, step) in composed.items():
+        for name in rows.composed:
             try:
-                entries.append(
-                    _entry(task, selected, name, loop, step, seed, compiled, progress, (changes or {}).get(name, {}))
-                )
+                entries.append(rows.entry(name, (changes or {}).get(name, {}), progress and partial(progress, name)))
             except FpirhcError as error:
                 skipped[name] = str(error)
             except KeyboardInterrupt:
-                skipped |= {n: "interrupted before it finished" for n in composed if n not in {e.name for e in entries}}
+                done = {*skipped, *(e.name for e in entries)}
+                skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
                 break
-    yard = Yardstick.of(problem, seed)
-    facts = circumstances(task, selected, command, begin)
+    aim = objective(task.headline_metric, task.metrics, problem)
     return Comparison(
-        **facts,
+        **circumstances(task, selected, command, begin),
         seed=seed,
         measure_from=problem.measure_from,
         entries=tuple(entries),
         skipped=skipped,
-        findings=findings(entries, task.headline, yard, skipped),
+        findings=findings(entries, task.headline, Yardstick.of(problem, seed), skipped, aim),
         pictures=task.pictures,
         time_unit=problem.time_unit,
         steps=problem.real_integrator.steps_maps,
     )
 
 
-def _entry(
-    task: Task,
-    controllers: Mapping[str, Controller],
-    name: str,
-    composed: ComposedLoop,
-    step: ComposedStep | None,
-    seed: int,
-    compiled: bool | None,
-    progress: Progress | None,
-    changes: Changes,
-) -> Entry:
-    problem, broken = task.problem, list[str]()
-    part = partial(attempted, broken=broken)
-    loop = composed.simulator(compiled)
-    run = judged_run(loop, seed=seed, name=name, progress=progress and partial(progress, name), changes=changes)
-    ready, metrics = loop.controller, measure(problem, run, task.metrics)
-    plans = innermost(ready).planner is not None and problem.horizon is not None
-    pair = pair_of(controllers, name) if ready.deformation.adapts else None
-    null = None
-    if pair is not None:
-        bare = ComposedLoop.of(problem, resolved(problem, controllers[pair])).simulator(False)
-        null = part("the null test", lambda: errors_of(*ModelAsPlant(problem, seed=seed).pair((bare, loop))))
-    stepper = part("the time of a cycle", Stepper.of, step, compiled=loop.compiled) if step is not None else None
-    cycle = part("the time of a cycle", _cycle_time, stepper, run) if stepper is not None else None
-    contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-    view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
-    notes = (*broken_limits(problem, run), *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
-    return Entry(
-        name,
-        run,
-        metrics,
-        ready.deformation.adapts,
-        pair,
-        weighed(problem, ready),
-        _has_exact_model(problem, ready),
-        cycles_per_plan(problem.horizon, problem.period) if plans else 1,
-        contraction,
-        view,
-        null,
-        cycle,
-        notes,
-    )
+class _Rows:
+    """The loops of a comparison, each composed and compiled once, and the row of each."""
+
+    def __init__(self, task: Task, controllers: Mapping[str, Controller], seed: int, compiled: bool | None) -> None:
+        self._task, self._controllers, self._seed, self._compiled = task, controllers, seed, compiled
+        self.composed: dict[str, tuple[ComposedLoop, ComposedStep | None]] = {}
+        self._loops: dict[str, Simulator] = {}
+        self._model = ModelAsPlant(task.problem, seed=seed)
+
+    def compose(self, name: str, changes: Changes, compiling: Callable[..., None]) -> None:
+        """Compose a loop, and its step by hand, and start the compiler for them."""
+        problem = self._task.problem
+        live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
+        loop = ComposedLoop.of(problem, resolved(problem, self._controllers[name]), live)
+        facts: dict[str, Any] = {"bounded": False, "broken": []}
+        step = attempted("the time of a cycle", ComposedStep.of, problem, loop.live.controller, **facts)
+        self.composed[name] = loop, step
+        if loop.worth_compiling(self._compiled):
+            compiling(loop.function, calls=loop.calls)
+            if step is not None:
+                compiling(step.function)
+
+    def _loop(self, name: str) -> Simulator:
+        ready = self._loops.get(name)
+        if ready is None or ready.remembers:  # such a loop begins where its last run ended
+            ready = self._loops[name] = self.composed[name][0].simulator(self._compiled)
+        return ready
+
+    def entry(self, name: str, changes: Changes, progress: Callable[[int, int], None] | None) -> Entry:
+        """Run a controller; a part that breaks is told, and loses no run."""
+        problem, broken = self._task.problem, list[str]()
+        part, loop = partial(attempted, broken=broken), self._loop(name)
+        run = judged_run(loop, seed=self._seed, name=name, progress=progress, changes=changes)
+        ready, metrics = loop.controller, measure(problem, run, self._task.metrics)
+        plans = innermost(ready).planner is not None
+        pair = pair_of(self._controllers, name) if ready.deformation.adapts else None
+        pair = pair if pair in self.composed else None
+        step, judged = self.composed[name][1], weighed(problem, ready)
+        null = part("the null test", self._null, pair, name, judged) if pair is not None else None
+        cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
+        contraction = part("the contraction", _contraction, problem, ready, run, metrics)
+        view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
+        notes = (*broken_limits(problem, run), *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
+        return Entry(
+            name=name,
+            run=run,
+            metrics=metrics,
+            adaptive=ready.deformation.adapts,
+            pair=pair,
+            weighed=judged,
+            exact=_has_exact_model(problem, ready),
+            plan_every=cycles_per_plan(problem.horizon, problem.period) if plans and problem.horizon else 1,
+            contraction=contraction,
+            lyapunov=view,
+            null=null,
+            cycle=cycle,
+            notes=notes,
+        )
+
+    def _null(self, pair: str, name: str, judged: frozenset[str] | None) -> ErrorPair:
+        return errors_of(*self._model.pair((self._loop(pair), self._loop(name))), judged)
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
@@ -296,18 +305,18 @@ def _has_exact_model(problem: Problem, controller: Controller) -> bool:
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
 
 
-def _cycle_time(stepper: Stepper, run: Run) -> tuple[float, float] | None:
+def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float, float] | None:
     """Median and largest wall time of a call of the controller, from measurement to command, us."""
-    count = min(run.cycles, REPLAYED)
+    stepper, count = Stepper.of(composed, compiled=compiled), min(run.cycles, REPLAYED)
     if count < 2:
         return None
+    step: Callable[..., Any] = stepper.step_measured if stepper.estimates else stepper.step
+    samples: tuple[np.ndarray, ...] = (run.time, run["state"], run["realised"])
     if stepper.estimates:
-        step, samples = stepper.step_measured, (run.time, raw_measurements(run))
+        samples = run.time, raw_measurements(run)
     elif stepper.beside:
         step = lambda now, x, r, y, memory: stepper.step(now, x, r, memory, output=y)  # noqa: E731
-        samples = run.time, run["state"], run["realised"], run["output"]
-    else:
-        step, samples = stepper.step, (run.time, run["state"], run["realised"])
+        samples = *samples, run["output"]
     memory, taken = stepper.start(), np.empty(count)
     for k in range(count):
         begin = time.perf_counter_ns()
@@ -323,33 +332,20 @@ def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
         if name in {**limits.soft, **limits.prices} or not run.cycles:
             continue
         values = run[f"plant_state.{name}"]
+        unit = with_space(run.unit(f"plant_state.{name}"))
         room = 1e-3 * (high - low if np.isfinite(high - low) else max(abs(values).max(), 1.0))
-        beyond = max(float(values.max()) - high, low - float(values.min()))
-        if beyond > room:
-            texts.append(f"{name} leaves its hard limits by {beyond:.3g}")
+        for value, limit in ((values.min(), low), (values.max(), high)):
+            if abs(value - min(max(value, low), high)) > room:
+                texts.append(f"{name} reaches {value:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
     return tuple(texts)
 
 
-def harm_of_adaptation(
-    problem: Problem,
-    name: str,
-    controller: Controller,
-    *,
-    seed: int = 0,
-    compiled: bool = False,
-    settings: Numbers | None = None,
-    **_: Any,
-) -> tuple[str, ...]:
+def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:
     """Return what short runs on the plant and on the model show against the adaptation of a controller."""
     if not controller.deformation.adapts:
         return ()
     try:
-        ready = (
-            controller
-            if not settings
-            else ComposedLoop.of(problem, controller, list(settings)).simulator(False).holding(settings).controller
-        )
-        against = harm_in(*Trials(problem, without_deformation(ready), cycles=1000).errors(ready))
+        against = harm_in(*Trials(problem, without_deformation(controller), cycles=1000).errors(controller))
     except FpirhcError:
         return ()
     return (f"{name}: {against}.",) if against else ()

@@ -7,7 +7,7 @@ and a sentence; some turn a smaller error into a doubtful one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -20,6 +20,7 @@ from fpirhc.simulation.loop import HeldInput
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
+from fpirhc.studies.objective import Objective
 from fpirhc.summary import written_out
 from fpirhc.task.problem import Problem
 
@@ -49,6 +50,7 @@ class Finding:
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
+_STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
 _SAMPLES = 2000
 
@@ -78,10 +80,11 @@ class Yardstick:
         rows = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[0].full())
         places = {n: plant.output.elements.index(n) for n in problem.judged_names}
         own = {n: float(np.ptp(rows[k])) for n, k in places.items()}
-        both = {n: max(own[n], float(np.abs(rows[k, 0] - problem.start_output[k]))) for n, k in places.items()}
+        both = {n: float(np.ptp(np.append(rows[k], problem.start_output[k]))) for n, k in places.items()}
         small = {n: max(ROUNDING * float(np.abs(rows[k]).max()), 1e-300) for n, k in places.items()}
         weights = (problem.cost.tracked or {}) if problem.cost is not None else {}
-        held = {n: weights[n] ** -0.5 if weights.get(n, 0) > 0 else 1.0 for n in places}
+        wide = {n: high - low for n, (low, high) in problem.limits.states.items() if math.isfinite(high - low)}
+        held = {n: weights[n] ** -0.5 if weights.get(n, 0) > 0 else wide.get(n, 1.0) for n in places}
         scales = {n: size if size > small[n] else held[n] for n, size in both.items()}
         return Yardstick(scales, left_alone(problem, seed), frozenset(n for n in places if own[n] > small[n]))
 
@@ -93,21 +96,27 @@ class Yardstick:
 
 # --- Flags ---------------------------------------------------------------------------------------------------------------
 
-Pair = tuple["Entry", "Entry"]
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """The same controller without adaptation and with it, and what is asked of them."""
+
+    plain: Entry
+    adaptive: Entry
+    yard: Yardstick
+    names: Sequence[str]  # of the coordinates that count
 
 
-def _worst(values: Mapping[str, float]) -> float:
-    return max(values.values(), default=0.0)
+def _left_alone(pair: Pair) -> float:
+    alone = pair.yard.alone
+    return min((pair.adaptive.errors[n] / max(alone[n], 1e-300) for n in pair.names if n in alone), default=0.0)
 
 
-def _left_alone(pair: Pair, yard: Yardstick) -> float:
-    return min((pair[1].errors[n] / max(v, 1e-300) for n, v in yard.alone.items()), default=0.0)
-
-
-def _growth(pair: Pair, _: Yardstick) -> float:
+def _growth(pair: Pair) -> float:
     """By how much the error grows from quarter to quarter of the run, as that of an unstable loop."""
-    errors = np.abs(pair[1].run["true_error"])
-    if pair[1].run.stop is not None or len(errors) < 40:
+    run = pair.adaptive.run
+    errors = np.abs(run["true_error"])
+    if run.stop is not None or len(errors) < 40:
         return 0.0
     largest = np.array([part.max(axis=0) for part in np.array_split(errors, 4)])
     steps = largest[1:] / np.maximum(largest[:-1], 1e-300)
@@ -115,40 +124,50 @@ def _growth(pair: Pair, _: Yardstick) -> float:
     return float(np.where(exponential, largest[-1] / np.maximum(largest[0], 1e-300), 0.0).max(initial=0.0))
 
 
-def _unsolved(pair: Pair, _: Yardstick) -> float:
-    return pair[1].metrics.statuses.get(Status.NOT_CONVERGED.name, 0) / max(1, pair[1].run.cycles)
+def _unsolved(pair: Pair) -> float:
+    return pair.adaptive.metrics.statuses.get(Status.NOT_CONVERGED.name, 0) / max(1, pair.adaptive.run.cycles)
 
 
-def _at_limit(pair: Pair, _: Yardstick) -> float:
-    return float(pair[1].metrics.values.get("at_limit", {}).get("", 0.0))
+def _at_limit(pair: Pair) -> float:
+    return float(pair.adaptive.metrics.values.get("at_limit", {}).get("", 0.0))
 
 
-def _moves(pair: Pair, _: Yardstick) -> float:
-    before, after = (e.metrics.values.get("total_variation", {}) for e in pair)
-    return _worst({n: v / before[n] for n, v in after.items() if before.get(n, 0.0) > 0})
+def _moved(pair: Pair) -> dict[str, float]:
+    """How many times as much each input moves; what stands still counts as moving by a millionth of its size."""
+    before, after = (e.metrics.values.get("total_variation", {}) for e in (pair.plain, pair.adaptive))
+    size = pair.adaptive.metrics.values.get("effort", {})
+    return {n: v / max(before[n], _STILL * size.get(n, 0.0), 1e-300) for n, v in after.items() if n in before and v > 0}
 
 
-def _chatters(pair: Pair, yard: Yardstick) -> float:
-    """The same where the command moves many times its own span."""
-    command = pair[1].run["command"]
-    swings = np.abs(np.diff(command, axis=0)).sum(axis=0) / np.maximum(np.ptp(command, axis=0), 1e-300)
-    return _moves(pair, yard) if len(command) and swings.max() >= 10 else 0.0
+def _moves(pair: Pair) -> float:
+    return max(_moved(pair).values(), default=0.0)
 
 
-def _grows(pair: Pair, _: Yardstick) -> float:
-    return 0.0 if pair[1].contraction is None else pair[1].contraction.growing
+def _chatters(pair: Pair) -> float:
+    """The same of inputs that move many times their own span: a command that settles once moves by its span."""
+    moved = _moved(pair)
+    command = {n: pair.adaptive.run[f"command.{n}"] for n in moved}
+    back_and_forth = {n for n, c in command.items() if np.abs(np.diff(c)).sum() >= 10 * np.ptp(c) > 0}
+    return max((moved[n] for n in back_and_forth), default=0.0)
 
 
-def _null(pair: Pair, _: Yardstick) -> float:
-    null = pair[1].null
-    return 0.0 if null is None or not null.fails else null.ratio(null.worst)
+def _grows(pair: Pair) -> float:
+    return 0.0 if pair.adaptive.contraction is None else pair.adaptive.contraction.growing
+
+
+def _null(pair: Pair) -> float:
+    """How many times as large it makes the error of a right model, where that exceeds what the wrong model costs without it."""
+    null = pair.adaptive.null
+    if null is None or not null.fails or null.stuck:
+        return 0.0
+    return null.ratio(null.worst) if null.adapted[null.worst] > pair.plain.errors[null.worst] else 0.0
 
 
 @dataclass(frozen=True)
 class Flag:
     """A row of the table of flags."""
 
-    measure: Callable[[Pair, Yardstick], float]
+    measure: Callable[[Pair], float]
     least: float  # value from which it is raised
     text: str  # with the value as {0}
     doubts: bool = False  # whether it turns a smaller error into a doubtful one
@@ -180,9 +199,9 @@ FLAGS = (
 )
 
 
-def flags_of(pair: Pair, yard: Yardstick) -> list[tuple[Flag, str]]:
+def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
-    raised = [(flag, value) for flag in FLAGS if (value := flag.measure(pair, yard)) > flag.least]
+    raised = [(flag, value) for flag in FLAGS if (value := flag.measure(pair)) > flag.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
     return [(f, f.text.format(written_out(v))) for f, v in raised if not (chatter and f.measure is _moves)]
 
@@ -214,7 +233,7 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     outcome = (
         Outcome.MIXED if up and down else Outcome.WORSE if up else Outcome.BETTER if down else Outcome.NO_DIFFERENCE
     )
-    raised = flags_of((plain, adaptive), yard)
+    raised = flags_of(Pair(plain, adaptive, yard, major))
     said = [text for _, text in raised]
     if any(yard.beyond(plain, n) and yard.beyond(adaptive, n) for n in major):
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
@@ -227,31 +246,57 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
 
 
+def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
+    """Return what adaptation does to the number that the problem is judged by."""
+    names, metric = (plain.name, adaptive.name), aim.metric
+    assert metric is not None
+    before, after = (
+        math.nan if e.run.stop else float(e.metrics[metric.name].get(aim.element, math.nan)) for e in (plain, adaptive)
+    )
+    lost = [n for n, v in zip(names, (before, after), strict=True) if not math.isfinite(v)]
+    if lost:
+        outcome = Outcome.NOT_COMPARABLE if len(lost) == 2 else Outcome.WORSE if lost == [names[1]] else Outcome.BETTER
+        return Finding(f"{' and '.join(lost)}: no {aim.noun}.", outcome, names)
+    ratio = after / before if before * after > 0 else math.nan
+    if abs(after - before) <= metric.floor or HELPS <= ratio <= HURTS:
+        outcome = Outcome.NO_DIFFERENCE
+    else:
+        outcome = Outcome.BETTER if aim.sign * (after - before) < 0 else Outcome.WORSE
+    text = f"{names[1]} against {names[0]} by {aim.noun}: {outcome} ({aim.text(before)} -> {aim.text(after)})."
+    return Finding(text, outcome, names, {aim.noun: ratio})
+
+
 def findings(
-    entries: Sequence[Entry], headline: tuple[str, str] | None, yard: Yardstick, skipped: Mapping[str, str]
+    entries: Sequence[Entry],
+    headline: tuple[str, str] | None,
+    yard: Yardstick,
+    skipped: Mapping[str, str],
+    aim: Objective,
 ) -> tuple[Finding, ...]:
     """Return the verdict: the headline pair first, then the others, the best row, and what was not run."""
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     pairs.sort(key=lambda p: ((p[0].name, p[1].name) != headline, "solve" not in p[1].run.layout))
-    judged = [judge(*pair, yard) for pair in pairs]
+    judged = [judge_by(aim, *pair) for pair in pairs] if aim.metric is not None else []
+    judged += [judge(*pair, yard) for pair in pairs]
     if not judged:
         judged = [Finding("No controller is here both with and without adaptation.", Outcome.NOT_COMPARABLE)]
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {name} ({why}).") for name, why in skipped.items()))
 
 
-def relative_error(entry: Entry, yard: Yardstick) -> float:
-    """Return the error over the ranges, root mean square over the coordinates; infinite for a run that ended early."""
+def relative_error(entry: Entry, yard: Yardstick, names: Collection[str]) -> float:
+    """Return the error over the ranges, root mean square over these coordinates; infinite for a run that ended early."""
     if entry.run.stop is not None:
         return math.inf
-    shares = [entry.errors[n] / yard.scales[n] for n in entry.errors]
+    shares = [entry.errors[n] / yard.scales[n] for n in names]
     return math.hypot(*shares) / math.sqrt(len(shares))
 
 
-def _remarks(entries: Sequence[Entry], pairs: Sequence[Pair], yard: Yardstick) -> Iterator[str]:
-    rows = {e.name: relative_error(e, yard) for e in entries}
-    fair = {e.name: rows[e.name] for e in entries if not e.exact}
+def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yard: Yardstick) -> Iterator[str]:
+    names = (pairs[0][1].weighed if pairs else None) or [*yard.scales]
+    rows = {e.name: relative_error(e, yard, names) for e in entries}
+    fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
     if fair:
         best = min(fair, key=fair.__getitem__)
         yield f"The smallest error is that of {best}, {written_out(100 * fair[best])} % of the range."
