@@ -123,8 +123,12 @@ def _noise(problem: Problem, seed: int) -> Quantity:
 
 
 def _lost(problem: Problem, seed: int) -> Quantity:
-    losing = _sensed(problem, seed, lambda sensor, _, value: replace(sensor, dropout=value))
-    return Quantity("of the samples", 0.0, 0.02, 0.98, losing)
+    count = len(problem.sensing.measures(problem.plant))  # a cycle in which one of them loses its sample has none
+
+    def losing(sensor: Sensor, _: str, value: float) -> Sensor:
+        return replace(sensor, dropout=1 - (1 - value) ** (1 / count))
+
+    return Quantity("of the samples", 0.0, 0.02, 0.98, _sensed(problem, seed, losing))
 
 
 def _plants(problem: Problem, seed: int) -> Quantity:

@@ -127,7 +127,12 @@ def tune(
 
 
 def _finished(study: Any) -> list[Any]:
-    return [trial for trial in study.get_trials(deepcopy=False) if trial.state.name == "COMPLETE"]
+    """The trials that are finished; one that was interrupted is none, and the sampler must not count it."""
+    trials = study.get_trials(deepcopy=False)
+    for trial in trials:
+        if trial.state.name == "RUNNING":
+            study.tell(trial.number, state=type(trial.state).FAIL)
+    return [trial for trial in trials if trial.state.name == "COMPLETE"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Full disks, damaged ledgers and Ctrl-C: one line, a code of its own, and what is finished is kept."""
+"""Ctrl-C in a solver, in a step and in a build is an interruption, and no fault of theirs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import casadi as ca
 import numpy as np
 import pytest
-from test_scenarios import LINE
+from line import line_text
 
 import fpirhc as fp
 from fpirhc.contraction import spectrum
@@ -20,6 +20,7 @@ from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import NotSupported
 from fpirhc.symbolic.evaluate import Evaluator, attempted
 
+LINE = line_text("period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}")
 PLANNED = """measure_from=0.5,
     horizon=fp.Horizon(stages=30, step=5e-3),
     cost=fp.Quadratic(states={'y': 1.0}, deviation={'u': 1e-3}),"""

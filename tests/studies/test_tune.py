@@ -8,13 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 from line import EXACT, line_text
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported, OutputError
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.problem_files.settings import current_setting, is_whole
-from fpirhc.studies.objective import PENALTY, objective
+from fpirhc.studies.objective import PENALTY
+from fpirhc.studies.runs import run_variants
+from fpirhc.studies.tune import tune
+from fpirhc.studies.variants import CasesOf, Draws
 
 TUNING = """tuning = {
     "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},
@@ -97,10 +101,6 @@ def test_spans_are_checked(wrong):
 # --- Tuning -----------------------------------------------------------------------------------------------------------
 
 
-def records(folder: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in (folder / "trials.jsonl").read_text().splitlines()[1:]]
-
-
 @pytest.mark.parametrize(
     ("metric", "error", "message"),
     [
@@ -113,82 +113,109 @@ def records(folder: Path) -> list[dict[str, Any]]:
 )
 def test_a_wrong_metric_is_refused(metric, error, message, task, tmp_path):
     with pytest.raises(error, match=message):
-        fp.tune(task, trials=1, seed=0, folder=tmp_path / "t", metric=metric)
-
-
-def test_a_run_that_fails_costs_more_than_any_metric(task):
-    """Between one and two penalties, less if it lasted long; settings that cannot run cost two."""
-    aim = objective("max_error.y", task.metrics, task.problem)
-    record = {"outcome": "ended early", "error": None, "lasted": 0.25, "metrics": {"max_error": {"y": None}}}
-    finished = {
-        "controller": "RHC",
-        "outcome": "finished",
-        "error": 0.1,
-        "lasted": 1.0,
-        "metrics": {"max_error": {"y": 3e5}},
-    }
-    assert aim.cost(finished) == 3e5
-    assert 3e5 < aim.cost({**record, "lasted": 0.75}) < aim.cost(record) < aim.refused == aim.cost({"skipped": "why"})
+        tune(task, trials=1, seed=0, folder=tmp_path / "t", metric=metric)
 
 
 def test_failing_trials_cost_a_finite_penalty(task, tmp_path):
-    """Gains far beyond the limit of contraction diverge: finite, and above everything that works."""
-    wild = replace(
-        task, tuning={"CTC+FPI": {"deformation.gain": fp.Span(-1e4, -1e3), "deformation.scale": fp.Span(1e5, 1e6)}}
+    """Gains far beyond the limit of contraction diverge, and a scale below zero is refused: the settings stay as they are."""
+    wild = {"deformation.gain": fp.Span(-1e4, -1e3), "deformation.scale": fp.Span(1e5, 1e6)}
+    for spans, expected in (
+        (wild, {"deformation.gain": -0.1, "deformation.scale": 20.0}),
+        ({"deformation.scale": fp.Span(-2.0, -1.0)}, {"deformation.scale": 20.0}),
+    ):
+        folder = tmp_path / "-".join(spans)
+        tuned = tune(replace(task, tuning={"CTC+FPI": spans}), trials=4, seed=0, folder=folder, compiled=False)
+        assert tuned.settings() == {"CTC+FPI": expected}
+        assert (tuned.table.cost == tuned.table.cost_before).all()
+        values = [value for value in costs(folder) if value > tuned.table.cost[0]]
+        assert len(values) == 4
+        assert all(PENALTY / 1e3 < value <= 2 * PENALTY for value in values)
+
+
+def costs(folder: Path) -> list[float]:
+    """The cost of every finished trial, as it stands in the file."""
+    lines = [json.loads(line) for line in (folder / "trials.log").read_text().splitlines()]
+    return [one["values"][0] for one in lines if one.get("values")]
+
+
+def test_the_best_is_never_worse_and_costs_what_its_runs_say(task, tmp_path):
+    """The cost is the mean relative error over the plants, which are the same for all trials; lines of Python give it."""
+    draws = Draws(3, 10.0, 7)
+    tuned = tune(task, trials=12, seed=1, variants=draws, controllers=["CTC+FPI"], folder=tmp_path, compiled=False)
+    row, [gain] = tuned.table.iloc[0], tuned.settings()["CTC+FPI"].values()
+    assert row.cost < row.cost_before
+    for value, cost in ((gain, row.cost), (-0.1, row.cost_before)):
+        controllers = {"one": fp.with_settings(task.controllers["CTC+FPI"], {"deformation.gain": value})}
+        rows = run_variants(replace(task, controllers=controllers, tuning={}), draws, compiled=False)
+        assert cost == pytest.approx(rows.error.mean(), rel=1e-9)
+    scope = {"controllers": dict(task.controllers), "fp": fp}
+    exec(tuned.python(), scope)
+    assert scope["controllers"]["CTC+FPI"].deformation.gain == gain
+
+
+def test_a_metric_of_which_more_is_better_is_tuned_upwards(task, tmp_path):
+    inside = fp.Metric("inside", lambda problem, run: float((abs(run["error.y"]) < 0.02).mean()), better="larger")
+    task = replace(task, metrics=[*task.metrics, inside])
+    facts = {"trials": 8, "seed": 0, "controllers": ["CTC"], "metric": "inside", "compiled": False}
+    row = tune(task, folder=tmp_path, **facts).table.iloc[0]
+    assert row.cost <= row.cost_before < 0
+
+
+def test_a_disturbed_search_finds_what_a_calm_one_finds(task, tmp_path):
+    """Interrupted within a trial, or begun with fewer trials: the same trials, bit by bit. Trials beyond the tenth learn."""
+    facts: dict[str, Any] = {"seed": 3, "variants": Draws(2, 10.0, 3), "controllers": ["CTC+FPI"], "compiled": False}
+    calm = tune(task, trials=14, folder=tmp_path / "calm", **facts)
+
+    def interrupt(name: str, done: int, of: int) -> None:
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune(task, trials=14, folder=tmp_path / "cut", progress=interrupt, **facts)
+    cut = tmp_path / "cut" / "trials.log"
+    lines = cut.read_text().splitlines(keepends=True)
+    cut.write_text("".join(lines[:-1]))  # the fifth was running
+    assert len(costs(tmp_path / "cut")) == 4
+    tune(task, trials=11, folder=tmp_path / "cut", **facts)
+    again = tune(task, trials=14, folder=tmp_path / "cut", **facts)
+    pd.testing.assert_frame_equal(again.table, calm.table)
+    assert costs(tmp_path / "cut") == costs(tmp_path / "calm")
+
+
+def test_other_plants_and_spans_are_another_search(task, tmp_path):
+    """Their trials stand beside each other in one folder, and none counts for the other."""
+    facts: dict[str, Any] = {"seed": 3, "controllers": ["CTC"], "compiled": False, "folder": tmp_path}
+    tune(task, trials=2, **facts)
+    tune(task, trials=2, variants=Draws(2, 10.0, 3), **facts)
+    wider = replace(task, tuning={"CTC": {"tracking.rate": fp.Span(1.0, 12.0)}})
+    tune(wider, trials=2, **facts)
+    assert len(costs(tmp_path)) == 6
+    tune(task, trials=2, **facts)
+    assert len(costs(tmp_path)) == 6
+
+
+def test_tuning_on_some_cases_leaves_the_others(task, tmp_path):
+    """The cost is the mean over the cases that are named."""
+    cases = fp.Cases(
+        {"light": {"exact.b": 2.0, "group": "some"}, "stiff": {"exact.k": 8.0, "group": "some"}, "far": {}}
     )
-    tuned = fp.tune(wild, trials=4, seed=0, folder=tmp_path / "t")
-    costs = [r["cost"] for r in records(tmp_path / "t")]
-    assert all(0 < c <= 2 * PENALTY for c in costs)
-    assert tuned.entries[0].failed == 4
-    assert tuned.entries[0].settings == {"deformation.gain": -0.1, "deformation.scale": 20.0}
-    refused = replace(task, tuning={"CTC+FPI": {"deformation.scale": fp.Span(-2.0, -1.0)}})
-    tuned = fp.tune(refused, trials=1, seed=0, folder=tmp_path / "refused")
-    assert records(tmp_path / "refused")[1]["cost"] == 2 * PENALTY
-    assert tuned.entries[0].settings == {"deformation.scale": 20.0}
-
-
-def test_a_disturbed_study_finds_what_a_calm_one_finds(task, tmp_path):
-    """Cut anywhere and gone on with, or begun with fewer trials: the same trials, bit by bit. Trials beyond the tenth learn."""
-    settings: dict[str, Any] = {"seed": 3, "count": 2, "percent": 10.0, "controllers": ["CTC+FPI"]}
-    calm = fp.tune(task, trials=14, folder=tmp_path / "calm", **settings)
-    fp.tune(task, trials=5, folder=tmp_path / "cut", **settings)
-    content = (tmp_path / "cut" / "trials.jsonl").read_bytes()
-    (tmp_path / "cut" / "trials.jsonl").write_bytes(content[:-7])
-    again = fp.tune(task, trials=14, folder=tmp_path / "cut", **settings)
-    assert (tmp_path / "cut" / "trials.jsonl").read_bytes() == (tmp_path / "calm" / "trials.jsonl").read_bytes()
-    assert again.facts() == calm.facts()
-    with pytest.raises(OutputError, match="seed was 3, is 4"):
-        fp.tune(task, trials=14, folder=tmp_path / "cut", **{**settings, "seed": 4})
-
-
-def test_a_generation_that_was_interrupted_goes_on_as_it_would_have_done(task, tmp_path):
-    """Within the first trials, which are random, and within those that learn; no finished trial is run again."""
-    facts: dict[str, Any] = {"seed": 0, "compiled": False, "population": 4, "controllers": ["CTC"]}
-
-    def lines(folder: str) -> list[str]:
-        return (tmp_path / folder / "trials.jsonl").read_text().splitlines(keepends=True)
-
-    fp.tune(task, trials=20, folder=tmp_path / "whole", **facts)
-    for finished in (2, 14):
-        folder = tmp_path / f"after {finished}"
-        folder.mkdir()
-        (folder / "trials.jsonl").write_text(
-            "".join(lines("whole")[: 2 + finished])
-        )  # the header, the settings as they are
-        fp.tune(task, trials=20, folder=folder, **facts)
-        assert lines(folder.name) == lines("whole")
+    task = replace(task, cases=cases)
+    facts = {"trials": 2, "controllers": ["CTC"], "compiled": False, "folder": tmp_path}
+    row = tune(task, variants=CasesOf(("some",)), **facts).table.iloc[0]
+    rows = run_variants(task, CasesOf(("some",)), controllers=["CTC"], compiled=False)
+    assert row.cost_before == pytest.approx(rows.error.mean(), rel=1e-9)
 
 
 def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):
     with pytest.raises(InvalidProblem, match="no search space for controller 'CTC exact'"):
-        fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
+        tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
     with pytest.raises(InvalidProblem, match=r"add to its file, for example, tuning ="):
-        fp.tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
+        tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
     with pytest.raises(InvalidValue, match="trials 0: expected at least 1"):
-        fp.tune(task, trials=0, seed=0, folder=tmp_path)
+        tune(task, trials=0, seed=0, folder=tmp_path)
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(NotSupported, match=r"pip install 'fpirhc\[tune\]'"):
-        fp.tune(task, trials=1, seed=0, folder=tmp_path)
+        tune(task, trials=1, seed=0, folder=tmp_path)
 
 
 def test_a_search_space_that_is_missing_is_offered_for_a_controller_that_adapts(tmp_path):
@@ -197,10 +224,10 @@ def test_a_search_space_that_is_missing_is_offered_for_a_controller_that_adapts(
     with pytest.raises(
         InvalidProblem, match=r"tuning = \{'RHC\+FPI': \{'deformation\.gain': fpirhc\.LogSpan\(-6, -0\.2\)\}\}"
     ):
-        fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["RHC"])
-    alone = replace(task, controllers={"RHC": task.controllers["RHC"]}, headline=None)
-    with pytest.raises(InvalidProblem, match=r"tuning = \{'RHC': \{'tracking\.rate'"):
-        fp.tune(alone, trials=1, seed=0, folder=tmp_path)
+        tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
+    alone = replace(task, controllers={"RHC": task.controllers["RHC"]}, headline=None, tuning={})
+    with pytest.raises(InvalidProblem, match=r"tuning = \{'RHC': "):
+        tune(alone, trials=1, seed=0, folder=tmp_path)
 
 
 def test_settings_of_a_problem():
