@@ -253,7 +253,7 @@ OTHERS = {
         (
             "2 inputs (torque, brake) for 1 of the coordinates (angle): each input holds one",
             "leave an input out",
-            "docs/models.md",
+            "docs/plants.md",
         ),
     ),
     "controlled by one name": Wrong(
