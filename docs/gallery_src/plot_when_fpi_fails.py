@@ -105,7 +105,7 @@ except fp.FpirhcError as reason:
 [answer] = [
     a
     for a in fp.review(problem, {"good": good}, mismatch=0.0, seed=0).answers["good"]
-    if "gain admissible" in a.question
+    if a.key == "gain"
 ]
 print(textwrap.fill(f"{answer.verdict}: {answer.evidence}", 85))
 

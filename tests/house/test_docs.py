@@ -16,7 +16,7 @@ from fpirhc.cli import app
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.members import FAMILIES, member_classes
-from fpirhc.review.review import QUESTIONS
+from fpirhc.review.questions import QUESTIONS
 from fpirhc.simulation.loop import close_loop
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -70,8 +70,8 @@ def test_first_gain_is_the_one_that_review_recommends(page, tmp_path):
     (tmp_path / "first.py").write_text(text)
     task = fp.load_problem(str(tmp_path / "first.py"))
     review = fp.review(task.problem, {"it": task.controllers["RHC+FPI"]}, mismatch=0.0, seed=0)
-    [gain] = [a for a in review.answers["it"] if a.question == "Is the gain admissible?"]
-    assert gain.numbers["recommended, times the gain"] == 1
+    [gain] = [a for a in review.answers["it"] if a.key == "gain"]
+    assert gain.numbers["recommended_times"] == 1
     assert review.ready
 
 
