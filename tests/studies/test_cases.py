@@ -103,36 +103,6 @@ def test_cases_are_asked_for_by_name_and_group(task):
         matching(["havy"])
 
 
-# --- The figure -------------------------------------------------------------------------------------------------------
-
-
-def judged_by(task: Task, name: str) -> Task:
-    """The task with a figure that is better when larger, and one that is better when smaller."""
-    figures = (
-        fp.figures.Nadir("output.y" if task.problem.plant.outputs else "state.y"),
-        fp.figures.Total("true_error.y"),
-    )
-    return replace(task, metrics=[*task.metrics, *figures], headline_metric=name)
-
-
-def test_the_verdict_of_one_run_speaks_of_it_first(task):
-    """The sentence has both numbers, and its outcome is that of the metric's direction."""
-    task = judged_by(task, "nadir")
-    comparison = fp.compare(task, seed=0, compiled=False)
-    first = comparison.findings[0]
-    before, after = (e.metrics["nadir"][""] for e in comparison.entries)
-    assert first.pair == ("CTC", "CTC+FPI")
-    assert first.text.startswith("CTC+FPI ")
-    assert "nadir" in first.text
-    assert "larger is better" in first.text
-    better = (
-        {True: "better", False: "worse"}[after > before] if not 0.9 <= abs(after / before) <= 1.1 else "no difference"
-    )
-    assert first.outcome is not None
-    assert first.outcome.value == better
-    assert comparison.findings[1].text.startswith("CTC+FPI")
-
-
 # --- Wrong uses -------------------------------------------------------------------------------------------------------
 
 WRONG_CASES: dict[str, tuple[Any, str]] = {
