@@ -11,7 +11,6 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import described
 from fpirhc.plant.plant import Plant
 
 P = ParamSpec("P")
@@ -66,16 +65,6 @@ def require(good: bool, words: str) -> None:
     """
     if not good:
         raise InvalidProblem(words)
-
-
-def require_methods(where: str, value: object, methods: Iterable[str], example: str) -> None:
-    """Raise where an object of a package is something else.
-
-    Raises:
-        InvalidValue: it lacks a method.
-    """
-    if not all(callable(getattr(value, name, None)) for name in methods) or isinstance(value, type):
-        raise InvalidValue(f"{where}: expected an object such as {example}, got {described(value)}")
 
 
 def require_seconds(where: str, model: Plant) -> None:

@@ -1,4 +1,4 @@
-"""Libraries of C files: for this machine by its compiler, for others and for the web where ziglang is installed."""
+"""Libraries of C files: for this machine by its compiler, and for the web by ziglang."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,23 +17,32 @@ from fpirhc.symbolic.native import find_compiler
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
 _FLAGS = ("-std=c99", "-O2", "-s", "-ffp-contract=off")
 _SHARED = ("-shared", "-fvisibility=hidden")
-_ZIG = (sys.executable, "-m", "ziglang", "cc", "-target")
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 _SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
-ENDINGS = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
-PLATFORMS = {  # and the names that zig has for them
-    "x86_64-linux": "x86_64-linux-gnu.2.17",
-    "aarch64-linux": "aarch64-linux-gnu.2.17",
-    "x86_64-windows": "x86_64-windows-gnu",
-    "x86_64-darwin": "x86_64-macos",
-    "aarch64-darwin": "aarch64-macos",
-}
+_ENDINGS = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
 WEB_STACK = 262144  # bytes, which hold the deepest plan
 
 
-def shared_libraries(files: Mapping[str, str]) -> dict[str, bytes]:
-    """Return a shared library by platform, "x86_64-linux" and so on; nothing where there is no compiler."""
-    return {place: _compiled(files, command, place) for place, command in _compilers().items()}
+@dataclass(frozen=True)
+class Library:
+    """A shared library for this machine."""
+
+    platform: str  # "x86_64-linux" and so on
+    content: bytes
+
+    @property
+    def ending(self) -> str:
+        """The ending of its file's name."""
+        return _ENDINGS[self.platform.rpartition("-")[2]]
+
+
+def shared_library(files: Mapping[str, str]) -> Library | None:
+    """Return C files as a shared library; None where there is no compiler."""
+    own = find_compiler()
+    machine = platform.machine().lower()
+    here = f"{_MACHINES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
+    command = [own] if own else [sys.executable, "-m", "ziglang", "cc"] if find_spec("ziglang") else None
+    return None if command is None else Library(here, _compiled(files, [*command, *_SHARED], here))
 
 
 def web_module(files: Mapping[str, str]) -> bytes:
@@ -40,36 +50,7 @@ def web_module(files: Mapping[str, str]) -> bytes:
     package("ziglang", "compiler", "the target wasm")
     # zig's own 16 MB are all that a page would ask for.
     flags = ("-mexec-model=reactor", f"-Wl,-z,stack-size={WEB_STACK}", "-Wl,--no-entry")
-    return _compiled(files, [*_ZIG, "wasm32-wasi", *flags], "wasm32")
-
-
-def _done(command: Sequence[str], otherwise: str) -> str:
-    """Run a command and return what it complains of."""
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise CompileError(f"{otherwise}: '{command[0]}' cannot be started: {error.strerror}") from None
-    if done.returncode != 0:
-        raise CompileError(f"{otherwise}: {done.stderr.strip()[-2000:]}")
-    return done.stderr
-
-
-def _compilers() -> dict[str, list[str]]:
-    """The command of the compiler for each platform."""
-    commands = {}
-    if find_spec("ziglang") is not None:
-        # The plainest processor of each kind, for a library that goes to other machines.
-        for place, target in PLATFORMS.items():
-            commands[place] = [*_ZIG, target, "-mcpu=baseline", *_SHARED]
-    own = find_compiler()
-    if own is not None:
-        commands[_here()] = [own, *_SHARED]
-    return commands
-
-
-def _here() -> str:
-    machine = platform.machine().lower()
-    return f"{_MACHINES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
+    return _compiled(files, [sys.executable, "-m", "ziglang", "cc", "-target", "wasm32-wasi", *flags], "wasm32")
 
 
 def _compiled(files: Mapping[str, str], command: Sequence[str], place: str) -> bytes:
@@ -79,5 +60,11 @@ def _compiled(files: Mapping[str, str], command: Sequence[str], place: str) -> b
             (folder / file).write_text(text, encoding="utf-8")
         library, sources = folder / "library", [str(folder / file) for file in files if file.endswith(".c")]
         elsewhere = ("-fPIC", "-lm") if place.endswith(("linux", "darwin")) else ()
-        _done([*command, *_FLAGS, *sources, *elsewhere, "-o", str(library)], f"no library for {place}")
+        whole, otherwise = [*command, *_FLAGS, *sources, *elsewhere, "-o", str(library)], f"no library for {place}"
+        try:
+            done = subprocess.run(whole, capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise CompileError(f"{otherwise}: '{command[0]}' cannot be started: {error.strerror}") from None
+        if done.returncode != 0:
+            raise CompileError(f"{otherwise}: {done.stderr.strip()[-2000:]}")
         return library.read_bytes()

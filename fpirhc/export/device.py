@@ -54,14 +54,12 @@ class Device:
     """A controller for a device."""
 
     name: str  # prefix of everything in C
-    title: str  # of problem and controller
+    title: str  # of problem and controller, as a comment may have it
     problem: Problem  # of the controller
     controller: Controller  # as the problem file has it
     # of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit
     stepper: Stepper
     cycles: int  # number of cycles that are recorded for a replay
-    # "system" or "own": exp, log, pow, sin, cos, tanh and atanh of the machine, or those with the same bits everywhere
-    libm: str = "system"
 
     @cached_property
     def inputs(self) -> Layout:
@@ -172,6 +170,11 @@ def default_name(text: str) -> str:
     """Return a C name made of a text."""
     name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_").lower()[:_LONGEST].rstrip("_")
     return name if re.match(r"[a-z]", name) and name not in _C_WORDS | _FILES else f"c_{name}"[:_LONGEST].rstrip("_")
+
+
+def in_comment(text: str) -> str:
+    """Return a text of a problem file as a comment of C may have it: one line that neither ends the comment nor begins another."""
+    return " ".join(text.replace("*/", "* /").replace("/*", "/ *").split())
 
 
 def literal(value: float) -> str:

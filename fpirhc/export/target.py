@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest, not_writable
-from fpirhc.export.device import Device, check_name, default_name
+from fpirhc.export.device import Device, check_name, default_name, in_comment
 from fpirhc.members import within
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.task.problem import Problem
@@ -26,13 +26,11 @@ class Target:
         name: word after --to.
         summary: what comes out, in one line.
         files: function of a device that returns the contents of all files by name.
-        libm: whose exp, sin and the like it takes, unless told otherwise: "system" or "own".
     """
 
     name: str
     summary: str
     files: Callable[[Device], Mapping[str, str | bytes]]
-    libm: str = "system"
 
 
 @cache
@@ -57,13 +55,11 @@ def device_of(
     name: str | None = None,
     live: Sequence[str] = (),
     cycles: int = 2000,
-    libm: str = "system",
 ) -> Device:
     """Return a controller for a device.
 
     Args:
         name: prefix of everything in C; None: made of the title.
-        libm: "system", or "own" for the same bits on every machine.
     """
     whole = f"{problem.name} {title}"
     chosen = default_name(whole) if name is None else name
@@ -71,7 +67,7 @@ def device_of(
     try:
         # A solver without a bound of its time is refused below, for what it is.
         stepper = Stepper(problem, controller, live=live, bounded=False)
-        device = Device(chosen, whole, problem, controller, stepper, cycles, libm)
+        device = Device(chosen, in_comment(whole), problem, controller, stepper, cycles)
         _ = device.sources, device.bounds
     except NotSupported as error:
         raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import inspect
-import re
-from importlib import import_module
 
 import numpy as np
 import pytest
 from tank import TANK
 
 import fpirhc as fp
-from fpirhc.adapters.gymnasium import gymnasium_body
+from fpirhc.adapters.fmu import fmu_body
 from fpirhc.adapters.names import derivatives, finite_numbers, steps_per_cycle
 from fpirhc.adapters.rotorpy import rotorpy_body
 from fpirhc.adapters.tclab import tclab_body
@@ -25,8 +23,8 @@ def test_a_wrong_argument_of_an_adapter_is_named():
     for module in within("fpirhc.adapters"):
         functions = inspect.getmembers(module, inspect.isfunction)
         own = [(name, one) for name, one in functions if one.__module__ == module.__name__]
-        adapters += [one for name, one in own if name.endswith("_body") or name in ("arm", "plant_of", "as_env")]
-    assert len(adapters) == 7
+        adapters += [one for name, one in own if name.endswith("_body")]
+    assert len(adapters) == 5
     for adapter in adapters:
         parameters = list(inspect.signature(adapter).parameters.values())
         needed = [one for one in parameters if one.default is one.empty]
@@ -34,22 +32,6 @@ def test_a_wrong_argument_of_an_adapter_is_named():
         named = dict.fromkeys([*(one.name for one in needed), checked[0].name], task)
         with pytest.raises(InvalidField, match=rf"{adapter.__name__}\.{checked[0].name}: expected "):
             adapter(**named)
-
-
-@pytest.mark.parametrize(
-    ("use", "words"),
-    [
-        (
-            lambda: gymnasium_body("Pendulum-v1", TANK, measures={"h": 0}),
-            "gymnasium_body(env=...): expected an object such as gymnasium.make(\"Pendulum-v1\"), got the text 'Pendulum-v1'",
-        )
-        # type: ignore[arg-type]
-    ],
-)
-def test_a_wrong_object_or_address_is_told_at_once(use, words):
-    """Before a package is asked for, and not when a run begins."""
-    with pytest.raises(InvalidValue, match=re.escape(words)):
-        use()
 
 
 MINUTES = fp.Plant({"x": "m"}, {"u": "m/min^2"}, {}, lambda q, v, u, p: {"x": u.u}, time_unit="min")
@@ -79,10 +61,12 @@ def test_a_derivative_beyond_the_second_is_a_mistake():
         mistakes.raise_if_any()
 
 
-def test_what_a_package_raises_has_the_adapters_name():
-    message = "plant_of: TypeError: ss(sys): sys must be a StateSpace or TransferFunction"
-    with pytest.raises(InvalidProblem, match=re.escape(message)):
-        import_module("fpirhc.adapters.control").plant_of("1/(s+1)")
+def test_what_a_package_raises_has_the_adapters_name(tmp_path):
+    """What is no archive is told by the package in its own words, and a file that is not there by its name."""
+    (tmp_path / "no.fmu").write_text("nothing")
+    for name, words in (("no.fmu", "fmu_body: BadZipFile: File is not a zip file"), ("absent.fmu", "cannot be read")):
+        with pytest.raises(InvalidProblem, match=words):
+            fmu_body(str(tmp_path / name), TANK, period=0.1, measures={"h": "h"})
 
 
 @pytest.mark.parametrize("given", [np.zeros(3), "up", [1.0, np.nan], None, [[1.0, 2.0]]])

@@ -135,8 +135,8 @@ def contraction(loop: LabLoop, run: fp.Run, variant: Any) -> np.ndarray:
     return factors_along(len(rows), lambda at: jacobians[at], float(str(run.settings["effective_gain"])))
 
 
-def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_states_them(tmp_path):
-    """A larger reference, dead time of an input that has none, two set-points of one coordinate: 1e-12 of the largest number."""
+def test_reference_and_set_points_have_the_numbers_of_a_task_that_states_them(tmp_path):
+    """A larger reference, and two set-points of one coordinate: 1e-12 of the largest number."""
     pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
@@ -153,14 +153,11 @@ def test_reference_dead_time_and_set_points_have_the_numbers_of_a_task_that_stat
     problem = replace(task.problem, duration=0.6, measure_from=0.0, reference=reference)
     lab = make_lab("two_mass", "", "two_mass", problem, {name: task.controllers[name]})
     paths = {s.path: s for s in lab.sliders}
-    wait, first, second = paths["dead_time.inputs.Q1"], paths["setpoints.q1.0"], paths["setpoints.q1.1"]
-    assert (wait.value, wait.low, wait.unit, first.unit) == (0.0, 0.0, "s", "m")
-    assert wait.high == pytest.approx(5 * problem.period, rel=1e-5)
+    first, second = paths["setpoints.q1.0"], paths["setpoints.q1.1"]
+    assert first.unit == "m"
     assert [(r.first, r.last) for r in first.rows + second.rows] == [(0, 300), (300, 600)]
-    moved = {wait.path: 2.5 * problem.period, first.path: 0.15, second.path: 0.05}
-    said = answers(lab, moved, tmp_path)[0]
-    late = replace(problem, dead_time=fp.DeadTime(inputs={"Q1": 2.5 * problem.period}))
-    run = fp.simulate(late, task.controllers[name], seed=0, setpoints={"q1": [(0.0, 0.15), (0.3, 0.05)]})
+    said = answers(lab, {first.path: 0.15, second.path: 0.05}, tmp_path)[0]
+    run = fp.simulate(problem, task.controllers[name], seed=0, setpoints={"q1": [(0.0, 0.15), (0.3, 0.05)]})
     for column, values in zip(lab.loops[0].shown, said["columns"], strict=True):
         wanted = np.ravel(run[column])
         assert np.abs(np.array(values) - wanted).max() <= 1e-12 * max(1.0, np.abs(wanted).max()), column

@@ -46,11 +46,11 @@ def samples(of: str, title: str) -> np.ndarray:
     return np.resize(np.hstack(parts), (CYCLES, sum(part.shape[1] for part in parts)))
 
 
-def device(name: str, *, live: bool = True, bare: bool = False) -> Device:
+def device(name: str, *, live: bool = True) -> Device:
     of, title, paths = CASES[name]
     task = fp.load_problem(of)
     given = paths if live else ()
-    return device_of(task.problem, task.controllers[title], title, name="arm", live=given, cycles=1, bare=bare)
+    return device_of(task.problem, task.controllers[title], title, name="arm", live=given, cycles=1)
 
 
 def random_rows(name: str, device: Device, random: np.random.Generator, bad: Sequence[float]) -> np.ndarray:
@@ -184,29 +184,13 @@ def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, 
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", CASES)
-def test_bare_instances_answer_as_the_bare_step(name, seed, tmp_path):
-    """Without gate: samples without faults, and the bits of the controller's own step."""
-    random = np.random.default_rng(seed)
-    one = device(name, live=False, bare=True)
-    library = Library(one, tmp_path / "c")
-    rows = [random_rows(name, one, random, ()) for _ in range(INSTANCES)]
-    wanted = [[answer for _, answer in stepped(one, own, {})] for own in rows]
-    instances, at = [library.begun() for _ in range(INSTANCES)], [0] * INSTANCES
-    for j in random.permutation(np.repeat(np.arange(INSTANCES), CYCLES)):
-        assert library.cycle(instances[j], rows[j][at[j]]) == wanted[j][at[j]]
-        at[j] += 1
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("bare", [False, True], ids=["gated", "bare"])
 @pytest.mark.parametrize("name", slow_but(CASES, "outputs", "torque"))
-def test_a_float_export_is_near_the_double_one(name, bare, seed, tmp_path):
+def test_a_float_export_is_near_the_double_one(name, seed, tmp_path):
     """A thousandth of the largest command; what is no number is a bad sample in both, and nothing stays behind it."""
     random = np.random.default_rng(seed)
-    one = device(name, live=False, bare=bare)
+    one = device(name, live=False)
     single, double = Library(one, tmp_path / "float", "float"), Library(one, tmp_path / "double")
-    rows = random_rows(name, one, random, () if bare else (np.nan, np.inf, -np.inf))
+    rows = random_rows(name, one, random, (np.nan, np.inf, -np.inf))
     answers = [
         np.array([library.cycle(instance, row) for row in rows])
         for library, instance in ((single, single.begun()), (double, double.begun()))
@@ -214,6 +198,6 @@ def test_a_float_export_is_near_the_double_one(name, bare, seed, tmp_path):
     assert np.isfinite(answers[0]).all()
     bad = [part[:, 0] == int(Status.BAD_SAMPLE) for part in answers]
     np.testing.assert_array_equal(*bad)
-    assert bad[0].any() != bare
+    assert bad[0].any()
     largest = np.abs(answers[1][:, 1:]).max()
     np.testing.assert_allclose(answers[0][:, 1:], answers[1][:, 1:], rtol=0, atol=1e-3 * largest)

@@ -1,10 +1,14 @@
-"""Controllers as mock-up units: valid by FMPy, equal to the stepper and to a run, and strict about what a master may do."""
+"""Controllers as units of FMI 2.0: valid by FMPy, equal to the stepper and to a run, and strict about what a master may do."""
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 import fpirhc as fp
@@ -12,7 +16,13 @@ from fpirhc.errors import NotSupported
 from fpirhc.export import binaries
 from fpirhc.export.device import Device
 from fpirhc.export.target import device_of, target_called, write
+from fpirhc.symbolic.native import find_compiler
 
+REASON = "FMPy is not installed: pip install 'fpirhc[fmu]'"
+fmpy: Any = pytest.importorskip("fmpy", reason=REASON)
+fmi1 = pytest.importorskip("fmpy.fmi1", reason=REASON)
+validation = pytest.importorskip("fmpy.validation", reason=REASON)
+needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "limits.inputs.Q1")),
     "plan": ("two_mass", "RHC+FPI", ()),
@@ -21,52 +31,193 @@ CASES = {
 }
 
 
-@pytest.fixture(autouse=True)
-def only_this_machine(monkeypatch):
-    """Libraries for other platforms take half a minute the first time; one test asks for them."""
-    monkeypatch.setattr(binaries, "find_spec", lambda _: None)
-
-
-def exported(name: str, folder: Path, target: str) -> tuple[Device, Path]:
+def exported(name: str, folder: Path) -> tuple[Device, Path]:
     of, title, live = CASES[name]
     task = fp.load_problem(of)
     device = device_of(task.problem, task.controllers[title], title, name="unit", live=live, cycles=1)
-    write(device, target_called(target), folder)
+    write(device, target_called("fmu2"), folder)
     return device, folder / "unit.fmu"
+
+
+class Master:
+    """A unit that is called by names."""
+
+    def __init__(self, path: Path) -> None:
+        described = fmpy.read_model_description(str(path))
+        self.unit: Any = fmpy.instantiate_fmu(fmpy.extract(str(path)), described, fmi_type="CoSimulation")
+        self.variables = {v.name: v for v in described.modelVariables}
+        self.inputs, self.outputs = (
+            [n for n, v in self.variables.items() if v.causality == causality and v.type == "Real"]
+            for causality in ("input", "output")
+        )
+        self.begin()
+
+    def begin(self, time: float = 0.0) -> None:
+        self.unit.setupExperiment(startTime=time)
+        self.unit.enterInitializationMode()
+        self.unit.exitInitializationMode()
+
+    def set(self, names: list[str], values: np.ndarray) -> None:
+        self.unit.setReal(self._references(names), np.asarray(values, dtype=float).tolist())
+
+    def get(self, names: list[str]) -> list[float]:
+        return list(self.unit.getReal(self._references(names)))
+
+    def status(self) -> int:
+        return int(self.unit.getInteger(self._references(["status"]))[0])
+
+    def step(self, time: float, period: float) -> None:
+        self.unit.doStep(currentCommunicationPoint=time, communicationStepSize=period)
+
+    def _references(self, names: list[str]) -> list[int]:
+        return [self.variables[n].valueReference for n in names]
+
+
+@contextmanager
+def master(path: Path) -> Iterator[Master]:
+    one = Master(path)
+    try:
+        yield one
+    finally:
+        one.unit.terminate()
+        one.unit.freeInstance()
+
+
+def samples_of(device: Device) -> np.ndarray:
+    """What the step is given in a run, without the time."""
+    run = fp.simulate(device.problem, device.controller, seed=0)
+    return np.hstack([np.reshape(run[n], (len(run.time), -1)) for n in device.inputs.names[1:]])
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", CASES)
+def test_a_unit_is_valid_and_its_commands_are_those_of_the_stepper_bit_by_bit(name, tmp_path):
+    """FMPy finds nothing wrong, and 300 samples of a run give the commands and statuses that the stepper gives."""
+    device, path = exported(name, tmp_path)
+    assert validation.validate_fmu(str(path)) == []
+    period, samples, memory = device.problem.period, samples_of(device), device.stepper.start()
+    with master(path) as unit:
+        for k, row in enumerate(samples[:300]):
+            unit.set(unit.inputs, row)
+            command, memory = device.stepper.step_measured(k * period, row, memory)
+            assert unit.get(unit.outputs) == command.tolist(), k
+            assert unit.get(["trace.status"])[0] == unit.status() == device.stepper.trace()["status"]
+            unit.step(k * period, period)
+
+
+@needs_compiler
+def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_where_they_do_not(tmp_path):
+    """A master that exchanges after each step alone is a dead time of one period: newtons off, and told on the page."""
+    device, path = exported("plan", tmp_path)
+    problem, run = device.problem, fp.simulate(device.problem, device.controller, seed=0)
+    plant, advance = problem.plant, problem.integrator.step(problem.plant, problem.period)
+    apart = []
+    for late in (False, True):
+        state, realised, worst = run["state"][0], run["realised"][0], 0.0
+        held = np.asarray(problem.inputs_before, dtype=float)
+        with master(path) as unit:
+            for k in range(500):
+                unit.set(unit.inputs, np.concatenate([state, realised]))
+                new = np.array(unit.get(unit.outputs))
+                command, held = (held, new) if late else (new, new)
+                worst = max(worst, np.abs(command - run["command"][k]).max())
+                unit.step(k * problem.period, problem.period)
+                state = advance(state, command, plant.exact, np.zeros(advance.numel_in(3))).full().ravel()
+                realised = plant.equations.response(state, command, plant.exact).full().ravel()
+        apart.append(worst)
+    assert apart[0] < 1e-11
+    assert apart[1] > 1.0
+    assert "every command one period late" in (tmp_path / "README.md").read_text()
+
+
+@needs_compiler
+def test_what_a_master_may_not_do(tmp_path):
+    """Wrong settings, other steps, steps that begin elsewhere, numbers that are computed: refused, and the unit stays as it was."""
+    device, path = exported("torque", tmp_path)
+    period, gain = device.problem.period, "setting.deformation.gain"
+    with master(path) as unit:
+        start = unit.get([gain])[0]
+        assert (unit.variables[gain].min, unit.variables[gain].max) == tuple(
+            None if np.isinf(e) else repr(e) for e in device.bounds["deformation.gain"]
+        )
+        for wrong in (np.nan, np.inf, 3.0):
+            with pytest.raises(fmi1.FMICallException):
+                unit.set([gain], np.array([wrong]))
+            assert unit.get([gain])[0] == start
+        unit.set([gain], np.array([start / 2]))
+        assert unit.get([gain])[0] == start / 2
+        for name in ("command.Q1", "trace.clipped", "time"):
+            with pytest.raises(fmi1.FMICallException):
+                unit.set([name], np.zeros(1))
+        for point, step in ((0.0, 2 * period), (0.0, 0.5 * period), (0.0, np.nan), (period, period), (np.nan, period)):
+            with pytest.raises(fmi1.FMICallException):
+                unit.step(point, step)
+        assert unit.get(["time"])[0] == 0.0
+        for k in range(3):
+            unit.step(k * period, period)
+        with pytest.raises(fmi1.FMICallException):
+            unit.step(0.0, period)  # again, which only a state that is set back allows
+        assert unit.get(["time"])[0] == 3 * period
+
+
+@needs_compiler
+def test_a_state_that_is_kept_comes_back_and_a_reset_begins_anew(tmp_path):
+    """The same samples after both give the same commands; another unit beside it does not notice."""
+    device, path = exported("plan", tmp_path)
+    period, samples = device.problem.period, samples_of(device)
+    with master(path) as unit, master(path) as other:
+
+        def cycles(first: int, last: int) -> list[list[float]]:
+            said = []
+            for k in range(first, last):
+                unit.set(unit.inputs, samples[k])
+                said.append(unit.get(unit.outputs))
+                unit.step(k * period, period)
+            return said
+
+        before = cycles(0, 20)
+        kept = unit.unit.getFMUState()
+        after = cycles(20, 40)
+        unit.unit.setFMUState(kept)
+        assert cycles(20, 40) == after
+        unit.unit.freeFMUState(kept)
+        other.set(other.inputs, samples[0])
+        assert other.get(other.outputs) == before[0]
+        unit.unit.reset()
+        unit.begin()
+        assert cycles(0, 20) == before
+
+
+@needs_compiler
+def test_what_is_read_before_the_start_is_not_the_command_of_the_start(tmp_path):
+    """The reference is another one at t = 5 s."""
+    said = []
+    with master(exported("torque", tmp_path)[1]) as unit:
+        for early in (True, False):
+            unit.unit.reset()
+            if early:
+                unit.get(unit.outputs)
+            unit.begin(5.0)
+            said.append(unit.get(unit.outputs))
+    assert said[0] == said[1]
 
 
 def test_without_a_compiler_a_unit_holds_its_sources_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(binaries, "find_compiler", lambda: None)
-    exported("torque", tmp_path, "fmu")
-    names = zipfile.ZipFile(tmp_path / "unit.fmu").namelist()
+    monkeypatch.setattr(binaries, "find_spec", lambda _: None)
+    _, path = exported("torque", tmp_path)
+    names = set(zipfile.ZipFile(path).namelist())
     assert not [name for name in names if name.startswith("binaries/")]
-    assert {"sources/buildDescription.xml", "sources/unit.c", "sources/unit_fmu.c", "sources/fmi3Functions.h"} <= {
-        *names
-    }
+    assert {"modelDescription.xml", "sources/unit.c", "sources/unit_fmu.c", "sources/fmi2Functions.h"} <= names
     assert "none: no compiler was found" in (tmp_path / "README.md").read_text()
 
 
 def test_the_same_controller_gives_the_same_archive(tmp_path):
-    _, first = exported("torque", tmp_path / "a", "fmu2")
-    _, second = exported("torque", tmp_path / "b", "fmu2")
-    assert first.read_bytes() == second.read_bytes()
+    first, second = (exported("torque", tmp_path / name)[1].read_bytes() for name in "ab")
+    assert first == second
 
 
 def test_without_fmpy_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "fmpy", None)
-    with pytest.raises(NotSupported, match=r"the target fmu needs fmpy.*fpirhc\[fmu\]"):
-        exported("torque", tmp_path, "fmu")
-
-
-@pytest.mark.slow
-def test_one_archive_serves_five_platforms(tmp_path, monkeypatch):
-    """By zig: libraries whose first bytes are those of Linux, Windows and macOS."""
-    pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
-    monkeypatch.undo()
-    _, path = exported("torque", tmp_path, "fmu")
-    archive = zipfile.ZipFile(path)
-    first = {"linux": b"\x7fELF", "windows": b"MZ", "darwin": b"\xcf\xfa\xed\xfe"}
-    libraries = {name.split("/")[1]: archive.read(name)[:4] for name in archive.namelist() if "binaries/" in name}
-    assert set(libraries) == set(binaries.PLATFORMS)
-    for platform, head in libraries.items():
-        assert head.startswith(first[platform.partition("-")[2]])
+    with pytest.raises(NotSupported, match=r"the target fmu2 needs fmpy.*fpirhc\[fmu\]"):
+        exported("torque", tmp_path)

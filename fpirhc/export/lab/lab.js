@@ -156,19 +156,15 @@ function remember() {
   // Each loop as it was built for this page, and a run of it with other numbers; a controller that is built with them has another first
   // plan. A change of a device leaves the plan.
   const texts = DATA.loops.map((loop) => {
-    const own = settings.filter(([p]) => loop.live.includes(p)), late = own.some(([p]) => p.startsWith("dead_time.inputs."));
-    const times = ["inputs", "longest"].map((key) => `${key}=${listed(Object.entries(loop.late[key]))}`).join(", ");
-    const problem = late ? `problem = replace(task.problem, dead_time=replace(task.problem.dead_time, ${times}))` : "problem = task.problem";
-    const built = `problem, task.controllers[${JSON.stringify(loop.name)}]`;
-    if (!numbers.length && !own.length) return [problem, `print(fp.simulate(${built}, seed=0${aimed}))`];
+    const own = settings.filter(([p]) => loop.live.includes(p));
+    const built = `task.problem, task.controllers[${JSON.stringify(loop.name)}]`;
+    if (!numbers.length && !own.length) return [`print(fp.simulate(${built}, seed=0${aimed}))`];
     const live = own.length ? `, live=${JSON.stringify(own.map(([p]) => p))}` : "";
-    const variant = numbers.length ? `, variant=fp.with_settings(problem, ${listed(numbers)})` : "";
+    const variant = numbers.length ? `, variant=fp.with_settings(task.problem, ${listed(numbers)})` : "";
     const given = own.length ? `, changes={0.0: ${listed(own)}}, deployed=True` : "";
-    return [problem, `loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}${aimed}))`];
+    return [`loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}${aimed}))`];
   });
-  const all = texts.flatMap((own, k) => (k && own[0] === texts[k - 1][0] ? own.slice(1) : own));
-  const lines = ["import fpirhc as fp", ...(all.some((one) => one.includes("replace(")) ? ["from dataclasses import replace"] : []), "",
-    `task = fp.load_problem(${JSON.stringify(DATA.file)})`, ...all];
+  const lines = ["import fpirhc as fp", "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, ...texts.flat()];
   say("python", lines.join("\n"));
 }
 

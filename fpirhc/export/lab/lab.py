@@ -13,7 +13,7 @@ import hashlib
 import html
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +43,6 @@ from fpirhc.task.reference import pairs
 from fpirhc.whole_file import write_whole
 
 _SPAN = 4.0  # a slider goes from a fourth to four times its number
-_WAIT = 5  # cycles of dead time that an input without any may get
 _RANDOM = ("sensing", "disturbances")  # parts of a problem with random series
 _SETTINGS = ("gain", "rate")  # sliders where nobody asks for others, beside the limits of inputs
 _OF_REFERENCE = ("scale", "rate")  # and these of the reference
@@ -121,7 +120,7 @@ def make_lab(
 
     Args:
         problem: the task; its equations run in the page, so a reality outside cannot.
-        live: paths of settings with a slider; none: gains, rates, limits of inputs, dead times, and numbers of the reference.
+        live: paths of settings with a slider; none: gains, rates, limits of inputs, and numbers of the reference.
         pictures: of the problem; the first `Planar` moves with the loops.
     """
     problem.require_equations(
@@ -131,9 +130,7 @@ def make_lab(
     loops, without = [], dict[str, str]()
     for name, controller in controllers.items():
         warn_of_harm(problem, controller)
-        roomy = _with_room(problem, controller)
-        wanted = list(live) or _usual(roomy, controller)
-        ready = _with_live(roomy, controller, wanted, without)
+        ready = _with_live(problem, controller, list(live) or _usual(problem, controller), without)
         loops.append(LabLoop(name, ready, _mechanism(ready, pictures, without)))
     lost = [path for path in live if not any(loop.opens(path) for loop in loops)]
     if lost:
@@ -165,28 +162,13 @@ def _mechanism(ready: Simulator, pictures: Sequence[Picture], without: dict[str,
 
 
 def _usual(problem: Problem, controller: Controller) -> list[str]:
-    """Gains and rates of a controller, the limits of inputs that are finite, dead times, and the numbers of the reference."""
+    """Gains and rates of a controller, the limits of inputs that are finite, and the numbers of the reference."""
     own = [path for name in _SETTINGS for path in paths_to(name, controller) if not path.startswith("optimiser.")]
     return [
         *own,
         *(f"reference.{path}" for name in _OF_REFERENCE for path in paths_to(name, problem.reference)),
         *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()),
-        *(f"dead_time.inputs.{name}" for name in problem.dead_time.inputs),
-        *(["dead_time.measurement"] if problem.dead_time.measurement else []),
     ]
-
-
-def _with_room(problem: Problem, controller: Controller) -> Problem:
-    """The problem with a queue for every input, where the controller can have one: its dead time is then a number in the memory."""
-    late = problem.dead_time
-    rooms = {name: _WAIT * problem.period for name in problem.plant.inputs if name not in late.queued}
-    inputs = {**dict.fromkeys(rooms, 0.0), **late.inputs}
-    roomy = replace(problem, dead_time=replace(late, inputs=inputs, longest={**late.longest, **rooms}))
-    try:
-        simulator(roomy, controller, compiled=False)
-    except FpirhcError:
-        return problem
-    return roomy
 
 
 def _with_live(problem: Problem, controller: Controller, wanted: list[str], without: dict[str, str]) -> Simulator:
@@ -282,18 +264,14 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
     for path in dict.fromkeys(path for loop in loops for path in loop.ready.live.paths):
         having = [loop for loop in loops if path in loop.ready.live.paths]
         value = having[0].ready.live.start[path]
-        size = max(abs(value), 1e-3)
-        farthest = max(_SPAN * size, _WAIT * having[0].ready.problem.period)  # no slider goes beyond
-        bounds = []
+        size, bounds = max(abs(value), 1e-3), []
         for live in (loop.ready.live for loop in having):
             own = abs(live.start[path])  # a loop may begin with another number
-            bounds.append(live.bounds(path, (farthest + own) / max(own, 1e-3)))
+            bounds.append(live.bounds(path, (_SPAN * size + own) / max(own, 1e-3)))
         low, high = max(low for low, _ in bounds), min(high for _, high in bounds)
         low, high = (
             max(low, value / _SPAN if low > 0 else min(value / _SPAN, value * _SPAN, value - size)),
-            min(high, max(value / _SPAN, value * _SPAN))
-            if value
-            else min(high, max(size, _WAIT * having[0].ready.problem.period)),
+            min(high, max(value / _SPAN, value * _SPAN) if value else size),
         )
         step = value + 1e-4 * ((high - value) or (low - value))
         if step == value:
@@ -406,7 +384,6 @@ def _own(name: str) -> str:
 
 
 def _loop_data(loop: LabLoop) -> dict[str, Any]:
-    late = loop.ready.problem.dead_time
     return {
         "name": loop.name,
         "module": base64.b64encode(loop.module).decode(),
@@ -417,7 +394,6 @@ def _loop_data(loop: LabLoop) -> dict[str, Any]:
         "shown": len(loop.shown),
         "errors": len(loop.ready.loop.trace[loop.error].columns),
         "live": list(loop.ready.live.paths),
-        "late": {"inputs": dict(late.inputs), "longest": dict(late.longest)},
         "frame": loop.frame,
         "shapes": loop.shapes,
         "responses": loop.factor.size1_out(0) if loop.factor else 0,

@@ -12,7 +12,7 @@ from fpirhc.contraction.spectrum import response_jacobian
 from fpirhc.errors import FpirhcError
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of, literal
-from fpirhc.export.targets.c import template, with_own_math
+from fpirhc.export.targets.c import template
 from fpirhc.simulation.changes import patch
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.pictures.planar import Planar
@@ -119,7 +119,7 @@ class LabLoop:
                 __package__,
             )
         files["lab_run.c"] = template("loop.c", words, __package__)
-        return web_module(with_own_math(files, "lab"))
+        return web_module(files)
 
     @property
     def every(self) -> int:

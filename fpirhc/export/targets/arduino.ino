@@ -1,4 +1,4 @@
-/* @title@ on an Arduino: one step per period; `longest` has the microseconds of the longest step. Write the two functions. */
+/* @title@ on an Arduino: one step per period; the longest step so far is told beside the period. Write the two functions. */
 
 #include <@name@.h>
 
@@ -14,6 +14,7 @@ void read_sample(@name@_inputs* in) { (void)in; }           /* all but the time 
 void write_command(const @name@_command* out) { (void)out; }
 
 void setup() {
+  Serial.begin(115200);
   @name@_init(&controller);
   due = micros();
 }
@@ -31,5 +32,11 @@ void loop() {
   @name@_step(&controller, &in, &out);
   write_command(&out);
   took = micros() - begun;
-  if (took > longest) longest = took;
+  if (took > longest) {
+    longest = took;
+    Serial.print("longest step, us: ");
+    Serial.print(longest);
+    Serial.print(longest > TICKS ? ", TOO LONG for a period of " : ", of a period of ");
+    Serial.println(TICKS);
+  }
 }

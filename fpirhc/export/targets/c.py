@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.controllers.gate import HELD
 from fpirhc.errors import InvalidValue
-from fpirhc.export.device import Device, identifiers, literal
+from fpirhc.export.device import Device, identifiers, in_comment, literal
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
 from fpirhc.plant.motion import SECONDS
@@ -42,17 +42,7 @@ def sources(device: Device) -> dict[str, str]:
     name = device.name
     before = f"/* {device.title}. Made by fpirhc from its symbolic step. */\n"
     steps = {f"{name}_step{k or ''}.c": before + body for k, body in enumerate(device.sources)}
-    files = {f"{name}.h": _header(device), f"{name}.c": _controller(device), **steps}
-    if device.libm == "system":
-        return files
-    return with_own_math(files, name)
-
-
-def with_own_math(files: Mapping[str, str], name: str) -> dict[str, str]:
-    """Return C files that call the project's own exp, log and the like, and the files of these, which begin with the name."""
-    own = {file: text.replace("#include <math.h>", f'#include "{name}_math.h"') for file, text in files.items()}
-    words = {"name": name, "NAME": name.upper()}
-    return {**own, **{f"{name}_{file}": template(file, words) for file in ("math.h", "math.c")}}
+    return {f"{name}.h": _header(device), f"{name}.c": _controller(device), **steps}
 
 
 def _files(device: Device) -> Mapping[str, str | bytes]:
@@ -117,7 +107,7 @@ def _header(device: Device) -> str:
         'extern "C" {',
         "#endif",
         "",
-        f"#define {upper}_PERIOD {float(device.problem.period)!r} /* {device.problem.plant.time_unit} */",
+        f"#define {upper}_PERIOD {float(device.problem.period)!r} /* {in_comment(device.problem.plant.time_unit)} */",
         f"/* Cycles from time 0 on, beyond which a time in float no longer tells its cycle: {name}_reset, and time 0, before. */",
         f"#define {upper}_CYCLES (sizeof(casadi_real) == sizeof(float) ? {IN_FLOAT}UL : 4294967294UL)",
         *[f"#define {upper}_{key} {value} /* numbers */" for key, value in counts.items()],
@@ -175,7 +165,7 @@ def _struct(name: str, layout: Layout) -> str:
     names = identifiers([s.name.removeprefix(PREFIX) for s in signals])
     alone = len(signals) == 1 and bool(signals[0].elements)
     for own, signal in zip(names, signals, strict=True):
-        each = [unit or "as in the problem file" for unit in signal.entry_units]
+        each = [in_comment(unit) or "as in the problem file" for unit in signal.entry_units]
         units = ", ".join(dict.fromkeys(each))
         entries = identifiers(signal.elements)
         if not entries:

@@ -1,48 +1,255 @@
-"""A mock-up unit of FMI 2.0 for co-simulation, which most tools import."""
+"""A mock-up unit of FMI 2.0 for co-simulation: variables, the archive, and how a controller answers a master.
+
+A command is computed from the inputs of its own cycle when it is read (feed-through). A master that exchanges values
+after each step alone delays the command by one period, as a dead time of the plant would.
+"""
 
 from __future__ import annotations
 
+import io
+import re
+import uuid
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-from fpirhc.export.mock_up_unit import STATUS, Interface, Variable, mock_up_unit
+import numpy as np
+
+from fpirhc.errors import package
+from fpirhc.export.binaries import shared_library
+from fpirhc.export.device import Device
 from fpirhc.export.target import Target
+from fpirhc.export.targets.c import data_of, filled, sources
+from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.live import PREFIX
 
 
-def _step(_: str) -> Mapping[str, str]:
-    return {"canGetAndSetFMUstate": "true"}
+@dataclass(frozen=True)
+class Variable:
+    """A number that a master sees.
+
+    Args:
+        name: with derivatives as der(name, n), as FMI spells them.
+        unit: empty where there is none.
+        causality: by which FMI says who writes it.
+        variability: by which FMI says when it changes.
+        start: value at the beginning; None where it is computed.
+        bounds: ends of the interval that is taken; infinite where there is none.
+    """
+
+    name: str
+    unit: str
+    causality: str
+    variability: str = "discrete"
+    start: float | None = None
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+
+    def attributes(self, number: int) -> dict[str, str]:
+        """Return name, reference, and by whom and when the number is changed."""
+        own = {"causality": self.causality, "variability": self.variability}
+        return {"name": self.name, "valueReference": str(number), **own}
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The attributes of XML that every number has."""
+        ends = {key: end for key, end in zip(("min", "max"), self.bounds, strict=True) if np.isfinite(end)}
+        numbers = ends if self.start is None else {**ends, "start": self.start}
+        return {**({"unit": self.unit} if self.unit else {}), **{key: repr(float(v)) for key, v in numbers.items()}}
 
 
-def _add(listed: ET.Element, number: int, one: Variable) -> None:
-    scalar = ET.SubElement(listed, "ScalarVariable", one.attributes(number))
-    ET.SubElement(scalar, "Integer" if one is STATUS else "Real", one.facts)
+STATUS = Variable("status", "", "output")  # a whole number
+_HEADERS = ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h")
+_FOLDERS = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}  # of libraries
 
 
-def _structure(root: ET.Element, computed: list[int]) -> None:
-    for tag in ("Outputs", "InitialUnknowns"):
-        unknowns = ET.SubElement(root, tag)
-        for number in computed:
-            ET.SubElement(unknowns, "Unknown", index=str(number + 1))
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    folder = Path(package("fmpy", "fmu", "the target fmu2").__file__).parent / "c-code"
+    headers = {name: (folder / name).read_text(encoding="utf-8") for name in _HEADERS}
+    variables, own = _variables(device), sources(device)
+    text = filled(device, "fmi2.c", **_words(device))
+    token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, ''.join([text, *own.values()]))}}}"
+    unit = f'#define TOKEN "{token}"\n\n{text}\n{_unused(text, "".join(headers.values()))}'
+    files = {**own, f"{device.name}_fmu.c": unit}
+    described = _described(device, token, variables, [name for name in files if name.endswith(".c")])
+    contents: dict[str, str | bytes] = {"modelDescription.xml": described}
+    contents |= {f"sources/{name}": text for name, text in {**files, **headers}.items()}
+    library = shared_library({**files, **headers})
+    if library and library.platform in _FOLDERS:
+        contents[f"binaries/{_FOLDERS[library.platform]}/{device.name}{library.ending}"] = library.content
+    return {
+        f"{device.name}.fmu": _archive(contents),
+        "README.md": _page(device, variables, contents),
+        "sizes.txt": _sizes(device, contents),
+    }
 
 
-def _build(described: ET.Element, _: str, files: list[str]) -> Mapping[str, ET.Element]:
-    unit = described.find("CoSimulation")
-    assert unit is not None
+TARGET = Target("fmu2", "FMI 2.0 unit for co-simulation", _files)
+
+
+def _sizes(device: Device, contents: Mapping[str, str | bytes]) -> str:
+    """Bytes of each library, those of the struct of unit.c that every instance allocates on 64 bits, and code and stack here."""
+    work, stepper = device.sizes, device.stepper
+    data = sum(layout.size for layout in data_of(device).values())
+    numbers = 3 * stepper.memory.size + stepper.signals.size + data + work["w"] + device.inputs.size
+    words = numbers + stepper.signals["command"].size + work["arg"] + work["res"] + work["iw"] + 3
+    libraries = {name: len(data) for name, data in contents.items() if name.startswith("binaries/")}
+    lines = [f"{name}: {size} bytes\n" for name, size in libraries.items()]
+    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n"])
+
+
+# Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest
+
+
+def _variables(device: Device) -> list[Variable]:
+    """The numbers in the order of their references; `_words` counts in the same order."""
+    stepper = device.stepper
+    listed = [Variable("time", device.problem.plant.time_unit, "independent", "continuous")]
+    listed += _numbers(device.inputs, "input")[1:]
+    for part, layout in data_of(device).items():
+        if part == "parameters":
+            listed += _numbers(layout, "parameter", "tunable")
+        elif part != "settings":
+            listed += _numbers(layout, "input")
+    listed += [replace(one, start=None) for one in _numbers(Layout((stepper.signals["command"],)), "output")]
+    listed.append(STATUS)
+    for path, ends in device.bounds.items():
+        unit = device.settings[PREFIX + path].entry_units[0]
+        listed.append(Variable(_structured(PREFIX + path), unit, "parameter", "tunable", stepper.numbers[path], ends))
+    trace = zip(stepper.signals.columns, stepper.signals.units, strict=True)
+    return listed + [Variable(_structured(f"trace.{name}"), unit, "local") for name, unit in trace]
+
+
+def _numbers(layout: Layout, causality: str, variability: str = "discrete") -> list[Variable]:
+    rows = zip(layout.columns, layout.units, layout.start().tolist(), strict=True)
+    return [Variable(_structured(name), unit, causality, variability, start) for name, unit, start in rows]
+
+
+def _structured(name: str) -> str:
+    """The structured name of FMI: q1'' is der(q1,2), and the end 0 of an interval Q1 is Q1[0]."""
+    base = name.rstrip("'")
+    order = len(name) - len(base)
+    parts = [part if re.fullmatch(r"[A-Za-z_]\w*|\d+", part, re.ASCII) else f"'{part}'" for part in base.split(".")]
+    text = re.sub(r"\.(\d+)(?=\.|$)", r"[\1]", ".".join(parts))
+    return text if not order else f"der({text})" if order == 1 else f"der({text},{order})"
+
+
+def _words(device: Device) -> dict[str, str]:
+    """Where the shared functions find a number, by its reference; references count the variables in their order."""
+    data = {part: layout for part, layout in data_of(device).items() if part != "settings"}
+    rows, at = [], 1
+    for place, size in [
+        ("&s->in + 1", device.inputs.size - 1),
+        *((f"&s->c.{part}", one.size) for part, one in data.items()),
+    ]:
+        rows.append(f"  if (r >= {at} && r < {at + size}) return (casadi_real*){place} + (r - {at});")
+        at += size
+    status = at + device.stepper.signals["command"].size
+    settings, trace = status + 1, status + 1 + len(device.bounds)
+    return {
+        "references": f"enum {{ TIME, COMMANDS = {at}, STATUS = {status}, SETTINGS = {settings}, TRACE = {trace} }};",
+        "written": "\n".join(rows),
+        **_settings(device),
+    }
+
+
+def _settings(device: Device) -> dict[str, str]:
+    """How a setting is read, and written through its check."""
+    if not device.bounds:
+        return {"settings_read": "", "settings_written": ""}
+    places = [device.settings.slice(PREFIX + path).start for path in device.bounds]
+    inside = f"  if (r >= SETTINGS && r < SETTINGS + {len(places)})"
+    read = f"  static const int PLACES[] = {{{', '.join(map(str, places))}}};\n"
+    setting = f"({device.name}_setting)(r - SETTINGS)"
+    return {
+        "settings_read": f"{read}{inside} return (casadi_real*)&s->c.settings + PLACES[r - SETTINGS];",
+        "settings_written": f"{inside} {{\n    s->fresh = 0;\n"
+        f"    return {device.name}_set(&s->c, {setting}, (casadi_real)value) ? DONE : REFUSED;\n  }}",
+    }
+
+
+# Texts
+
+
+def _described(device: Device, token: str, variables: list[Variable], files: list[str]) -> str:
+    root = ET.Element(
+        "fmiModelDescription",
+        {
+            "generationTool": "fpirhc",
+            "variableNamingConvention": "structured",
+            "fmiVersion": "2.0",
+            "modelName": device.title,
+            "guid": token,
+        },
+    )
+    facts = {"canHandleVariableCommunicationStepSize": "false", "canGetAndSetFMUstate": "true"}
+    unit = ET.SubElement(root, "CoSimulation", {"modelIdentifier": device.name, **facts})
     listed = ET.SubElement(unit, "SourceFiles")
     for file in files:
         ET.SubElement(listed, "File", name=file)
-    return {}
+    units = ET.SubElement(root, "UnitDefinitions")
+    for name in sorted({one.unit for one in variables if one.unit}):
+        ET.SubElement(units, "Unit", name=name)
+    period, end = (repr(float(v)) for v in (device.problem.period, device.problem.duration))
+    ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=end, stepSize=period)
+    listed = ET.SubElement(root, "ModelVariables")
+    for k, one in enumerate(variables):
+        scalar = ET.SubElement(listed, "ScalarVariable", one.attributes(k))
+        ET.SubElement(scalar, "Integer" if one is STATUS else "Real", one.facts)
+    structure = ET.SubElement(root, "ModelStructure")
+    for tag in ("Outputs", "InitialUnknowns"):
+        unknowns = ET.SubElement(structure, tag)
+        for k, one in enumerate(variables):
+            if one.causality == "output":
+                ET.SubElement(unknowns, "Unknown", index=str(k + 1))
+    ET.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
 
 
-_FMI2 = Interface(
-    version="2.0",
-    code="fmi2.c",
-    headers=("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    token="guid",
-    step=_step,
-    add=_add,
-    structure=_structure,
-    build=_build,
-    folders={"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"},
-)
-TARGET = Target("fmu2", "FMI 2.0 unit for co-simulation", lambda one: mock_up_unit(one, _FMI2))
+def _unused(text: str, headers: str) -> str:
+    """Functions of the standard that a controller does not have: an importer looks for all of them, and each returns an error."""
+    made = []
+    for result, name, given in re.findall(r"typedef\s+([\w\s*]+?)\s+(fmi2\w+)TYPE\s*\(([^;]*?)\);", headers):
+        if re.search(rf"\b{name}\(", text):
+            continue
+        names = re.findall(r"(\w+)\s*(?:\[\])?\s*(?:,|$)", given)
+        ignored = " ".join(f"(void){one};" for one in names if one != "void")
+        answer = "0" if "Status" not in result else "fmi2Error"
+        made.append(f"{result} {name}({given}) {{ {ignored} return {answer}; }}")
+    return "\n".join(made) + "\n"
+
+
+def _archive(contents: Mapping[str, str | bytes]) -> bytes:
+    """A zip of the contents without dates: the same controller gives the same bytes."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in contents.items():
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
+    return buffer.getvalue()
+
+
+def _page(device: Device, variables: list[Variable], contents: Iterable[str]) -> str:
+    platforms = sorted(name.split("/")[1] for name in contents if name.startswith("binaries/"))
+    libraries = ", ".join(platforms) or "none: no compiler was found, and a tool must build the sources"
+    rows = [f"| `{one.name}` | {one.unit} | {one.causality} |" for one in variables if one.causality != "local"]
+    unit = device.problem.plant.time_unit
+    return f"""# {device.title}
+
+`{device.name}.fmu` is a unit of FMI 2.0 for co-simulation, with sources. Libraries in it: {libraries}.
+Whoever builds the sources leaves fused multiplications out (gcc and clang: -ffp-contract=off), or the last bits are others.
+
+- A communication step is one period, {float(device.problem.period)!r} {unit}, and begins where the last one ended; others are
+  refused.
+- A command follows from the inputs of its own cycle: set the inputs, get the commands, then take the step. A master that exchanges
+  values after each step alone gives the plant every command one period late; state that dead time in the problem, or let the master
+  pass inputs through.
+- `status` is the number of the cycle's status, 0 where nothing happened; the command is held where a sample could not be used.
+- Settings that are not finite, outside their bounds, or on the wrong side of the other end of their interval are discarded.
+
+| variable | unit | causality |
+|---|---|---|
+{chr(10).join(rows)}
+
+`trace.*` are all signals of the cycle, as local variables.
+"""

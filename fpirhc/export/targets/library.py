@@ -1,4 +1,4 @@
-"""Shared libraries whose functions take arrays: for LabVIEW, MATLAB, Python's ctypes, C#, Rust."""
+"""A shared library whose functions take arrays: for LabVIEW, MATLAB, Python's ctypes, C#, Rust."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 
 from fpirhc.errors import NotInstalled
-from fpirhc.export.binaries import ENDINGS, shared_libraries
+from fpirhc.export.binaries import shared_library
 from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import filled, layout_of, sources
@@ -29,12 +29,16 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
             settings=", ".join(device.bounds) or "none",
         ),
     }
-    made = {f"{name}_{at}{ENDINGS[at.split('-')[1]]}": data for at, data in shared_libraries(own).items()}
-    if not made:
+    made = shared_library(own)
+    if made is None:
         raise NotInstalled(
             f"a shared library needs a C compiler: {why_no_compiler()}; install gcc or clang, or pip install 'fpirhc[compiler]'"
         )
-    return {**own, **made, "layout.json": json.dumps(layout_of(device), indent=1)}
+    return {
+        **own,
+        f"{name}_{made.platform}{made.ending}": made.content,
+        "layout.json": json.dumps(layout_of(device), indent=1),
+    }
 
 
 def _listed(layout: Layout) -> str:
@@ -43,5 +47,5 @@ def _listed(layout: Layout) -> str:
 
 
 TARGET = Target(
-    "library", "shared libraries whose functions take arrays, for LabVIEW, MATLAB, ctypes and others", _files
+    "library", "a shared library whose functions take arrays, for LabVIEW, MATLAB, ctypes and others", _files
 )

@@ -48,7 +48,7 @@ def _whole(module: bytes, at: int) -> tuple[int, int]:
     return sum((module[k] & 127) << 7 * (k - at) for k in range(at, end)), end
 
 
-TARGET = Target("wasm", "WebAssembly with a wrapper in JavaScript and types", _files, libm="own")
+TARGET = Target("wasm", "WebAssembly with a wrapper in JavaScript and types", _files)
 
 
 def _types(device: Device, structs: list[str]) -> str:
