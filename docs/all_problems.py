@@ -24,7 +24,7 @@ from fpirhc.problem_files.shipped import missing, stated
 
 PROBLEMS = Path(__file__).resolve().parents[1] / "problems"
 TRIED = Path(__file__).resolve().parent / "rivals.json"
-HEADS = ("problem", "quantity", "plain", "with FPI", "best rival", "exact model", "winner", "why")
+HEADS = ("problem", "quantity", "plain", "with FPI", "best rival", "exact model", "winner")
 PLAIN = ("RHC", "CTC", "CT", "pump alone", "static map", "static inverse")
 OWN = re.compile(r"(RHC|CTC|CT|slots|static)\b(?!.*(offset-free|RLS))")  # rows of the iteration and its plain forms
 DRAW, LOST = 1.1, 10.0  # ratios of errors
@@ -37,10 +37,11 @@ def files() -> list[Path]:
 
 
 def table() -> str:
-    """The table as Markdown."""
+    """The table as Markdown, and below it why the winner of each problem wins."""
     tried = json.loads(TRIED.read_text(encoding="utf-8"))
     rows = [HEADS, ("---",) * len(HEADS), *(row_of(path, tried.get(path.stem)) for path in files())]
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([*lines, "", *(f"- *{path.stem}*: {stated(path, 'why', '')}" for path in files()), ""])
 
 
 def errors_in(path: Path) -> tuple[str, dict[str, float]]:
@@ -71,7 +72,7 @@ def row_of(path: Path, tried: tuple[str, float] | None) -> tuple[str, ...]:
     shown[2] = "none holds it" if lost and not rivals else shown[2]
     kept = stated(path, "keeps_rule", None)
     safe = [{n: e for n, e in some.items() if kept is None or n in kept} for some in (plain, adapted, rivals)]
-    return path.stem, quantity, *shown, _winner(*safe), stated(path, "why", "")
+    return path.stem, quantity, *shown, _winner(*safe)
 
 
 def _best(errors: dict[str, float]) -> str:
