@@ -43,7 +43,7 @@ from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, l
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 
-_SCALE, _STEEPEST, _NUMBERS = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, "numbers"))
+_SCALE, _STEEPEST = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
 
@@ -272,25 +272,17 @@ def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:
     if not ocp.settings:
         return ()
     starts = {name: tuple(map(float, values)) for name, values in _derived_numbers(ocp).items()}
-    elements = {_SCALE: ocp.input.elements, _STEEPEST: (), _NUMBERS: _computed(ocp)}
+    elements = {_SCALE: ocp.input.elements, _STEEPEST: ()}
     return tuple(Signal(name, elements[name], (), start) for name, start in starts.items())
 
 
 _LONGER = "the line search shortens its steps; plans are the same where they converge, and need more calls"
-_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER, _NUMBERS: "the terminal cost is that of the old weights"}
-
-
-def _computed(ocp: OptimalControl) -> tuple[str, ...]:
-    """Paths of the numbers among the settings that the cost computes from the others."""
-    return tuple(path for path in ocp.settings if path.startswith(DERIVED))
+_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER}
 
 
 def _derived_numbers(ocp: OptimalControl) -> dict[str, np.ndarray]:
-    """Scale, largest eigenvalue, and the numbers that the cost computes, by signal."""
-    table = ocp.nodes[2][ocp.data.slice("settings"), 0]
-    computed = np.array([value for path, value in zip(ocp.settings, table, strict=True) if path.startswith(DERIVED)])
-    numbers = {_NUMBERS: computed} if computed.size else {}
-    return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest]), **numbers}
+    """Scale and largest eigenvalue, by signal."""
+    return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest])}
 
 
 def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: Signals) -> list[Expression]:
@@ -300,8 +292,6 @@ def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: S
     live = live_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser)
     declared = {one.name: getattr(s, one.name) for one in own_signals(problem)}
     numbers = {path: declared.get(PREFIX + path, number.of(ca.MX)) for path, number in live.items()}
-    if _computed(ocp):
-        numbers |= dict(zip(_computed(ocp), ca.vertsplit(getattr(s, _NUMBERS)), strict=True))
     settings = (numbers[path] for path in ocp.settings)
     return [expression(ca.vertcat(*settings, graph(getattr(s, _SCALE)), graph(getattr(s, _STEEPEST))))]
 

@@ -14,14 +14,14 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
-from fpirhc.symbolic.live import DERIVED, computed_from, nominal, numbers
+from fpirhc.symbolic.live import live_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +80,6 @@ class Cost(Checked, ABC):
     @abstractmethod
     def uses_feedforward(self) -> bool:
         """Whether a term needs the model's input along the reference."""
-
-    def derived(self, plant: Plant, linearise: Callable[[], Linearisation]) -> dict[str, float]:  # noqa: ARG002
-        """Return the numbers that Python computes from the weights, by name; they are data where weights are live."""
-        return {}
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
@@ -221,15 +217,13 @@ class Quadratic(Cost):
         if isinstance(self.terminal, Mapping):
             return _squares(self.terminal, view.output, view.reference)
         error = view.state.vector[: plant.state.size] - view.reference.vector
-        entries = nominal(self).derived(plant, linearise)
-        values = numbers(computed_from(self, entries))
-        return ca.bilin(ca.reshape(values, error.numel(), error.numel()), error, error)
-
-    def derived(self, plant: Plant, linearise: Callable[[], Linearisation]) -> dict[str, float]:
-        if self.terminal is None or isinstance(self.terminal, Mapping):
-            return {}
-        weight = np.asarray(self.terminal.weight(self, plant, linearise()))
-        return {f"{DERIVED}terminal.{k}": float(entry) for k, entry in enumerate(weight.ravel(order="F"))}
+        if live := live_numbers(self):
+            raise NotSupported(
+                f"LQRTerminal computes its weight from {', '.join(live)}; leave it closed, or weigh the end by name: "
+                "terminal={...}"
+            )
+        weight = ca.SX(ca.DM(np.asarray(self.terminal.weight(self, plant, linearise()))))
+        return ca.bilin(weight, error, error)
 
 
 @dataclass(frozen=True)

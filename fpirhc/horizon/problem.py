@@ -57,7 +57,6 @@ class OptimalControl:
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
         settings: paths of the live settings, whose numbers are among the data.
         live_bounds: paths of the live limits of inputs, which are arguments of a call.
-        derive: function of the numbers of settings, by path, that returns the numbers that the cost computes from them.
         inner: of a plant with outputs, for every state its place in the reference, or -1 and a value of its own; else empty.
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
@@ -91,7 +90,6 @@ class OptimalControl:
     shares: np.ndarray
     settings: tuple[str, ...] = ()
     live_bounds: tuple[str, ...] = ()
-    derive: Callable[[Mapping[str, float]], dict[str, float]] | None = None
     inner: tuple[tuple[int, float], ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
@@ -163,8 +161,6 @@ class OptimalControl:
         """
         if not self.settings:
             return self
-        if self.derive is not None:
-            values = {**values, **self.derive(values)}
         states, inputs, table = self.nodes
         numbers = np.array([values[path] for path in self.settings])
         table = table.copy()

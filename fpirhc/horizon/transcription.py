@@ -35,7 +35,7 @@ from fpirhc.plant.motion import outside_of, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal, settled
+from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -98,12 +98,6 @@ def _transcribed(
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
     values = {path: number.value for path, number in {**live_numbers(cost, limits), **others}.items()}
-
-    def derive(numbers: Mapping[str, float]) -> dict[str, float]:
-        advance = _advance(plant, horizon)
-        return settled(cost, numbers).derived(plant, lambda: _linearise(plant, reference, horizon, advance))
-
-    values |= derive(values) if settings else {}
     if settings:
         # The scale and the largest eigenvalue follow from the expansion; until `at` they are ones.
         ones, numbers = np.ones(plant.input.size), np.array([values[path] for path in settings])
@@ -139,7 +133,6 @@ def _transcribed(
         state_price=state_prices(limits, state, plant, horizon.step),
         settings=settings,
         live_bounds=tuple(live_numbers(limits.inputs)),
-        derive=derive,
         inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.longest, nodes[0][: plant.state.size, :-1], nodes[1]

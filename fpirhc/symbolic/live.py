@@ -206,11 +206,6 @@ def live_numbers(*values: object) -> dict[str, LiveNumber]:
     return numbers
 
 
-def computed_from(value: object, numbers: Mapping[str, float]) -> list[float | LiveNumber]:
-    """Return numbers, by path, that Python computes from a value: as they are, or live where a number of the value is."""
-    return [live_number(path, one) for path, one in numbers.items()] if is_live(value) else list(numbers.values())
-
-
 def is_live(*values: object) -> bool:
     """Return whether a live number stands in one of the values."""
     return bool(live_numbers(*values))

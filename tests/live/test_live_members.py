@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -90,9 +90,12 @@ def test_an_optimiser_keeps_no_old_number(name):
 
 
 def test_numbers_that_follow_from_settings_follow():
-    """The terminal weight of the LQR, the scale that a sigmoid chooses from the limits, the step length and the first plan."""
+    """The scale that a sigmoid chooses from the limits, the step length and the first plan; the LQR's weight is refused."""
     one = fp.FixedPoint(iterations=1, tolerance=1e-3)
-    weighed = fp.RecedingHorizon(one, fp.Sigmoid(gain=-0.5), cost=fp.Quadratic(**WEIGHTS, terminal=fp.LQRTerminal()))
+    weighed = fp.RecedingHorizon(one, fp.Sigmoid(gain=-0.5), cost=fp.Quadratic(**WEIGHTS))
+    computed = replace(weighed, cost=fp.Quadratic(**WEIGHTS, terminal=fp.LQRTerminal()))
+    with pytest.raises(fp.FpirhcError, match=r"LQRTerminal computes its weight from .*states\.a"):
+        simulator(two_masses(), computed, live=["cost.states.a"], compiled=False)
     tried = check_live(
         two_masses(), weighed, paths=["cost.states.a", "cost.deviation.Fb", "limits.inputs.Fa.1"], cycles=30
     )
@@ -257,10 +260,8 @@ def test_a_gain_that_changes_during_a_run_changes_the_estimate():
 def test_every_derived_number_says_what_an_old_one_does():
     """A device without Python needs to know; an empty text forbids the change there."""
     arm, pendulum, two = (load_problem(name) for name in ("planar_arm", "mrac_pendulum", "two_mass"))
-    terminal = replace(cast(Any, two.problem.cost), terminal=fp.LQRTerminal())
-    planned = replace(two.problem, cost=terminal)
     cases: list[tuple[Any, Any, list[str], set[bool]]] = [
-        (planned, two.controllers["RHC"], ["cost.states.q1"], {True}),
+        (two.problem, two.controllers["RHC"], ["cost.states.q1"], {True}),
         (two_masses(), KALMAN, ["estimator.drift.a"], {True}),
         (pendulum.problem, pendulum.controllers["Lyapunov MRAC"], ["rate"], {False}),
         (arm.problem, arm.controllers["AID"], ["tracking.rate"], {False}),
