@@ -41,6 +41,7 @@ from fpirhc.symbolic.program import chained
 from fpirhc.task.exogenous import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
+_DESCRIBED: Latest[object] = Latest(16)
 _CHAIN = 5  # cycles of the inner chain of the virtual machine
 Progress = Callable[[int, int], None]
 Compiled: TypeAlias = tuple[Evaluator, bool, str]  # whether it is compiled, and why not
@@ -169,7 +170,7 @@ class Simulator:
             "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(controller.deformation.effective_gain()),
             "parameters": [float(v) for v in model.parameters(model.plant)],
-            "controller": describe(controller),
+            "controller": _DESCRIBED.of((controller,), (), lambda: describe(controller)),
             "problem": describe(problem),
             "backend": "compiled C" if self.compiled else "CasADi virtual machine",
             "why not compiled": self.why_not_compiled,
