@@ -48,21 +48,16 @@ class Repeats(Variants):
     seeds: int = 1  # 1: the problem alone
 
     def of(self, task: Task) -> Sequence[Variant]:
-        problem = task.problem
-        every = [Variant("nominal", problem, "nominal", seed=self.seed)]
-        if self.seeds > 1:
-            every.append(
-                Variant(
-                    "rounding", problem.with_exact(problem.real_parameters * (1 + 1e-14)), "nominal", seed=self.seed
-                )
-            )
+        problem, seed = task.problem, self.seed
+        every = [Variant("nominal", problem, "nominal", seed=seed)]
+        if self.seeds > 1 and problem.foreign is None:
+            moved = problem.with_exact(problem.real_parameters * (1 + 1e-14))
+            every.append(Variant("rounding", moved, "nominal", seed=seed))
             if (finer := problem.integrator.finer(2)) is not None:
-                every.append(Variant("finer steps", replace(problem, integrator=finer), "finer", seed=self.seed))
-            if problem.disturbances or not problem.sensing.ideal or problem.foreign is not None:
-                every += [
-                    Variant(f"seed {self.seed + k}", problem, "nominal", seed=self.seed + k)
-                    for k in range(1, self.seeds)
-                ]
+                every.append(Variant("finer steps", replace(problem, integrator=finer), "finer", seed=seed))
+        if problem.disturbances or not problem.sensing.ideal or problem.foreign is not None:
+            seeds = range(seed + 1, seed + self.seeds)
+            every += [Variant(f"seed {k}", problem, "nominal", seed=k) for k in seeds]
         return every
 
 

@@ -1,35 +1,16 @@
-"""Figures (matplotlib) of plans and comparisons, and the pairs without | with adaptivity of the method's papers."""
+"""Figures (matplotlib) of plans and of the contraction; what goes over time is drawn by the page itself."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from colorsys import hsv_to_rgb
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fpirhc.errors import OutputError
-from fpirhc.simulation.drawing import (
-    PALETTE,
-    by_unit,
-    caption_axes,
-    draw_bands,
-    draw_changes,
-    draw_legend,
-    draw_line,
-    draw_responses,
-    draw_signal,
-    draw_title,
-    literal,
-    new_figure,
-    quantity_label,
-    row_of_axes,
-    show_usual,
-    shown_motion,
-    thinned,
-    time_label,
-)
+from fpirhc.simulation.drawing import PALETTE, caption_axes, draw_legend, literal, new_figure, row_of_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,17 +18,14 @@ if TYPE_CHECKING:
 
     from fpirhc.contraction.spectrum import ContractionReport
     from fpirhc.simulation.picture import Drawing
-    from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.compare import Comparison, Contraction, Entry
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
 
-    Draw: TypeAlias = Callable[[Axes, Run, Sequence[str]], None]
-
 _WIDE = 16.5  # inches, of a picture as wide as the page
 _CYCLES = 150  # of the decay of a response error
 _BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
-_REFERENCES = ("#111111", "#777777", "#aaaaaa")  # colours of references, which lie on what follows them
+_GOLDEN = 0.618034  # of a turn, from hue to hue
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -89,116 +67,20 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
     return figure
 
 
-def pair_figures(plain: Entry, adaptive: Entry) -> dict[str, Drawing]:
-    """Return the pictures of the method's papers as pairs, without adaptivity on the left and with it on the right.
-
-    Both sides have the same axes, and a picture has one unit: quantities of several units are several pictures.
-    """
-    figures = {}
-    for title, draw, signal, what, names in _pictures(plain.run):
-        groups = by_unit(plain.run, signal, names)
-        for unit, same in groups.items():
-            name = title if len(groups) == 1 else f"{title} [{unit}]"
-            same = same[:1] if draw is _draw_responses else same  # four lines each
-            figures[name] = _pair(draw, quantity_label(plain.run, signal, same, what), same, (plain, adaptive))
-    return figures
-
-
-def _pictures(run: Run) -> list[tuple[str, Draw, str, str, list[str]]]:
-    """Title, drawing, signal with the units, what its entries are of the names, and names of every picture of a pair."""
-    judged, inputs = list(run.layout["error"].elements), list(run.layout["command"].elements)
-    phases = [("Phase trajectories", _draw_phase, "error", "", _phase_names(run))] if _phase_names(run) else []
-    return [
-        ("Trajectory tracking", _draw_trajectory, "error", "", judged),
-        *phases,
-        ("Tracking error", partial(draw_signal, signal="error"), "error", "error of ", judged),
-        ("Command", partial(draw_signal, signal="command"), "command", "", inputs),
-        ("Highest derivatives", _draw_responses, "desired", "responses of ", list(run.layout["desired"].elements)),
-    ]
-
-
-def _pair(draw: Draw, label: str, names: Sequence[str], entries: tuple[Entry, Entry]) -> Drawing:
-    figure, axes = row_of_axes(11, 3.6, 2)
-    for axis, entry in zip(axes, entries, strict=True):
-        draw(axis, entry.run, names)
-        if draw is not _draw_phase:
-            draw_bands(axis, entry.run)
-            draw_changes(axis, entry.run)
-            axis.set_xlabel(time_label(entry.run))
-            axis.set_ylabel(label)
-        draw_title(axis, entry.name)
-        draw_legend(axis)
-    _share_axes(axes)
-    return figure
-
-
-def _share_axes(axes: Sequence[Axes]) -> None:
-    """Give both sides the range that shows all of both."""
-    x, y = np.array([axis.get_xlim() for axis in axes]), np.array([axis.get_ylim() for axis in axes])
-    for axis in axes:
-        axis.set_xlim(x.min(), x.max())
-        axis.set_ylim(y.min(), y.max())
-
-
-def lyapunov_figure(comparison: Comparison) -> Drawing | None:
-    """V = |S|^2 / 2 over time and its ultimate bound, for controllers with an exponential tracking law."""
-    views = [(e, e.lyapunov) for e in comparison.entries if e.lyapunov is not None]
-    if not views:
-        return None
-    figure, [axis] = row_of_axes(_WIDE, 4.0, 1)
-    colours = colours_of(comparison)
-    for entry, view in views:
-        color, values = colours[entry.name], _positive(view.function)
-        times = entry.run.period * np.arange(values.size)
-        axis.semilogy(thinned(times), thinned(values), color=color, lw=1, label=literal(entry.name))
-        axis.axhline(_positive(0.5 * view.ultimate**2), color=color, lw=0.8, ls="--")
-    caption_axes(axis, time_label(views[0][0].run), "V")
-    draw_legend(axis)
-    return figure
-
-
 def _positive(values: np.ndarray | float) -> Any:
     """Values that have a place on a logarithmic axis; the others are left out."""
     return np.where((np.asarray(values) > 0) & np.isfinite(values), values, np.nan)
 
 
 def colours_of(comparison: Comparison) -> dict[str, str]:
-    """Return the colour of every controller that ran, by name: the same one in all pictures of a report."""
-    names = [e.name for e in comparison.entries if e.run.cycles > 1]
-    return dict(zip(names, PALETTE * len(names), strict=False))
-
-
-def _draw_trajectory(axis: Axes, run: Run, names: Sequence[str]) -> None:
-    for k, name in enumerate(names):
-        draw_line(axis, run, f"{shown_motion(run.layout)}.{name}", f"{name} realised", PALETTE[k % len(PALETTE)])
-        draw_line(axis, run, f"reference.{name}", f"{name} nominal", _REFERENCES[k % len(_REFERENCES)], "--")
-    show_usual(
-        axis.set_ylim, run, [f"{one}.{name}" for one in (shown_motion(run.layout), "reference") for name in names]
+    """Return the colour of every controller that ran, by name: the same one in all pictures of a report, the pair's first."""
+    names = sorted(
+        (e.name for e in comparison.entries if e.run.cycles > 1),
+        key=lambda name: name not in (comparison.findings[0].pair or ()),
     )
-
-
-def _phase_names(run: Run) -> list[str]:
-    """The judged coordinates whose first derivative is a state: a coordinate of order one has no phase plane."""
-    return [
-        name for name in run.layout["error"].elements if f"{name}'" in run.layout[shown_motion(run.layout)].elements
-    ]
-
-
-def _draw_phase(axis: Axes, run: Run, names: Sequence[str]) -> None:
-    motion = shown_motion(run.layout)
-    for k, name in enumerate(names):
-        nominal = _REFERENCES[k % len(_REFERENCES)]
-        for signal, style, color in ((motion, "-", PALETTE[k % len(PALETTE)]), ("reference", "--", nominal)):
-            x, y = run[f"{signal}.{name}"], run[f"{signal}.{name}'"]
-            axis.plot(thinned(x), thinned(y), style, color=color, lw=1, label=literal(f"{name} {signal}"))
-    for limit, prime in ((axis.set_xlim, ""), (axis.set_ylim, "'")):
-        show_usual(limit, run, [f"{one}.{name}{prime}" for one in (motion, "reference") for name in names])
-    across, up = (quantity_label(run, motion, [name + prime for name in names]) for prime in ("", "'"))
-    caption_axes(axis, across, up)
-
-
-def _draw_responses(axis: Axes, run: Run, names: Sequence[str]) -> None:
-    draw_responses(axis, run, names[0])
+    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(names)))
+    extra = (f"#{''.join(f'{round(255 * one):02x}' for one in colour)}" for colour in more)
+    return dict(zip(names, (*PALETTE, *extra), strict=False))
 
 
 def contraction_figure(comparison: Comparison) -> Drawing | None:

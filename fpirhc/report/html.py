@@ -1,6 +1,6 @@
 """HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view.
 
-The verdict is first, then come the tables, charts, pictures, and settings.
+The verdict is first, then come the main columns, charts, pictures, notes, and settings.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import hashlib
 import json
 import re
 import textwrap
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
@@ -20,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.report.figures import colours_of, contraction_figure, lyapunov_figure, pair_figures
+from fpirhc.report.figures import colours_of, contraction_figure
+from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
 from fpirhc.studies.comparison.verdict import Outcome
-from fpirhc.summary import Column, Table
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -36,21 +37,6 @@ if TYPE_CHECKING:
     from fpirhc.simulation.run import Run
     from fpirhc.studies.comparison.compare import Comparison, Entry
     from fpirhc.studies.view import View
-
-
-_CAPTIONS = {
-    "Trajectory tracking": "Nominal (dashed) and realised motion over time.",
-    "Phase trajectories": "First derivative against coordinate.",
-    "Tracking error": "Nominal minus realised.",
-    "Command": "After clipping.",
-    "Highest derivatives": "Nominal, desired, deformed and realised response. Where adaptation works the realised one lies on the "
-    "desired one, although the deformed one is far from both.",
-}
-_LYAPUNOV = (
-    "V = |S|^2 / 2 of the tracking law, dashed: its ultimate bound (sup|h| / rate)^2 / 2 by the response error h of the "
-    "measured part. A small response error keeps V near zero."
-)
-_CONTRACTION = "Predicted contraction factor against the gain, and the response error's decay"
 
 
 @dataclass(frozen=True)
@@ -71,75 +57,32 @@ def write_report(comparison: Comparison, path: Path) -> None:
     write_whole(render(comparison), path, "report")
 
 
-def render(comparison: Comparison, lab: str = "") -> str:
-    """Return the page's text; `lab` is the address of a page beside it that the reader can go on to."""
-    pair = headline_pair(comparison)
+def render(comparison: Comparison) -> str:
+    """Return the page's text."""
     own, motions = own_pictures(comparison)
-    begin = [e.name for e in pair] if pair else []
+    begin = [*(comparison.findings[0].pair or ())]
     series = {**chart_data(comparison), "bands": BANDS, "begin": begin, "motions": motions}
     data = _in_script(json.dumps(series, separators=(",", ":")))
-    contraction, lyapunov = contraction_figure(comparison), lyapunov_figure(comparison)
+    scripts = asset("uPlot.iife.min.js"), asset("axes.js"), *([planar.script()] if motions else [])
+    factors = contraction_figure(comparison)
+    caption = "Predicted contraction factor against the gain, and the response error's decay"
+    slots: dict[tuple[str, ...], list[str]] = {}  # names of controllers by their time slots
+    for e in comparison.entries:
+        if e.run.spans():
+            slots.setdefault(e.run.layout["desired"].elements, []).append(e.name)
+    changed = [f"{e.name}: {text}" for e in comparison.entries for text in settings_in_force(e.run)]
     return render_page(
         "comparison.html",
         comparison.view,
-        (
-            asset("uPlot.iife.min.js"),
-            asset("axes.js"),
-            *([planar.script()] if motions else []),
-            f"const DATA={data};\n{asset('report.js')}",
-        ),
-        slots=_slots(comparison),
+        (*scripts, f"const DATA={data};\n{asset('report.js')}"),
+        slots=slots,
         bands=BANDS,
-        pairs=_pairs(*pair) if pair else [],
         own=own,
         motions=motions,
-        contraction=[Image(contraction.address, _CONTRACTION)] if contraction else [],
-        contracts=_contracts(comparison),
-        lyapunov=[Image(lyapunov.address, "Lyapunov function over time with its ultimate bound", _LYAPUNOV)]
-        if lyapunov
-        else [],
-        in_force=_in_force(comparison),
-        lab=lab,
+        contraction=[Image(factors.address, caption)] if factors else [],
+        contracts=[f"{e.name}: {e.contraction.report.text}" for e in comparison.entries if e.contraction],
+        in_force=changed,
     )
-
-
-def _contracts(comparison: Comparison) -> list[str]:
-    """A sentence per adaptive row about its iteration by itself; the verdict is named where the row does no better."""
-    bad = (Outcome.WORSE, Outcome.MIXED, Outcome.DOUBTFUL, Outcome.NOT_COMPARABLE)
-    lost = {f.pair[1] for f in comparison.findings if f.pair and f.outcome in bad}
-    return [
-        f"{e.name}: {e.contraction.report.text}"
-        + (" This is of the iteration by itself; what the whole loop did is in the verdict." if e.name in lost else "")
-        for e in comparison.entries
-        if e.contraction
-    ]
-
-
-def headline_pair(comparison: Comparison) -> tuple[Entry, Entry] | None:
-    """The pair that the verdict begins with; None when there is none."""
-    by_name = {e.name: e for e in comparison.entries}
-    pairs = [(by_name[e.pair], e) for e in comparison.entries if e.pair in by_name]
-    usable = [p for p in pairs if p[0].run.cycles > 1 and p[1].run.cycles > 1]
-    named = [p for p in usable if comparison.findings[0].pair == (p[0].name, p[1].name)]
-    candidates = named or usable
-    return candidates[0] if candidates else None
-
-
-def _slots(comparison: Comparison) -> dict[tuple[str, ...], list[str]]:
-    """Names of controllers by their time slots."""
-    by_slots: dict[tuple[str, ...], list[str]] = {}
-    for e in comparison.entries:
-        if e.run.spans():
-            by_slots.setdefault(e.run.layout["desired"].elements, []).append(e.name)
-    return by_slots
-
-
-def _pairs(plain: Entry, adaptive: Entry) -> list[Image]:
-    sides = f"{plain.name} on the left, {adaptive.name} on the right"
-    return [
-        Image(figure.address, f"{title}: {sides}", f"{title}. {_CAPTIONS.get(title.partition(' [')[0], '')}")
-        for title, figure in pair_figures(plain, adaptive).items()
-    ]
 
 
 def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, Any]]]:
@@ -169,24 +112,6 @@ def _drawn(wanted: Picture, names: Sequence[str], draw: Callable[[Drawing], None
     return Image(figure.address, f"{wanted.title}: {', '.join(names)}", f"{wanted.title}. {wanted.caption}".strip())
 
 
-def _in_force(comparison: Comparison) -> Table:
-    """The live settings of every run, at its start and wherever they changed."""
-    heads = ("controller", f"from [{comparison.time_unit}]", "setting", "number")
-    table = Table("settings in force", [Column(head, left=head == "setting") for head in heads])
-    for entry in comparison.entries:
-        for time, path, value in _new_numbers(entry):
-            table.add([entry.name, f"{time:g}", path, f"{value:.6g}"])
-    return table
-
-
-def _new_numbers(entry: Entry) -> Iterator[tuple[float, str, float]]:
-    """Time, path and number of every live setting at the start, and of those that changed later."""
-    last: Mapping[str, float] = {}
-    for time, numbers in entry.run.in_force:
-        yield from ((time, path, value) for path, value in numbers.items() if last.get(path) != value)
-        last = numbers
-
-
 def _in_script(data: str) -> str:
     """JSON as a page's script has it: no text ends the script."""
     return data.replace("<", "\\u003c")
@@ -214,7 +139,11 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     every = [Markup(script) for script in (asset("table.js"), *scripts)]
     styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")] + [Markup(planar.styles())]
     template = _environment().get_template(name)
-    return template.render(view=view, policy=Markup(_policy(every)), styles=styles, scripts=every, **context)
+    others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome is not None)
+    said = ", ".join(f"{count} {outcome}" for outcome, count in others.items())
+    return template.render(
+        view=view, others=said, policy=Markup(_policy(every)), styles=styles, scripts=every, **context
+    )
 
 
 @cache

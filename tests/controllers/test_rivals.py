@@ -325,18 +325,6 @@ def test_bound_holds_before_the_transient_is_over():
     assert np.isinf(diverged.ultimate)  # without a warning
 
 
-def test_view_is_shown_where_there_is_one():
-    """As a note and in the report; a law without an exponential surface has none."""
-    problem = swing(duration=0.3, measure_from=0.1)
-    task = Task("case", Path("case.py"), "title", "", problem, {"CTC": VIEWED[0], "PID": fp.PID({"angle": 80.0})})
-    comparison = compare(task, seed=0, compiled=False)
-    view = comparison["CTC"].lyapunov
-    assert view is not None
-    assert comparison["CTC"].notes[-1] == view.text
-    assert comparison["PID"].lyapunov is None
-    assert "Lyapunov's view" in render(comparison)
-
-
 # What fits, and what does not
 
 

@@ -8,15 +8,14 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from plants import sine_of_three
 
 import fpirhc as fp
 from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.report.figures import colours_of
 from fpirhc.report.html import INTERVALS, blocks, chart_data, render, whole_numbers, write_report
 from fpirhc.report.terminal import show
 from fpirhc.studies.comparison.compare import compare
@@ -67,10 +66,20 @@ def test_report_is_self_contained_and_small(written, whole):
 
 def test_verdict_comes_first_then_table_charts_and_pictures(whole):
     """The order in which a reader asks."""
-    heads = ("Controllers", "Signals over time", "Without | with", "Contraction", "Lyapunov's view", "Settings")
-    places = [whole.index(mark) for mark in ("id='verdict'", *(f"<h2>{head}" for head in heads))]
+    marks = ("id='verdict'", "<table>", "<h2>Signals over time", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
+    places = [whole.index(mark) for mark in marks]
     assert places == sorted(places)
-    assert whole.count("<img alt='") == 7
+    assert whole.count("<img alt='") == 1
+
+
+def test_the_pair_of_the_verdict_has_colours_of_its_own(comparison):
+    """The first two, whatever its place; no two rows share one."""
+    names = [f"c{k}" for k in range(15)]
+    entries = tuple(replace(comparison["plain"], name=name) for name in names)
+    first = replace(comparison.findings[0], pair=("c7", "c9"))
+    colours = colours_of(replace(comparison, entries=entries, findings=(first, *comparison.findings[1:])))
+    assert len(set(colours.values())) == 15
+    assert [*colours][:2] == ["c7", "c9"]
 
 
 def test_equations_and_tables_of_a_description_keep_their_columns():
@@ -98,31 +107,6 @@ def test_data_of_the_charts_is_complete(comparison):
     json.dumps(data, allow_nan=False)
 
 
-@pytest.mark.slow
-def test_predicted_band_is_drawn_around_the_distance_from_the_models_run():
-    """The headline's adaptive controller has a chart more: the distance is that of the run, and inside the band."""
-    track = fp.Exponential(rate=6.0)
-    controllers = {
-        "plain": fp.ComputedTorque(track),
-        "adaptive": fp.ComputedTorque(track, fp.Sigmoid(gain=-1.5, scale=5.0)),
-    }
-    quiet = replace(problem(), start={"y": 0.0}, disturbances={})
-    task = Task("case", Path("case.py"), "case", "", quiet, controllers, headline=("plain", "adaptive"))
-    comparison_value = compare(task, seed=0, compiled=False)
-    data = chart_data(comparison_value)
-    [chart] = [c for c in data["charts"] if "band" in c]
-    distance, upper, lower = ([v for v in s["values"] if v is not None] for s in chart["series"])
-    entry: Any = comparison_value["adaptive"]
-    assert chart["only"] == "adaptive"
-    apart = entry.run["state.y"] - entry.prediction.nominal.states[:, 0]
-    assert max(distance) == pytest.approx(apart.max(), rel=1e-4)
-    assert max(upper) == pytest.approx(entry.prediction.half_width["y"], rel=1e-4)
-    assert min(lower) == -max(upper)
-    assert max(np.abs(distance)) < 1.1 * max(upper)
-    assert "was predicted before the run" in render(comparison_value)
-    assert comparison_value["plain"].prediction is None
-
-
 def test_run_that_ended_early_is_told_in_words(comparison):
     """Its numbers are 'none', its reason is in the table, and its lines stop."""
     entry = comparison["plain"]
@@ -133,44 +117,29 @@ def test_run_that_ended_early_is_told_in_words(comparison):
     assert "<td class='none'>none</td>" in page
 
 
-def test_a_row_is_as_high_as_its_numbers(comparison, whole):
-    """A name stands alone in its cell; what is noted of it stands in a list below the table."""
-    assert "<th scope='row'>plain</th>" in whole
-    note = next(note for note in comparison["plain"].notes if "Lyapunov" in note)
-    assert f"<li>{whole_numbers(f'plain: {note}')}</li>" in whole
-
-
-def test_no_column_is_empty(comparison, whole):
-    """Where nobody plans there is no table of plans, and every column of the other has a number in some row."""
-    controllers, plans = comparison.view.tables
-    assert plans.rows == []
-    assert "gap" not in [column.head for column in controllers.columns]
+def test_no_column_is_empty(comparison):
+    """Where nobody plans there is no column of plans: every column has a number in some row."""
+    controllers = comparison.view.tables[0]
     assert all(any(row.cells[k] for row in controllers.rows) for k in range(len(controllers.columns)))
-    assert "<h3>Plans" not in whole
 
 
 def test_page_terminal_notebook_and_json_say_the_same(comparison, whole, capsys, monkeypatch):
     """Every text of the short table is on the terminal, on the page and in a notebook; JSON has the number behind it."""
     monkeypatch.setenv("COLUMNS", "2000")
     view = comparison.view
-    show(view, Path("report.html"))
+    show(view, Path("report.html"), verbose=True)
     printed, notebook = capsys.readouterr().out, comparison._repr_html_()
     for row in view.tables[0].narrow.rows:
         for cell in filter(None, row.cells[1:]):
             assert cell in printed
             assert f">{cell}</td>" in whole
             assert f"<td>{cell}</td>" in notebook
-    facts = json.loads(to_json(view.facts))["controllers"]["plain"]
+    facts = json.loads(to_json(view.facts))["controllers"]["plain"]["metrics"]
     assert facts["rms_error"]["y"] == comparison["plain"].metrics.rms_error["y"]
     assert f"<td>{written_out(facts['rms_error']['y'])}</td>" in notebook
-    slow = replace(comparison["plain"].cycle, median=4050.0)
-    busy = replace(comparison, entries=(replace(comparison["plain"], cycle=slow),))
-    assert "4 050" in busy.view.tables[0].rows[0].cells
 
 
-def test_comparison_without_a_pair_has_no_pair_pictures(comparison):
-    alone = replace(comparison, entries=comparison.entries[:1])
-    assert "Without | with" not in render(alone)
+def test_a_comparison_without_a_row_says_so(comparison):
     empty = replace(comparison, entries=(), skipped={"x": "because"})
     assert "No controller finished" in render(empty)
 

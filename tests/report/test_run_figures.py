@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +14,7 @@ from plants import chain
 import fpirhc as fp
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.figures import contraction_figure, pair_figures
-from fpirhc.report.html import asset, headline_pair
+from fpirhc.report.figures import contraction_figure
 from fpirhc.studies.comparison.compare import compare
 
 
@@ -60,19 +58,6 @@ def test_a_shipped_task_gives_its_controllers_their_names():
     assert fp.simulate(short, fresh, seed=0, name="mine", compiled=False).controller == "mine"
 
 
-@pytest.mark.parametrize("order", [1, 2])
-def test_a_plant_of_order_one_has_no_phase_picture(order):
-    """The phase plane is the first derivative against the coordinate; with order one the derivative is no state."""
-    pair = headline_pair(compare(task(order), seed=0, compiled=False))
-    assert pair is not None
-    figures = pair_figures(*pair)
-    assert ("Phase trajectories" in figures) == (order == 2)
-    assert all(axis.lines for figure in figures.values() for axis in figure.axes)
-    if order == 2:
-        axis = figures["Phase trajectories"].axes[0]
-        assert (axis.get_xlabel(), axis.get_ylabel()) == ("y [mg/l]", "y' [mg/l/s]")
-
-
 def reactor() -> Task:
     """Two coordinates and two inputs of different units; maps whose gains are no effective gains."""
     plant = fp.Plant(
@@ -105,12 +90,7 @@ def reacted():
 
 
 def test_a_chart_has_one_unit(reacted):
-    """Litres per second and kilowatts are two pictures, with their unit on the axis; a run's own figure has them, too."""
-    figures = pair_figures(reacted["plain"], reacted["affine"])
-    assert [name for name in figures if name.startswith("Command")] == ["Command [l/s]", "Command [kW]"]
-    assert [name for name in figures if name.startswith("Tracking")] == ["Tracking error [mol/l]", "Tracking error [K]"]
-    labels = {name: figure.axes[0].get_ylabel() for name, figure in figures.items()}
-    assert (labels["Command [l/s]"], labels["Command [kW]"]) == ("F [l/s]", "Q_dot [kW]")
+    """Litres per second and kilowatts are two charts, with their unit on the axis."""
     own = [axis.get_ylabel() for axis in reacted["affine"].run.plot().axes]
     assert own == [
         "error of c [mol/l]",
@@ -121,35 +101,6 @@ def test_a_chart_has_one_unit(reacted):
         "Q_dot [kW]",
         "responses of c [mol/l/s]",
     ]
-
-
-def test_every_unit_has_its_responses(reacted):
-    """A mole and a kelvin have a picture each, of the first quantity with this unit."""
-    figures = pair_figures(reacted["plain"], reacted["affine"])
-    labels = [figure.axes[0].get_ylabel() for name, figure in figures.items() if name.startswith("Highest")]
-    assert labels == ["responses of c [mol/l/s]", "responses of T [K/s]"]
-
-
-def test_a_reference_has_a_colour_of_its_own(reacted):
-    """Where what follows lies on it, both are seen: the reference is drawn later, dashed, and in another colour."""
-    figures = pair_figures(reacted["plain"], reacted["affine"])
-    for name in ("Trajectory tracking [K]", "Trajectory tracking [mol/l]"):
-        motion, reference = figures[name].axes[0].lines
-        assert "nominal" in str(reference.get_label())
-        assert reference.get_color() != motion.get_color()
-        assert (motion.get_linestyle(), reference.get_linestyle()) == ("-", "--")
-
-
-def test_both_sides_of_a_pair_have_the_same_axes(reacted):
-    """A smaller error looks smaller; nothing of either side is cut."""
-    for name, figure in pair_figures(reacted["plain"], reacted["affine"]).items():
-        left, right = figure.axes
-        assert left.get_ylim() == right.get_ylim(), name
-        assert left.get_xlim() == right.get_xlim(), name
-    left, right = pair_figures(reacted["plain"], reacted["affine"])["Tracking error [K]"].axes
-    low, high = left.get_ylim()
-    drawn = np.concatenate([line.get_ydata() for axis in (left, right) for line in axis.lines])
-    assert low < drawn.min() < drawn.max() < high
 
 
 def marked(axes: list[Axes]) -> dict[str, tuple[float, float]]:
@@ -175,14 +126,3 @@ def test_the_contraction_is_drawn_against_the_gain_that_the_user_sets(reacted):
     assert min(line.get_zorder() for line in crosses) > max(line.get_zorder() for line in rings)
     [limit] = [np.asarray(line.get_xydata())[0, 0] for line in panels[0].lines if line.get_label() == "linear limit"]
     assert limit == pytest.approx(-2 / (0.5 * 1.5))
-
-
-def test_nothing_is_green_in_a_red_report():
-    """Best cells are marked without a colour of success, and a better pair of a lost headline has none either."""
-    style = asset("report.css")
-    marks = re.findall(r"--mark:#(..)(..)(..)", style)
-    assert len(marks) == 2
-    for channels in marks:
-        red, green, blue = (int(c, 16) for c in channels)
-        assert green <= max(red, blue)
-    assert ".outcome-worse~ul li.outcome-better{color:var(--ink)}" in style

@@ -22,7 +22,6 @@ from fpirhc.problem_files.pairs import pair_of
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.changes import Changes
-from fpirhc.simulation.lyapunov_view import LyapunovView, lyapunov_view
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant
@@ -91,7 +90,6 @@ class Entry:
     exact: bool  # whether its model is exact where the others' is not
     plan_every: int  # cycles from plan to plan
     contraction: Contraction | None = None
-    lyapunov: LyapunovView | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
     cycle: tuple[float, float] | None = None  # median and largest time of a cycle, us
     notes: tuple[str, ...] = ()
@@ -264,7 +262,6 @@ class _Rows:
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
         cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-        view = part("the Lyapunov function", lyapunov_view, problem, ready, run)
         notes = (*broken_limits(problem, run), *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
         return Entry(
             name=name,
@@ -276,7 +273,6 @@ class _Rows:
             exact=_has_exact_model(problem, ready),
             plan_every=cycles_per_plan(problem.horizon, problem.period) if plans and problem.horizon else 1,
             contraction=contraction,
-            lyapunov=view,
             null=null,
             cycle=cycle,
             notes=notes,
