@@ -194,7 +194,6 @@ def simulator(
     controller: Controller,
     *,
     compiled: bool | None = True,
-    flags: Sequence[str] = (),
     live: Sequence[str] = (),
 ) -> Simulator:
     """Return the closed loop of problem and controller, ready to run.
@@ -203,7 +202,6 @@ def simulator(
         problem: the task.
         controller: its automatic settings are chosen here.
         compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
-        flags: for the compiler, after its usual ones.
         live: paths of settings that a run may change without another build: 'deformation.gain', 'cost.states.q1',
             'limits.inputs.Q1'.
 
@@ -212,7 +210,7 @@ def simulator(
         NotSupported: a setting that decides what the loop is made of, or that this loop needs as a number.
         CompileError: the compiler fails on a loop with live settings.
     """
-    return ComposedLoop.of(problem, controller, live).simulator(compiled, flags)
+    return ComposedLoop.of(problem, controller, live).simulator(compiled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,9 +243,7 @@ class ComposedLoop:
         """Cycles of a call of the compiled loop."""
         return moving(self.problem).cycles_of_call
 
-    def simulator(
-        self, compiled: bool | None, flags: Sequence[str] = (), known: dict[object, Compiled] | None = None
-    ) -> Simulator:
+    def simulator(self, compiled: bool | None, known: dict[object, Compiled] | None = None) -> Simulator:
         """Return the loop ready to run.
 
         A loop whose code is `known` is not compiled again, and `known` gets that of every other one: loops of one code differ in
@@ -255,19 +251,19 @@ class ComposedLoop:
         """
         ready, worth = self.live.controller, self.worth_compiling(compiled)
         if known is None:
-            return Simulator(self.problem, ready, self.loop, *self._code(compiled, flags), self.live)
+            return Simulator(self.problem, ready, self.loop, *self._code(compiled), self.live)
         key = worth, hashlib.sha256(self.function.serialize().encode()).digest()
-        code = known.get(key) or self._code(compiled, flags)
+        code = known.get(key) or self._code(compiled)
         result = Simulator(self.problem, ready, self.loop, *code, self.live)
         if not result.remembers:  # one that does is built anew for every run
             known[key] = code
         return result
 
-    def _code(self, compiled: bool | None, flags: Sequence[str]) -> Compiled:
+    def _code(self, compiled: bool | None) -> Compiled:
         function = self.function
         backend = Native(function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
         if self.worth_compiling(compiled):
-            backend = native(function, flags, required=bool(self.live.paths), calls=self.calls)
+            backend = native(function, required=bool(self.live.paths), calls=self.calls)
         interpreted = moving(self.problem).cycles_interpreted
         called = backend.function if backend.compiled else chained(function, interpreted, _CHAIN)
         return Evaluator(called), backend.compiled, backend.reason
@@ -281,7 +277,6 @@ def simulate(
     seed: Seed,
     name: str = "",
     compiled: bool | None = True,
-    flags: Sequence[str] = (),
     progress: Progress | None = None,
     settings: Numbers | None = None,
     changes: Changes | None = None,
@@ -298,14 +293,13 @@ def simulate(
         seed: of the noise of disturbances and sensors.
         name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
         compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
-        flags: for the compiler, after its usual ones.
         progress: called with (cycles done, cycles in all).
         settings: numbers of settings by path, in place of those of the controller and the problem.
         changes: numbers of settings from a time on, by time in s.
         setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
     """
     live = tuple(dict.fromkeys(path for numbers in (settings or {}, *(changes or {}).values()) for path in numbers))
-    ready = simulator(problem, controller, compiled=compiled, flags=flags, live=live)
+    ready = simulator(problem, controller, compiled=compiled, live=live)
     return judged_run(
         ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints
     )

@@ -1,13 +1,66 @@
-"""Random command lines, run in this process: an exit code as documented, one line for a mistake, and no traceback."""
+"""Random command lines, run in this process: an exit code as documented, words for a mistake, and no traceback."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import random
 from collections.abc import Iterator
 from pathlib import Path
 
+import typer
+
 from attack.problems import LINE
+from fpirhc.__main__ import main
+from fpirhc.cli import app
+
+GROUP = typer.main.get_command(app)
+CHEAP = ("accept", "check", "compare", "list", "new", "review", "run", "study", "tune")
+WORDS = (
+    "line.py", "line.py", "line.py", "no_such.py", "broken.py", "empty.py", "two_mas", "", ".", "/", "CTC", "CTC+FPI", "CTC+FP",
+    "0", "1", "2", "-1", "1e300", "nan", "inf", "0.1%", "x", "--", "-", "y", "out", "file", "\x00", "ü", "a" * 300, "=", "a=b",
+    "deformation.gain=-0.4", "tracking.rate=nan", "rms error", "*", "../..", "~", "bash", "csh",
+)  # fmt: skip
+FLAGS = ("--help", "--debug", "--no-such-option", "-x", "--out", "--draws", "--processes", "--seed", "--no-compile")
+SLOW = ("--trials", "--draws", "--seeds", "--processes", "--cycles")  # options with a number that is kept small
+CODES = {0, 1, 2, 3, 4, 5, 6}
+
+
+def random_line(seed: int) -> list[str]:
+    """The words of one command line."""
+    numbers = random.Random(seed)
+    if numbers.random() < 0.05:
+        return [numbers.choice((*WORDS, *FLAGS)) for _ in range(numbers.randrange(3))]
+    name = numbers.choice(CHEAP)
+    options = [(o, not p.is_flag) for p in GROUP.commands[name].params for o in p.opts if o.startswith("--")]  # type: ignore[attr-defined]
+    words = [name, *(["line.py"] if numbers.random() < 0.7 else [])]
+    for _ in range(numbers.choice((0, 0, 1, 1, 2, 3, 4))):
+        if numbers.random() < 0.6:
+            option, takes = numbers.choice(options)
+            value = numbers.choice(("0", "-1", "1", "2", "x")) if option in SLOW else numbers.choice(WORDS)
+            words += [option, value] if takes and numbers.random() < 0.9 else [option]
+        else:
+            words.append(numbers.choice((*WORDS, *FLAGS)))
+    # What runs is short: few trials, and no compiler.
+    return [*words, "--trials", "2"] if name == "tune" else words
+
+
+def raw_end(words: list[str]) -> str:
+    """What is wrong with the end of a command line; empty where nothing is. A working folder must have been prepared."""
+    printed, complained = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complained):
+        try:
+            code = main(list(words))
+        except BaseException as error:  # noqa: BLE001 -- what is looked for
+            return f"{words}: {type(error).__name__}: {error}"
+    if code not in CODES:
+        return f"{words}: exit code {code}: {complained.getvalue()[-300:]}"
+    if "Traceback" in complained.getvalue() and "--debug" not in words:
+        return f"{words}: a traceback"
+    if code == 2 and not (printed.getvalue() + complained.getvalue()).strip():
+        return f"{words}: bad input without a word"
+    return ""
 
 
 @contextlib.contextmanager

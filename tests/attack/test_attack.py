@@ -8,6 +8,7 @@ import pytest
 
 import fpirhc as fp
 from attack.artefacts import ARTEFACTS, flipped
+from attack.commands import prepared, random_line, raw_end
 from attack.faults import FAULTS
 from attack.files import flipped_bits, killed_compilations
 from attack.harness import PROBLEMS, Bench, shipped
@@ -55,7 +56,7 @@ def test_compilations_survive_their_kills(tmp_path):
 @pytest.mark.parametrize("flips", [40, pytest.param(400, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ARTEFACTS)
 def test_flipped_bits_of_files_are_noticed(name, flips, tmp_path):
-    """A saved run, a ledger or a baseline with a flipped bit is refused by name, or reads as it was written."""
+    """A saved run with a flipped bit is refused by name, or reads as it was written."""
     result = flipped(name, tmp_path / "flips", flips, seed=flips)
     assert (result.raw, result.unnoticed) == ((), 0)
 
@@ -65,3 +66,10 @@ def test_flipped_bits_of_files_are_noticed(name, flips, tmp_path):
 def test_no_planted_library_runs(tmp_path):
     """In whatever way another user could have written it."""
     assert {way: ran for way, ran in planted_and_run(tmp_path).items() if ran} == {}
+
+
+@pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])
+def test_random_command_lines(count, tmp_path):
+    """A documented exit code, words for what is wrong, and never a traceback."""
+    with prepared(tmp_path / "work"):
+        assert [end for end in (raw_end(random_line(count + k)) for k in range(count)) if end] == []
