@@ -1,0 +1,322 @@
+"""Comparisons of plants of others beside an integration that shares no line with the library's loop.
+
+Each is written as a user would write it, from its source. `by_hand` runs the same loop without the library: scipy integrates the
+user's own equations, a root finder inverts them, and the tracking law and the model-referenced affine map are a few lines:
+
+    d_k     = y^(r),N + sum_s C(r, s) rate^(r-s) (y^(s),N - y^(s))
+    delta_k = delta_{k-1} + A_c / 2 (f_k - f^_k + delta_{k-1})
+    u_k     = inverse of the model at d_k + delta_k, clipped
+
+`chain` gives the derivatives of an output, differentiated by hand. The equations are the sources'; the wrong parameters and the
+tasks are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import comb, pi
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import root
+
+import fpirhc as fp
+from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies.comparison.verdict import Outcome
+
+State = Mapping[str, float]
+Chain = Callable[[State, Any, Any], dict[str, tuple[float, ...]]]
+
+
+@dataclass(frozen=True, eq=False)
+class ForeignPlant:
+    """A plant with its task, the rate of the tracking law, the gain of the map, and the chains of its outputs."""
+
+    problem: fp.Problem
+    rate: float
+    gain: float = -1.0
+    chain: Chain | None = (
+        None  # (state, inputs, parameters) -> controlled outputs with their derivatives; None: coordinates
+    )
+
+    def compared(self, name: str) -> Any:
+        """The comparison that `fpirhc compare` shows."""
+        law = fp.ComputedTorque(fp.Exponential(rate=self.rate, integral=False))
+        pair = {"CTC": law, "CTC+FPI": law.with_deformation(fp.ModelReferenced(fp.Affine(gain=self.gain)))}
+        return fp.compare(Task(name, Path(f"{name}.py"), name, "", self.problem, pair), seed=0, compiled=False)
+
+
+def known(**values: tuple[float, float, str]) -> dict[str, fp.Parameter]:
+    """Parameters from (approximate, exact, unit)."""
+    return {name: fp.Parameter(*value) for name, value in values.items()}
+
+
+def steering() -> ForeignPlant:
+    """Lateral position of a car by its front wheels (Astrom and Murray, example 3.11; python-control, steering-optimal.py)."""
+
+    def rates(x, u, p):
+        return {"y": p.speed * ca.sin(x.heading), "heading": p.speed / p.wheelbase * ca.tan(u.steer)}
+
+    def chain(x, u, p):
+        climb = p.speed * np.cos(x["heading"])
+        return {"lateral": (x["y"], p.speed * np.sin(x["heading"]), climb * p.speed / p.wheelbase * np.tan(u.steer))}
+
+    plant = fp.Plant.of_states(
+        states={"y": "m", "heading": "rad"},
+        inputs={"steer": "rad"},
+        parameters=known(speed=(8.0, 10.0, "m/s"), wheelbase=(3.5, 3.0, "m")),
+        rates=rates,
+        outputs={"lateral": fp.Output("m", lambda x, p: x.y)},
+    )
+    return ForeignPlant(
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(lambda t: {"lateral": 2 * ca.sin(0.5 * t)}),
+            start={"y": 0.0, "heading": 0.0},
+            period=0.02,
+            duration=10.0,
+            measure_from=4.0,
+            limits=fp.Limits(inputs={"steer": (-0.5, 0.5)}),
+        ),
+        rate=1.5,
+        chain=chain,
+    )
+
+
+def conical_tank() -> ForeignPlant:
+    """Level of a conical tank (D. E. Seborg et al., Process Dynamics and Control, 4th ed. 2016, ch. 2; B. W. Bequette, 1998)."""
+
+    def response(q, u, p):
+        return {"level": (u.inflow - p.valve * ca.sqrt(q.level)) / (pi * (p.slope * q.level) ** 2)}
+
+    plant = fp.Plant(
+        coordinates={"level": "m"},
+        inputs={"inflow": "m^3/min"},
+        order=1,
+        response=response,
+        parameters=known(valve=(0.35, 0.5, "m^2.5/min"), slope=(0.5, 0.4, "1")),
+        ranges={"level": (0.05, 4.0)},
+        time_unit="min",
+    )
+    return ForeignPlant(
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(lambda t: {"level": 1.5 + 0.5 * ca.sin(0.5 * t)}),
+            start={"level": 1.2},
+            period=0.05,
+            duration=30.0,
+            measure_from=5.0,
+            limits=fp.Limits(inputs={"inflow": (0.0, 3.0)}),
+            input_before={"inflow": 0.5},
+        ),
+        rate=1.0,
+    )
+
+
+def magnet() -> ForeignPlant:
+    """A ball below an electromagnet, by its current i, squared (H. K. Khalil, Nonlinear Systems, 3rd ed. 2002, exercise 1.18)."""
+
+    def response(q, v, u, p):
+        force = p.inductance * u.current**2 / (2 * 0.05 * (1 + q.gap / 0.05) ** 2)
+        return {"gap": 9.81 - (0.001 * v.gap + force) / p.mass}
+
+    plant = fp.Plant(
+        coordinates={"gap": "m"},
+        inputs={"current": "A"},
+        response=response,
+        parameters=known(mass=(0.1, 0.12, "kg"), inductance=(0.01, 0.009, "H")),
+    )
+    return ForeignPlant(
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(lambda t: {"gap": 0.05 + 0.01 * ca.sin(4 * t)}),
+            start={"gap": 0.05, "gap'": 0.04},
+            period=2e-3,
+            duration=2.0,
+            measure_from=0.5,
+            limits=fp.Limits(inputs={"current": (0.5, 12.0)}),
+            input_before={"current": 6.3},
+        ),
+        rate=15.0,
+        gain=-0.6,
+    )
+
+
+def stocking() -> ForeignPlant:
+    """Adult and young fish by fishing and by setting out young ones, a map (Beverton and Holt 1957; stages as in H. Caswell 2001).
+
+    A+ = s A + m J - q A e,  J+ = b A / (1 + A / K) + u.
+    """
+
+    def following(x, u, p):
+        return {
+            "adults": p.s * x.adults + p.m * x.young - p.q * x.adults * u.effort,
+            "young": p.b * x.adults / (1 + x.adults / p.K) + u.stocked,
+        }
+
+    def chain(x, u, p):
+        adults = p.s * x["adults"] + p.m * x["young"] - p.q * x["adults"] * u.effort
+        young = p.b * x["adults"] / (1 + x["adults"] / p.K) + u.stocked
+        return {"adults": (x["adults"], adults - x["adults"]), "young": (x["young"], young - x["young"])}
+
+    plant = fp.Plant.discrete(
+        states={"adults": "kt", "young": "kt"},
+        inputs={"effort": "kd", "stocked": "kt"},
+        parameters=known(
+            s=(0.7, 0.8, "1"), m=(0.6, 0.5, "1"), q=(0.3, 0.4, "1/kd"), b=(0.8, 1.0, "1"), K=(60.0, 50.0, "kt")
+        ),
+        next=following,
+        step=1.0,
+        outputs={"adults": fp.Output("kt", lambda x, p: x.adults), "young": fp.Output("kt", lambda x, p: x.young)},
+        time_unit="year",
+    )
+    return ForeignPlant(
+        fp.Problem(
+            plant=plant,
+            reference=fp.Trajectory(
+                lambda t: {"adults": 60.0 + 8.0 * ca.sin(0.2 * t), "young": 40.0 + 4.0 * ca.sin(0.3 * t)}
+            ),
+            start={"adults": 55.0, "young": 38.0},
+            period=1.0,
+            duration=80.0,
+            measure_from=20.0,
+            limits=fp.Limits(inputs={"effort": (0.0, 3.0), "stocked": (0.0, 100.0)}),
+        ),
+        rate=0.5,
+        chain=chain,
+    )
+
+
+# --- The independent loop ---------------------------------------------------------------------------------------------
+
+
+def by_hand(one: ForeignPlant, *, adaptive: bool) -> dict[str, np.ndarray]:
+    """Return the errors of the controlled quantities at the beginning of every cycle, by name."""
+    problem, plant = one.problem, one.problem.plant
+    model, exact = (_parameters(plant, which) for which in ("approximate", "exact"))
+    low, high = (np.array(ends) for ends in zip(*(problem.limits.inputs[name] for name in plant.inputs), strict=True))
+    x, u = np.array([problem.start.get(e, 0.0) for e in plant.state.elements]), problem.inputs_before
+    delta: np.ndarray | None = None
+    seen, errors = None, []
+    for cycle in range(problem.cycles):
+        measured = _chain(one, x, u, exact)
+        desired, error = _desired(one, measured, cycle * problem.period)
+        errors.append(error)
+        if plant.step is None and cycle:
+            seen = (_last(measured), _last(_chain(one, x, u, model)))
+        delta = _delta(one.gain, delta, seen) if adaptive else None
+        wanted = desired + (0.0 if delta is None else delta)
+        u = root(lambda v, x=x, wanted=wanted: _last(_chain(one, x, v, model)) - wanted, u, tol=1e-13).x
+        u = np.clip(u, low, high)
+        if plant.step is not None:  # a map's response is known when its step is done
+            seen = (_last(_chain(one, x, u, exact)), _last(_chain(one, x, u, model)))
+        x = _moved(one, x, u, exact)
+    return {name: np.array([e[name] for e in errors]) for name in errors[0]}
+
+
+def _delta(gain: float, before: np.ndarray | None, seen: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray | None:
+    """The next deformation; None before anything was seen."""
+    if seen is None:
+        return None
+    before = np.zeros_like(seen[0]) if before is None else before
+    return before + 0.5 * gain * (seen[0] - seen[1] + before)
+
+
+def _desired(
+    one: ForeignPlant, measured: Mapping[str, tuple[float, ...]], t: float
+) -> tuple[np.ndarray, dict[str, float]]:
+    """The tracking law's response and the errors."""
+    responses, errors = [], {}
+    for name, values in measured.items():
+        order = len(values) - 1
+        nominal = _nominal(one.problem, name, order, t)
+        gains = [comb(order, s) * one.rate ** (order - s) for s in range(order)]
+        responses.append(nominal[order] + sum(k * (nominal[s] - values[s]) for s, k in enumerate(gains)))
+        errors[name] = nominal[0] - values[0]
+    return np.array(responses), errors
+
+
+def _nominal(problem: fp.Problem, name: str, order: int, t: float) -> list[float]:
+    """The reference and its derivatives, or its differences on a map, by differentiating the user's own expression."""
+    symbol = ca.SX.sym("t")
+    motion = problem.reference.motion  # type: ignore[attr-defined]  # every reference here is a Trajectory
+    value = motion(symbol)[name]
+    if problem.plant.step is not None:
+        ahead = [float(ca.evalf(ca.substitute(value, symbol, t + k * problem.plant.step))) for k in (0, 1)]
+        return [ahead[0], (ahead[1] - ahead[0]) / problem.plant.step]
+    values = []
+    for _ in range(order + 1):
+        values.append(float(ca.evalf(ca.substitute(value, symbol, t))))
+        value = ca.gradient(value, symbol)
+    return values
+
+
+def _parameters(plant: fp.Plant, which: str) -> SimpleNamespace:
+    return SimpleNamespace(**{name: getattr(one, which) for name, one in plant.parameters.items()})
+
+
+def _named(names: Mapping[str, str], values: np.ndarray) -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip(names, map(float, values), strict=True)))
+
+
+def _rates(plant: fp.Plant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) -> dict[str, float]:
+    """The user's own function, in numbers; of a map the next state."""
+    count = len(plant.coordinates)
+    lower = [_named(plant.coordinates, x[k : k + count]) for k in range(0, len(x), count)]
+    function = plant.response if plant.step is None else plant.next
+    assert function is not None
+    return {name: float(value) for name, value in function(*lower, _named(plant.inputs, u), p).items()}
+
+
+def _chain(one: ForeignPlant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) -> dict[str, tuple[float, ...]]:
+    """Every controlled quantity with its derivatives."""
+    plant = one.problem.plant
+    state = dict(zip(plant.state.elements, map(float, x), strict=True))
+    if one.chain is not None:
+        return one.chain(state, _named(plant.inputs, u), p)
+    rates, order = _rates(plant, x, u, p), plant.orders[0]
+    return {c: (*(state[c + "'" * k] for k in range(order)), rates[c]) for c in plant.controlled_names}
+
+
+def _last(chain: Mapping[str, tuple[float, ...]]) -> np.ndarray:
+    """The highest derivatives."""
+    return np.array([values[-1] for values in chain.values()])
+
+
+def _moved(one: ForeignPlant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) -> np.ndarray:
+    """The state one cycle later."""
+    plant, count = one.problem.plant, len(one.problem.plant.coordinates)
+    if plant.step is not None:
+        return np.array(list(_rates(plant, x, u, p).values()))
+
+    def derivative(_: float, state: np.ndarray) -> np.ndarray:
+        return np.concatenate([state[count:], list(_rates(plant, state, u, p).values())])
+
+    return np.asarray(
+        solve_ivp(derivative, (0, one.problem.period), x, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
+    )
+
+
+# --- Beside each other ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("plant", [steering, conical_tank, magnet, stocking])
+def test_errors_and_verdict_are_those_of_an_independent_integration(plant):
+    """An output of a body with states, a level in minutes, a force by the square of its input, and a map of two outputs."""
+    one = plant()
+    comparison = one.compared(plant.__name__)
+    late = np.arange(one.problem.cycles) * one.problem.period >= one.problem.measure_from - 1e-9
+    by = {name: by_hand(one, adaptive=name != "CTC") for name in ("CTC", "CTC+FPI")}
+    for name, errors in by.items():
+        rms = {c: float(np.sqrt(np.mean(e[late] ** 2))) for c, e in errors.items()}
+        assert dict(comparison[name].errors) == pytest.approx(rms, rel=1e-4)
+    first = comparison.findings[0]
+    assert first.outcome is Outcome.BETTER
+    assert max(first.ratios.values()) < 0.2
+    assert not comparison["CTC+FPI"].null.fails
