@@ -140,17 +140,5 @@ def written_out(value: float, digits: int = 3) -> str:
     return f"{float(text):,.15g}".replace(",", " ")
 
 
-def numbers_written_out(text: str) -> str:
-    """Return a sentence without numbers such as 1.69e+04: they are as `written_out` has them; after '=' thousands stay together."""
-    return _WITH_POWER.sub(_as_written, text)
-
-
-def _as_written(match: re.Match[str]) -> str:
-    value, digits = match["number"], sum(c.isdigit() for c in match["number"].partition("e")[0])
-    text = written_out(float(value), max(digits, 1))
-    text = f"+{text}" if value.startswith("+") else text
-    return match["before"] + (text.replace(" ", "") if "=" in match["before"] else text)
-
-
 def _escaped(text: str) -> str:
     return html.escape(printable(text), quote=True)

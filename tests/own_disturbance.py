@@ -10,7 +10,5 @@ from fpirhc.task.disturbance import Disturbance
 class Sawtooth(Disturbance):
     """A user's own: rises by 3 per second and falls back by 1.5 every half second."""
 
-    jump, slew = 1.5, 3.0
-
     def values(self, times, random):  # noqa: ARG002
         return 3.0 * np.mod(times + 1e-12, 0.5)

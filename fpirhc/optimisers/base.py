@@ -36,10 +36,6 @@ class Optimiser(Checked, ABC):
     cannot_keep: ClassVar[tuple[str, ...]] = ()
     """Limits that it cannot keep: of "inputs", of "states", those of states with "prices"."""
 
-    @property
-    def exportable(self) -> bool:
-        """Whether the step can leave CasADi's virtual machine as C code."""
-        return True
 
     @property
     def unbounded(self) -> str:

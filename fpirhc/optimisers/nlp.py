@@ -58,7 +58,6 @@ class MultipleShooting(Optimiser):
     def options(self, ocp: OptimalControl) -> Options:
         """CasADi's options of the solver."""
 
-    exportable = False
 
     def memory(self, ocp: OptimalControl) -> Layout:
         variables, constraints = sizes(ocp)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Protocol
 
@@ -161,12 +160,6 @@ def _cut(name: str, length: int) -> str:
     """A name without its middle where it is too long."""
     side = (length - len("...")) // 2
     return name if len(name) <= length else f"{name[:side]}...{name[-side:]}"
-
-
-def draw_title(axis: Axes, name: str) -> None:
-    """Set a name as the title of one of two panels side by side; a long one is smaller, in at most two lines."""
-    lines = textwrap.wrap(literal(name), _TITLE, max_lines=2, placeholder=" ...")
-    axis.set_title("\n".join(lines), fontsize=10 if len(lines) == 1 else 8, y=1.0)
 
 
 def draw_responses(axis: Axes, run: _Recorded, name: str) -> None:

@@ -105,11 +105,6 @@ class ErrorPair:
         return not self._beyond(WORSE, SLIGHT)
 
     @property
-    def lowers(self) -> bool:
-        """Whether adaptation makes no coordinate worse by more than a fifth, however small its errors are."""
-        return not self._beyond(WORSE, _ROUNDING)
-
-    @property
     def lower(self) -> bool:
         """Whether the errors are smaller with adaptation, as a sum of squares of their shares of the ranges, and `passes`."""
         sums = [sum((e[n] / max(self.ranges[n], 1e-300)) ** 2 for n in e) for e in (self.without, self.adapted)]

@@ -38,16 +38,6 @@ def disturbed_place(key: str, inputs: Collection[str]) -> tuple[bool, str]:
 class Disturbance(Checked, ABC):
     """Contract: values at given times, and the size and speed of their changes where these are known."""
 
-    @property
-    def jump(self) -> float:
-        """Size of the largest sudden change, in the unit of the disturbed signal; zero where there is none or it is unknown."""
-        return 0.0
-
-    @property
-    def slew(self) -> float:
-        """Speed of its other changes, per second; zero where it is unknown, and for noise, which no controller can follow."""
-        return 0.0
-
     @abstractmethod
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
         """Return one value per time, shape (m,), in the unit of the disturbed signal."""
@@ -72,10 +62,6 @@ class Step(Disturbance):
     at: float
     size: float
 
-    @property
-    def jump(self) -> float:
-        return abs(self.size)
-
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         return np.where(times >= self.at, self.size, 0.0)
 
@@ -94,10 +80,6 @@ class Pulse(Disturbance):
     duration: float
     size: float
 
-    @property
-    def jump(self) -> float:
-        return abs(self.size)
-
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         return np.where((times >= self.at) & (times < self.at + self.duration), self.size, 0.0)
 
@@ -115,11 +97,6 @@ class Sine(Disturbance):
     amplitude: float
     frequency: float
     phase: float = 0.0
-
-    @property
-    def slew(self) -> float:
-        """2 pi frequency amplitude."""
-        return abs(2 * math.pi * self.frequency * self.amplitude)
 
     def derivative(self, times: np.ndarray, order: int) -> np.ndarray:
         """Return amplitude omega^k sin(omega t + phase + k pi / 2)."""

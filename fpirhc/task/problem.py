@@ -167,14 +167,6 @@ class Problem(Checked):
         return round(self.duration / self.period)
 
     @property
-    def rounded_duration(self) -> str:
-        """What a run lasts where its duration is no whole number of cycles, as a clause; else ''."""
-        lasts, unit = self.cycles * self.period, self.time_unit
-        if abs(lasts - self.duration) <= _WHOLE * self.period:
-            return ""
-        return f"a run lasts {lasts:.6g} {unit}, because a duration of {self.duration:g} {unit} is no whole number of cycles"
-
-    @property
     def rate_unit(self) -> str:
         """Unit of a rate: 1/s, or one per unit of time."""
         return f"1/{self.time_unit}"

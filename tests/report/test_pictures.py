@@ -316,14 +316,6 @@ def test_a_mechanism_stands_still_where_nothing_can_move(runs):
     assert [len(a.patches) for a in figure.axes] == [18, 18]
 
 
-def test_a_notebook_plays_a_mechanism_in_a_frame_of_its_own(runs):
-    shown = planar().player({"<b>": runs["slow"]})._repr_html_()
-    assert "sandbox='allow-scripts'" in shown
-    assert "<b>" not in shown
-    assert "src=" not in shown.replace("srcdoc=", "")
-    assert "prefers-reduced-motion" in shown
-
-
 @pytest.mark.parametrize(
     ("shapes", "message"),
     [

@@ -49,7 +49,6 @@ def test_a_broken_metric_is_told_by_its_name():
 @pytest.mark.parametrize(
     ("part", "name"),
     [
-        ("lyapunov_view", "the Lyapunov function"),
         ("_cycle_time", "the time of a cycle"),
         ("_contraction", "the contraction"),
         ("errors_of", "the null test"),

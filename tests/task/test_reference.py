@@ -7,7 +7,6 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from own_disturbance import Sawtooth
 from plants import chain
 
 import fpirhc as fp
@@ -104,27 +103,6 @@ def test_step_pulse_and_sine():
     assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
     assert _values(fp.Pulse(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
     np.testing.assert_allclose(_values(fp.Sine(2.0, 0.25)), 2 * np.sin(np.pi / 2 * TIMES), equal_nan=False)
-
-
-@pytest.mark.parametrize(
-    "disturbance",
-    [fp.Step(0.3, -3.0), fp.Pulse(0.2, 0.7, 2.0), fp.Sine(2.0, 0.7, 0.3), Sawtooth()],
-    ids=lambda d: type(d).__name__,
-)
-def test_jump_and_slew_are_the_largest_changes(disturbance):
-    """Between close samples no value changes by more than the slew says and one jump more; the largest of each does happen."""
-    times = np.linspace(0, 2, 20001)
-    changes = np.abs(np.diff(disturbance.values(times, np.random.default_rng(0))))
-    gone = disturbance.slew * (times[1] - times[0])
-    sudden = changes > 1.01 * gone
-    assert changes[~sudden].max(initial=0.0) == pytest.approx(gone, rel=1e-3)
-    assert changes[sudden].max(initial=0.0) == pytest.approx(disturbance.jump, abs=1.01 * gone)
-
-
-def test_noise_and_formulas_tell_nothing():
-    """Noise is no motion to follow, and of a formula nothing is known."""
-    for disturbance in (fp.Noise(1.0), fp.ColouredNoise(1.0, 0.1), fp.Formula(ca.sin)):
-        assert (disturbance.jump, disturbance.slew) == (0.0, 0.0)
 
 
 def test_noise_is_drawn_from_the_seed():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import html
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -220,14 +218,6 @@ class Planar(Picture):
     def _width(self) -> int:
         return sum(2 * one["points"] + one["disc"] for one in self.outlines)
 
-    def player(self, runs: Mapping[str, Run]) -> Player:
-        """Return the moving picture of runs by name, which notebooks show.
-
-        Raises:
-            InvalidName: a run does not have the plant's state.
-        """
-        return Player(self.motion(runs))
-
     def _symbols(self) -> tuple[ca.SX, ca.SX]:
         x, _, p = self.plant.symbols()
         return x, p
@@ -248,24 +238,6 @@ class Planar(Picture):
                 )
             column += numbers
         return ca.vertcat(*column)
-
-
-@dataclass(frozen=True)
-class Player:
-    """A moving picture with its numbers, in a frame of its own."""
-
-    data: Mapping[str, object]  # of the picture, as `Planar.motion` returns it
-
-    def _repr_html_(self) -> str:
-        text = json.dumps(self.data, separators=(",", ":")).replace("<", "\\u003c")
-        page = (
-            f"<!doctype html><meta charset='utf-8'><style>body{{margin:0;font:14px system-ui,sans-serif}}{styles()}</style>"
-            f"<body><script>{script()}\nplay(document.body, {text});</script>"
-        )
-        return (
-            f"<iframe title='{html.escape(str(self.data.get('title', '')), quote=True)}' sandbox='allow-scripts' "
-            f"style='width:100%;height:380px;border:0' srcdoc='{html.escape(page, quote=True)}'></iframe>"
-        )
 
 
 def script() -> str:
