@@ -6,7 +6,6 @@ Names and reasons come from a user's files, so all of them are escaped for the p
 from __future__ import annotations
 
 import html
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LEAST_SHARE = 1e-5
-_WITH_POWER = re.compile(r"(?P<before>= ?|(?<![\w.]))(?P<number>[-+]?\d+(?:\.\d+)?e[+-]\d+)(?!\w)")
 _ROUNDING = 1e-9  # share of its scale, below which an error has no meaning
 _LONGEST = 1e6  # from which a number is written with a power of ten
 
