@@ -27,7 +27,9 @@ def rounds(inputs: int) -> int:
 
 
 def backward_sweep(ocp: OptimalControl, damping: Number) -> ca.Function:
-    """Function (stage columns, P_N, p_N, [damped]) -> (v (nu, N), K (nu, ns N)), with v in [lower - u, upper - u].
+    """Function (stage columns, P_N, p_N, [damped]) -> (v (nu, N), K (nu, ns N), Q_uu (nu, nu N), fall).
+
+    v is in [lower - u, upper - u], and fall is what the sweep promises to lower the cost by.
 
     With the cost to go of stage i+1 modelled by 1/2 dx'P dx + p'dx, stage i minimises Q_u' v + 1/2 v' Q_uu v with
 
@@ -48,14 +50,14 @@ def backward_sweep(ocp: OptimalControl, damping: Number) -> ca.Function:
     sweep = _stage(ocp, damping).mapaccum("fpirhc_riccati_stages", n, 2)
     reversed_stages = [in_reverse(column, n) for column in stacked]
     damped = [ca.MX.sym("damped", nu)] if ocp.settings else []
-    _, _, moves, gains = sweep(value, slope, *reversed_stages, *(ca.repmat(d, 1, n) for d in damped))
-    results = [in_reverse(moves, n), in_reverse(gains, n)]
+    _, _, moves, gains, curved, falls = sweep(value, slope, *reversed_stages, *(ca.repmat(d, 1, n) for d in damped))
+    results = [in_reverse(moves, n), in_reverse(gains, n), in_reverse(curved, n), ca.sum2(falls)]
     names = [*shapes, "P", "p", *(["damped"] if damped else [])]
-    return ca.Function("fpirhc_riccati", [*stacked, value, slope, *damped], results, names, ["v", "K"])
+    return ca.Function("fpirhc_riccati", [*stacked, value, slope, *damped], results, names, ["v", "K", "Q_uu", "fall"])
 
 
 def _stage(ocp: OptimalControl, damping: Number) -> ca.Function:
-    """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper, [damped]) -> (P, p, v, K)."""
+    """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper, [damped]) -> (P, p, v, K, Q_uu, fall)."""
     ns, nu = ocp.state.size, ocp.input.size
     sym = kind(opaque=ns * ns * (ns + nu) > _SCALAR_CODE).sym
     value, slope = sym("P", ns, ns), sym("p", ns)
@@ -72,8 +74,10 @@ def _stage(ocp: OptimalControl, damping: Number) -> ca.Function:
     next_value = q + ca.mtimes(a.T, value_a) + ca.mtimes(coupled.T, gain)
     next_slope = by_state + ca.mtimes(a.T, slope) + ca.mtimes(coupled.T, move)
     next_slope += ca.mtimes(gain.T, input_slope + ca.mtimes(damped, move))
+    fall = -0.5 * ca.dot(input_slope, move)
     arguments = [value, slope, a, b, by_state, by_input, q, s, r, u, lower, upper, *live]
-    return ca.Function("fpirhc_riccati_stage", arguments, [0.5 * (next_value + next_value.T), next_slope, move, gain])
+    results = [0.5 * (next_value + next_value.T), next_slope, move, gain, damped, fall]
+    return ca.Function("fpirhc_riccati_stage", arguments, results)
 
 
 def box_policy(nu: int, ns: int) -> ca.Function:

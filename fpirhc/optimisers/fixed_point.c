@@ -11,9 +11,10 @@ typedef struct {
 
 typedef struct {
   Plan plans[2];
-  casadi_real v[N * NU];
+  casadi_real v[N * NU], curved[N * NU * NU]; /* the next step, and Q_uu of the last sweep */
   casadi_real partials[N * NM], lambda[COSTATES * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
+  casadi_real sent; /* the largest move that a sweep at the best plan wants of an input; beyond every number before one */
 #ifdef SCALE_AT
   casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
 #endif
@@ -116,6 +117,7 @@ INLINE int judged(Search* s, const Plan* best, const Plan* plan, int ok, In lowe
   if (ok) {
     s->envelope = envelope, s->reach = reach;
     s->tau = untried ? s->resume : 1;
+    s->sent = 10 * UNTRIED;
     return 1;
   }
   if (!untried && !bold) {
@@ -196,12 +198,41 @@ INLINE void box_policy(In slope, In matrix, In low, In high, Out v, int* free, O
   }
 }
 
+/* Note what a sweep at the plan wants. Where the cost is flat a move is no error: it lowers the cost by nothing. */
+INLINE void want(Search* s, const Plan* plan, casadi_real most, casadi_real fall) {
+  casadi_real flat = FLAT * fabs(plan->value);
+  s->sent = fall > flat ? most : fall <= flat ? 0 : 10 * UNTRIED; /* what is no number is no certificate */
+}
+
+/* What a sweep at an accepted plan would want, by one adjoint pass with the factors of the last sweep. */
+INLINE int look(Search* s, const Plan* plan, In gains, In data, In lower, In upper) {
+  int i, j, l;
+  In arg[8];
+  Out res[8];
+  casadi_real ahead[NS], fall = 0, most = 0;
+  for (j = 0; j < NS; ++j) ahead[j] = COSTATE(N)[j];
+  for (i = N - 1; i >= 0; --i) {
+    casadi_real next[NS], steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], v[NU];
+    int free[NU];
+    arg[0] = s->partials + i * NM, arg[1] = ahead, arg[2] = data + i * NT;
+    res[0] = next, res[1] = steep;
+    if (pull(arg, res, 0, 0, 0)) return 1;
+    for (l = 0; l < NU; ++l) low[l] = lower[l] - plan->u[i * NU + l], high[l] = upper[l] - plan->u[i * NU + l];
+    box_policy(steep, s->curved + i * NU * NU, low, high, v, free, factor, pivots);
+    for (l = 0; l < NU; ++l) fall -= 0.5 * steep[l] * v[l], most = larger(most, fabs(v[l]));
+    for (j = 0; j < NS; ++j)
+      for (ahead[j] = next[j], l = 0; l < NU; ++l) ahead[j] += gains[(i * NS + j) * NU + l] * steep[l];
+  }
+  want(s, plan, most, fall);
+  return 0;
+}
+
 /* One Riccati sweep around the accepted plan: feedforward v, deformed, and feedback K. */
 INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In upper) {
   int i, j, l, m;
   In arg[8];
   Out res[8];
-  casadi_real p[NS * NS], lean[NS], wanted[N * NU], moved[N * NU];
+  casadi_real p[NS * NS], lean[NS], wanted[N * NU], moved[N * NU], fall = 0, most = 0;
   for (j = 0; j < NS * NS; ++j) p[j] = s->final[j];
   for (j = 0; j < NS; ++j) lean[j] = COSTATE(N)[j];
   for (i = N - 1; i >= 0; --i) {
@@ -225,6 +256,8 @@ INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In 
       high[l] = upper[l] - plan->u[i * NU + l];
     }
     box_policy(steep, r, low, high, v, free, factor, pivots);
+    for (j = 0; j < NU * NU; ++j) s->curved[i * NU * NU + j] = r[j];
+    for (l = 0; l < NU; ++l) fall -= 0.5 * steep[l] * v[l], most = larger(most, fabs(v[l]));
     for (j = 0; j < NS; ++j) {
       for (l = 0; l < NU; ++l) k[j * NU + l] = -cross[j * NU + l];
       substitute(free, factor, pivots, k + j * NU);
@@ -250,6 +283,7 @@ INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In 
   arg[0] = wanted, arg[1] = data, res[0] = moved;
   if (deformed(arg, res, 0, 0, 0)) return 1;
   for (i = 0; i < N * NU; ++i) s->v[i] = moved[i];
+  want(s, plan, most, fall);
   return 0;
 }
 
@@ -278,6 +312,7 @@ INLINE void begin(Search* s, Plan* best, Out gains, In memory, int posed, In low
   for (i = 0; i < N * NU * NS; ++i) gains[i] = (known | !posed) ? memory[GAINS + i] : 0;
   best->value = s->envelope = 10 * UNTRIED;
   s->reach = 0;
+  s->sent = 10 * UNTRIED;
   s->tau = 1;
   s->resume = tau > 0 ? smaller(tau, 1) : 1;
   /* After a rejected T a longer gamma would be rejected again, in every call of one iteration. */
@@ -303,7 +338,7 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   In s0 = GIVEN(0), data = GIVEN(1), lower = GIVEN(2), upper = GIVEN(3), memory = GIVEN(4);
   Search* restrict s = (Search*)w;
   Plan *best = s->plans, *plan = s->plans + 1;
-  int i, tried, plain = 0, empty = 0, good, posed = sane(s0, data, lower, upper);
+  int i, tried, plain = 0, swept = 0, empty = 0, good, posed = sane(s0, data, lower, upper);
   Out gains = res[2] + GAINS;
   casadi_real left;
 #ifdef SCALE_AT
@@ -312,18 +347,23 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
 #endif
   begin(s, best, gains, memory, posed, lower, upper);
   for (tried = 0;; ++tried) {
-    int bold = s->tau >= SHORTEST, ok = try_next(s, best, plan, gains, s0, data, lower, upper);
+    int bold = s->tau >= SHORTEST, sure = s->sent <= TOLERANCE, ok = try_next(s, best, plan, gains, s0, data, lower, upper);
     int accepted = judged(s, best, plan, ok && posed, lower, upper);
     if (accepted) {
       Plan* other = best;
       best = plan, plan = other;
     }
+    if (accepted && swept && (STOP_EARLY || tried == ITERATIONS) && look(s, best, gains, data, lower, upper)) return 1;
     if (tried == ITERATIONS) break;
     if (STOP_EARLY) {
+      /* A small gradient alone is no certificate: at a plan where the inputs do nothing it is small too. In open loop a sweep at the
+         plan before has to say so too. */
       plain += !bold;
-      if (plain >= PLAIN || (best->value < UNTRIED && residual(s, best, lower, upper) <= TOLERANCE)) break;
+      if (plain >= PLAIN) break;
+      if ((sure || !CONVERGING) && best->value < UNTRIED && s->sent <= TOLERANCE && residual(s, best, lower, upper) <= TOLERANCE) break;
     }
     if (accepted && direct(s, best, gains, data, lower, upper)) return 1;
+    swept |= accepted;
   }
   good = posed && best->value < UNTRIED;
   left = residual(s, best, lower, upper);
@@ -334,7 +374,7 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
     res[1][1] = good ? left : 0;
     res[1][2] = 0;
     res[1][3] = tried;
-    res[1][4] = empty ? INFEASIBLE : !good ? NON_FINITE : left <= TOLERANCE ? CONVERGED : NOT_CONVERGED;
+    res[1][4] = empty ? INFEASIBLE : !good ? NON_FINITE : left <= TOLERANCE && s->sent <= TOLERANCE ? CONVERGED : NOT_CONVERGED;
   }
   remember(s, best, good, posed, memory, lower, upper, res[2]);
   return 0;

@@ -17,7 +17,7 @@ from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
-from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.problem import OptimalControl, sizes_along
 from fpirhc.optimisers.base import Optimiser, first_plan, paid, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
@@ -29,6 +29,7 @@ from fpirhc.symbolic.live import settled
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
 _FIRST_CALLS = 5  # of `converging`, before a run
+_CLOSE = 1e-4  # of the size of an input: the tolerance unless one is given
 _GROWTH = 1e12  # of a motion of the model over the horizon, beyond which rollouts of plans leave their gradients too few digits
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
@@ -38,9 +39,12 @@ class FixedPoint(Optimiser):
     """Fixed-point iteration in place of the reduced gradient.
 
     Args:
-        iterations: per call without limits of states; 1 is the intended number, one step per control cycle.
-        tolerance: of the stationarity (in the unit of the inputs), below which a plan is converged.
-        feasible: violation of a state bound (in its unit) below which a plan counts as converged.
+        iterations: per call without limits of states. None: a call ends where its plan is solved, after at most 50; it takes at
+            least one. A number: exactly so many, whatever they achieve; 1 is one step per control cycle.
+        tolerance: of the stationarity and of the move that a sweep wants (in the unit of the inputs), below which a plan is
+            converged; None: 1e-4 of half the smallest range of an input, or of its size along the reference. The status of a call
+            is OK where the plan that it returns is below it, and NOT_CONVERGED elsewhere, also after so many iterations.
+        feasible: violation of a state bound, as a share of half its range, below which a plan counts as converged.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
             Gauss-Newton first where a remembered plan is improved.
@@ -52,8 +56,8 @@ class FixedPoint(Optimiser):
             economic cost has several minima, and a remembered plan stays in its own; a call takes twice as long.
     """
 
-    iterations: Count
-    tolerance: Positive
+    iterations: Count | None = None
+    tolerance: Positive | None = None
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     hessian: HessianModel | None = None
     damping: NotNegative = 0.0
@@ -67,6 +71,10 @@ class FixedPoint(Optimiser):
     def near_plan(self) -> Optimiser:
         return replace(self, second_start=False) if self.second_start else self
 
+    @property
+    def most_work(self) -> dict[str, int]:
+        return {name: count for name, count in super().most_work.items() if count is not None}
+
     def check(self, ocp: OptimalControl) -> None:
         """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.
 
@@ -78,7 +86,7 @@ class FixedPoint(Optimiser):
         require_map_of_plan("FixedPoint", self.map)
         reach = np.abs(np.concatenate([ocp.input_lower, ocp.input_upper, ocp.nodes[1].ravel()]))
         rounding = _DIGITS * float(reach[np.isfinite(reach)].max(initial=0.0))
-        if self.tolerance < rounding:
+        if self.tolerance is not None and self.tolerance < rounding:
             raise InvalidValue(
                 f"FixedPoint(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
                 f"use {1e3 * rounding:.0g}"
@@ -103,14 +111,14 @@ class FixedPoint(Optimiser):
     def step(self, ocp: OptimalControl) -> ca.Function:
         ocp = self._of(ocp)
         if ocp.bounds_states:
-            return self._begun(ocp, limited_step(ocp, self._limited(self.most_iterations)))
-        return self._begun(ocp, plain_step(ocp, self._plain(converging=False)))
+            return self._begun(ocp, limited_step(ocp, self._limited(ocp, self.most_iterations)))
+        return self._begun(ocp, plain_step(ocp, self._plain(ocp, converging=False)))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
         ocp = self._of(ocp)
         if ocp.bounds_states:
-            return self._begun(ocp, limited_step(ocp, self._limited(_MOST_LIMITED)))
-        return self._begun(ocp, plain_step(ocp, self._plain(converging=True)))
+            return self._begun(ocp, limited_step(ocp, self._limited(ocp, _MOST_LIMITED)))
+        return self._begun(ocp, plain_step(ocp, self._plain(ocp, converging=True)))
 
     def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
         return _of_two_starts(ocp, one, self.memory(ocp)) if self.second_start else one
@@ -120,7 +128,7 @@ class FixedPoint(Optimiser):
             return None
         # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
         own, ocp = settled(self, ocp.setting_numbers), self._of(ocp)
-        limited = limited_step(replace(ocp, settings=()), own._limited(_MOST_LIMITED))
+        limited = limited_step(replace(ocp, settings=()), own._limited(ocp, _MOST_LIMITED))
         return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
@@ -131,12 +139,20 @@ class FixedPoint(Optimiser):
         """The problem with the second derivatives of the Hessian's model."""
         return ocp if self.hessian is None else self.hessian.of(ocp)
 
-    def _plain(self, *, converging: bool) -> PlainSettings:
+    def _plain(self, ocp: OptimalControl, *, converging: bool) -> PlainSettings:
         hessian = self.hessian or GaussNewton()
-        return PlainSettings(self.tolerance, self.map, hessian, self.damping, self.iterations, converging)
+        return PlainSettings(self._tolerance(ocp), self.map, hessian, self.damping, self.iterations or 0, converging)
 
-    def _limited(self, iterations: int) -> LimitedSettings:
-        return LimitedSettings(self.tolerance, self.feasible, self.map, self.hessian, self.damping, iterations)
+    def _tolerance(self, ocp: OptimalControl) -> float:
+        if self.tolerance is not None:
+            return self.tolerance
+        half = 0.5 * (ocp.input_upper - ocp.input_lower)
+        usable = np.isfinite(half) & (half > 0)
+        sizes = half if usable.all() else np.where(usable, half, sizes_along(ocp.nodes[1]))
+        return _CLOSE * float(sizes.min())
+
+    def _limited(self, ocp: OptimalControl, iterations: int) -> LimitedSettings:
+        return LimitedSettings(self._tolerance(ocp), self.feasible, self.map, self.hessian, self.damping, iterations)
 
 
 def _require_rollouts(growth: np.ndarray) -> None:
@@ -146,8 +162,8 @@ def _require_rollouts(growth: np.ndarray) -> None:
     raise NotSupported(
         f"FixedPoint rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
         f"{np.prod(growth):.1g} over the horizon, so plans have no digits. Where the plant itself does not run away so, a fast "
-        f"mode is the cause: use Horizon(discretisation=Collocation()), or RungeKutta4(substeps=...) with more sub-steps; else limit "
-        f"a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages"
+        f"mode is the cause: use Horizon(discretisation=Collocation()), or RungeKutta4(substeps=...) with more sub-steps; else "
+        f"limit a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages"
     )
 
 

@@ -35,6 +35,7 @@ from fpirhc.symbolic.live import LiveNumber, Number
 from fpirhc.symbolic.native import Native
 
 MOST = 100  # iterations of one converging call
+CAP = 50  # the same of one in a loop
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
 _TEXTS = ("kernels", "fixed_point", "entry")
 
@@ -47,18 +48,23 @@ class PlainSettings:
     map: Deformation  # the deformation that makes the next plan
     hessian: HessianModel  # second derivatives of the quadratic model
     damping: Number  # added to the curvature of the inputs, in units of it
-    iterations: int  # of one call that does not converge
+    iterations: int  # of one call that does not converge; 0: it ends where the plan is solved, after at most `CAP`
     converging: bool  # whether a call goes on until the tolerance is met
 
     @property
     def most(self) -> int:
         """Most iterations of one call."""
-        return MOST if self.converging else self.iterations
+        return MOST if self.converging else self.iterations or CAP
+
+    @property
+    def ends(self) -> bool:
+        """Whether a call ends where the plan is solved."""
+        return self.converging or not self.iterations
 
     @property
     def stops(self) -> dict[str, object]:
         """Definitions for the loops in C of when a call ends."""
-        return {"STOP_EARLY": int(self.converging), "ITERATIONS": self.most}
+        return {"STOP_EARLY": int(self.ends), "CONVERGING": int(self.converging), "ITERATIONS": self.most}
 
 
 def plain_memory(ocp: OptimalControl) -> Layout:
@@ -89,7 +95,12 @@ def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
 
 def _library(ocp: OptimalControl, settings: PlainSettings) -> Native:
     """The driver alone as a library, whose last argument says whether a call stops where the plan is converged."""
-    stops = {"STOP_EARLY": f"({LAST} > 0)", "ITERATIONS": f"(STOP_EARLY ? {MOST} : {settings.iterations})"}
+    converging = f"({LAST} > 0)"
+    stops: dict[str, object] = {
+        "STOP_EARLY": converging if settings.iterations else 1,
+        "CONVERGING": converging,
+        "ITERATIONS": f"({converging} ? {MOST} : {settings.iterations or CAP})",
+    }
     driver = plain_driver(ocp, settings, stops)
     return plan_library(ocp, "fpirhc_fixed_point_both", driver, plain_memory(ocp).size)
 
@@ -110,7 +121,7 @@ def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
 
 
 def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[str, object]) -> Driver:
-    """Return the loops in C with what they call; `stops` are the definitions of STOP_EARLY and ITERATIONS."""
+    """Return the loops in C with what they call; `stops` are the definitions of when a call ends."""
     leaves = {
         **split_stage(ocp),
         "hessian": hessian_stage(ocp, settings.hessian),
@@ -134,8 +145,8 @@ def _room(ocp: OptimalControl, costates: int) -> int:
     """Numbers of the struct Search of fixed_point.c."""
     nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
     plan = 2 * n * nu + (n + 1) * ns + 1
-    course = n * (nu + partial_count(ocp)) + costates * ns + ns * ns
-    return 2 * plan + course + 5 + (nu + 1 if ocp.settings else 0)
+    course = n * (nu + nu * nu + partial_count(ocp)) + costates * ns + ns * ns
+    return 2 * plan + course + 6 + (nu + 1 if ocp.settings else 0)
 
 
 def _sizes(ocp: OptimalControl) -> dict[str, object]:
@@ -171,6 +182,7 @@ def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object
         "SHORTER": line_search.SHORTER,
         "SHORTEST": line_search.SHORTEST,
         "DRAWN_IN": line_search.DRAWN_IN,
+        "FLAT": line_search.FLAT,
         "ROUNDING": f"OF_TYPE({line_search.ROUNDING}, 1e-6)",
         "PLAIN": _MOST_PLAIN,
         "UNTRIED": f"(FINITE / {FINITE / line_search.UNTRIED:g})",
@@ -190,13 +202,14 @@ def plain_graph(ocp: OptimalControl, settings: PlainSettings, name: str) -> ca.F
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
     arguments, memory = call_symbols(ocp)
     search, anchor = _search(ocp, settings), first_anchor(ocp, arguments, memory)
-    if settings.converging:
+    if settings.ends:
         anchor, count = _converged(ocp, settings, search, arguments, anchor)
         return ca.Function(name, [*arguments, memory], _results(ocp, settings, arguments, memory, anchor, count - 1))
     for _ in range(settings.iterations):
         anchor, plan = search.tried(anchor, arguments)
         anchor = search.directed(anchor, plan, arguments)
-    anchor, _ = search.tried(anchor, arguments)
+    anchor, plan = search.tried(anchor, arguments)
+    anchor = search.looked(anchor, plan, arguments)
     results = _results(ocp, settings, arguments, memory, anchor, settings.iterations)
     return ca.Function(name, [*arguments, memory], results)
 
@@ -232,6 +245,8 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
         step=ca.MX(1),
         gamma=gamma,
         resume=resume,
+        sent=ca.MX(10 * line_search.UNTRIED),
+        curved=ca.MX.zeros(nu, nu * n),
     )
 
 
@@ -245,21 +260,31 @@ def _converged(
 ) -> tuple[Anchor, ca.MX]:
     """The anchor after the last iteration that is needed, and how many plans were tried."""
     symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
+    count, plain, ended = counts = [ca.MX.sym(name) for name in ("count", "plain", "ended")]
     tried, plan = search.tried(symbols, arguments)
-    work = ca.Function("fpirhc_iteration", [*arguments, *symbols], list(search.directed(tried, plan, arguments)))
-    rest = ca.Function("fpirhc_rest", [*arguments, *symbols], list(symbols))
-    choice = ca.Function.if_else("fpirhc_iteration_if_needed", work, rest)
-    again = _needed(ocp, settings, arguments, symbols)
-    known = [ca.MX.sym("count"), ca.MX.sym("plain")]
-    needed = again(*arguments, symbols.inputs, symbols.slope, symbols.value, known[1])
-    plainer = known[1] + ca.logic_and(needed, symbols.step < line_search.SHORTEST)
-    results = [*choice(needed, *arguments, *symbols), known[0] + needed, plainer]
-    once = ca.Function("fpirhc_iterated", [*arguments, *symbols, *known], results)
+    looked = search.looked(tried, plan, arguments)
+    tolerance = ocp.number_in(settings.tolerance, arguments.data)
+    residual = stationarity(ocp, looked.inputs, looked.slope, arguments.lower, arguments.upper, arguments.data)
+    solved = ca.logic_and(
+        looked.value < line_search.UNTRIED, ca.logic_and(residual <= tolerance, looked.sent <= tolerance)
+    )
+    # In open loop a sweep at the plan before has to say so too.
+    solved = ca.logic_and(solved, symbols.sent <= tolerance) if settings.converging else solved
+    plainer = plain + (symbols.step < line_search.SHORTEST)
+    ends = ca.logic_or(ca.logic_or(solved, plainer >= _MOST_PLAIN), count >= settings.most)
+    directed = search.directed(looked, plan, arguments)
+    after = [ca.if_else(ends, old, new) for old, new in zip(looked, directed, strict=True)]
+    given = [*arguments, *symbols, *counts]
+    work = ca.Function("fpirhc_iteration", given, [*after, count + 1, plainer, ends])
+    rest = ca.Function("fpirhc_rest", given, [*symbols, *counts])
+    once = ca.Function(
+        "fpirhc_iterated", given, list(ca.Function.if_else("fpirhc_if_needed", work, rest)(1 - ended, *given))
+    )
     few = ca.Function("fpirhc_few", once.mx_in(), _iterated([once] * _FEW, once.mx_in()))
     times = divmod(settings.most + 1, _FEW)
-    begin = [*arguments, *anchor, ca.MX(0), ca.MX(0)]
-    *last, count, _ = _iterated([few] * times[0] + [once] * times[1], begin)
-    return Anchor(*last), count
+    begin = [*arguments, *anchor, ca.MX(0), ca.MX(0), ca.MX(0)]
+    *last, tries, _, _ = _iterated([few] * times[0] + [once] * times[1], begin)
+    return Anchor(*last), tries
 
 
 _FEW = 15  # iterations in one Function: a graph of all of them takes longer to build
@@ -271,17 +296,6 @@ def _iterated(functions: Sequence[ca.Function], values: Sequence[ca.MX]) -> list
     for function in functions:
         state = function.call([*given, *state])
     return state
-
-
-def _needed(ocp: OptimalControl, settings: PlainSettings, arguments: Arguments, anchor: Anchor) -> ca.Function:
-    """Function (arguments, inputs, slope, value, plain steps) -> whether another iteration is needed."""
-    plain = ca.MX.sym("plain")
-    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
-    solved = ca.logic_and(
-        anchor.value < line_search.UNTRIED, residual <= ocp.number_in(settings.tolerance, arguments.data)
-    )
-    needed = ca.logic_and(ca.logic_not(solved), plain < _MOST_PLAIN)
-    return ca.Function("fpirhc_needed", [*arguments, anchor.inputs, anchor.slope, anchor.value, plain], [needed])
 
 
 def _results(
@@ -298,7 +312,8 @@ def _results(
     residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0
     tolerance = ocp.number_in(settings.tolerance, arguments.data)
-    status = ca.if_else(empty, int(Status.INFEASIBLE), status_of(finite, residual, 0, tolerance))
+    status = status_of(finite, ca.fmax(residual, anchor.sent), 0, tolerance)
+    status = ca.if_else(empty, int(Status.INFEASIBLE), status)
     numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
     solved = plain_memory(ocp).join(
         {

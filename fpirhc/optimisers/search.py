@@ -12,7 +12,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.riccati import backward_sweep, in_reverse
+from fpirhc.horizon.riccati import backward_sweep, box_policy, in_reverse
 from fpirhc.horizon.stage_data import STEEPEST, settings_in
 from fpirhc.optimisers.base import clip, sane
 from fpirhc.symbolic.expression import FINITE, TINY, is_finite
@@ -21,6 +21,7 @@ from fpirhc.symbolic.live import PREFIX, Number
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is required
 ARMIJO = 1e-2  # share of the first-order decrease that is required of a short step
 SHORTER = 0.25  # factor of the step after a plan that did not decrease the envelope
+FLAT = 1e-9  # of the cost: a sweep that promises less finds nothing to lower
 DRAWN_IN = 0.01  # least factor of gamma after a plain step that was rejected
 SHORTEST = 0.05  # below it the plain fixed-point step is taken
 ROUNDING = 1e-13  # relative to the cost: smaller differences are rounding
@@ -50,6 +51,8 @@ class Anchor(NamedTuple):
     step: ca.MX  # tau; below SHORTEST the next plan is T
     gamma: ca.MX
     resume: ca.MX  # tau after the evaluation of a remembered plan
+    sent: ca.MX  # the largest move that a sweep at U wants of an input; beyond every number before one
+    curved: ca.MX  # Q_uu of the last sweep (nu, nu N); zero before one
 
 
 class _Expanded(NamedTuple):
@@ -83,6 +86,7 @@ class Search:
         self._expand, self._try = _expansion(ocp), _trial(ocp)
         self._judge = _judgement(ocp)
         self._direct = _direction(ocp, hessian, map, damping)
+        self._look = _look(ocp)
 
     def tried(self, anchor: Anchor, arguments: Arguments) -> tuple[Anchor, _Expanded]:
         """Return the anchor after its next plan was tried, and that plan expanded."""
@@ -97,10 +101,23 @@ class Search:
 
     def directed(self, anchor: Anchor, plan: _Expanded, arguments: Arguments) -> Anchor:
         """Return the anchor with the direction of a sweep where the last plan was accepted, else with its old direction."""
-        move, gains = self._direct(*plan[:7], arguments.data, arguments.lower, arguments.upper)
-        return anchor._replace(
-            move=ca.if_else(plan.accepted, move, anchor.move), gains=ca.if_else(plan.accepted, gains, anchor.gains)
-        )
+        move, gains, curved, *seen = self._direct(*plan[:7], arguments.data, arguments.lower, arguments.upper)
+        made = {"move": move, "gains": gains, "curved": curved, "sent": _wanted(anchor, *seen)}
+        return anchor._replace(**{k: ca.if_else(plan.accepted, new, getattr(anchor, k)) for k, new in made.items()})
+
+    def looked(self, anchor: Anchor, plan: _Expanded, arguments: Arguments) -> Anchor:
+        """Return the anchor with what a sweep at a plan that was accepted would want, by the factors of the last sweep."""
+        given = plan.inputs, plan.states, *plan[2:6], anchor.gains, anchor.curved
+        sent = _wanted(anchor, *self._look(*given, arguments.data, arguments.lower, arguments.upper))
+        swept = ca.norm_inf(ca.vec(anchor.curved)) > 0
+        return anchor._replace(sent=ca.if_else(ca.logic_and(plan.accepted, swept), sent, anchor.sent))
+
+
+def _wanted(anchor: Anchor, most: ca.MX, fall: ca.MX) -> ca.MX:
+    """The largest move that a sweep wants: none where the cost is flat, because a move there lowers the cost by nothing."""
+    flat = FLAT * ca.fabs(anchor.value)
+    # What is no number is no certificate.
+    return ca.if_else(fall > flat, most, ca.if_else(fall <= flat, 0, 10 * UNTRIED))
 
 
 def _trial(ocp: OptimalControl) -> ca.Function:
@@ -151,7 +168,7 @@ def _expansion(ocp: OptimalControl) -> ca.Function:
 
 
 def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: Number) -> ca.Function:
-    """Function (U, X, A, B, l_s, l_u, costates, data, lower, upper) -> (v, K): the deformed feedforward and its feedback."""
+    """Function (U, X, A, B, l_s, l_u, costates, data, lower, upper) -> (v deformed, K, Q_uu, largest move, promised fall)."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
     stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(_stage_shapes(ns, nu))]
@@ -161,11 +178,35 @@ def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, dam
     _, slope, value = hessian_end(ocp)(states[:, n], data[:, n])
     bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
     damped = [ocp.number_in(damping, data) / ocp.scale_in(data)] if ocp.settings else []
-    move, gains = backward_sweep(ocp, damping)(*stacked, *hessians, inputs, *bounds, value, slope, *damped)
+    move, gains, curved, fall = backward_sweep(ocp, damping)(
+        *stacked, *hessians, inputs, *bounds, value, slope, *damped
+    )
     deform = deformed_move(map, nu * n, ocp)
     deformed = deform(*(ca.vec(move), data[:, 0])[: deform.n_in()])
-    results = [ca.reshape(deformed, nu, n), gains]
+    results = [ca.reshape(deformed, nu, n), gains, curved, ca.norm_inf(ca.vec(move)), fall]
     return ca.Function("fpirhc_direction", [inputs, states, *stacked, costates, data, lower, upper], results)
+
+
+def _look(ocp: OptimalControl) -> ca.Function:
+    """Function (U, X, A, B, l_s, l_u, K, Q_uu, data, lower, upper) -> (largest move, promised fall), by one adjoint pass."""
+    n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
+    shapes = [(ns, 1), *_stage_shapes(ns, nu), (nu, ns), (nu, nu), (nu, 1), (nu, 1), (nu, 1)]
+    ahead, a, b, by_state, by_input, gain, curved, u, low, high = y = [
+        ca.SX.sym(f"y{k}", *shape) for k, shape in enumerate(shapes)
+    ]
+    steep = by_input + b.T @ ahead
+    move, _ = box_policy(nu, 1)(steep, curved, ca.SX.zeros(nu, 1), low - u, high - u)
+    results = [by_state + a.T @ ahead + gain.T @ steep, ca.norm_inf(move), -0.5 * ca.dot(steep, move)]
+    stage = ca.Function("fpirhc_look_stage", y, results)
+    inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
+    stacked = [ca.MX.sym(f"m{k}", rows, columns * n) for k, (rows, columns) in enumerate(shapes[1:7])]
+    data, lower, upper = ca.MX.sym("data", ocp.data.size, n + 1), ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
+    _, slope, _ = hessian_end(ocp)(states[:, n], data[:, n])
+    turned = [in_reverse(m, n) for m in (*stacked, inputs)]
+    _, moves, falls = stage.mapaccum("fpirhc_look_stages", n)(
+        slope, *turned, *(ca.repmat(v, 1, n) for v in (lower, upper))
+    )
+    return ca.Function("fpirhc_look", [inputs, states, *stacked, data, lower, upper], [ca.mmax(moves), ca.sum2(falls)])
 
 
 def deformed_move(map: Deformation, size: int, ocp: OptimalControl | None = None) -> ca.Function:
@@ -191,7 +232,7 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
     value, slope = ca.MX.sym("V"), ca.MX.sym("g", nu, n)
     lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
-    shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), (1, 1), (1, 1), (1, 1), (1, 1), (1, 1)]
+    shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), *[(1, 1)] * 6, (nu, nu * n)]
     old = Anchor(*(ca.MX.sym(name, *shape) for name, shape in zip(Anchor._fields, shapes, strict=True)))
     live = [ca.MX.sym("scale", nu)] if ocp.settings else []
     scale = ca.repmat(live[0] if live else ocp.scale_in(None), 1, n)
@@ -203,9 +244,8 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     accepted, excess = _accepted(metric, old, (inputs, value, envelope), finite, flags)
     retreat = _retreat(metric, old, finite, excess, flags)
     step = ca.if_else(flags[0], old.resume, 1)
-    advance = Anchor(
-        inputs, states[:, :n], old.move, old.gains, plain, slope, value, envelope, step, old.gamma, old.resume
-    )
+    here = {"inputs": inputs, "states": states[:, :n], "plain": plain, "slope": slope, "value": value}
+    advance = old._replace(**here, envelope=envelope, step=step, sent=ca.MX(10 * UNTRIED))
     next_anchor = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
     arguments = [inputs, states, value, slope, lower, upper, *old, *live]
     return ca.Function("fpirhc_judgement", arguments, [*next_anchor, accepted])

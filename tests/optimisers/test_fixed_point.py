@@ -402,3 +402,31 @@ def test_feedback_keeps_unstable_plants_together():
 def test_settings_are_checked(settings, message):
     with pytest.raises(ValueError, match=message):
         fp.FixedPoint(**{"iterations": 1, "tolerance": 1e-6, **settings})
+
+
+MAGNET = fp.Plant(
+    coordinates={"gap": "m"},
+    inputs={"current": "A"},
+    order=2,
+    response=lambda q, v, u, p: {"gap": 9.81 - p.inductance / (2 * p.mass) * (u.current / q.gap) ** 2},
+    parameters={"inductance": fp.Parameter(2.0e-4, 1.4e-4, "H m"), "mass": fp.Parameter(0.06, 0.06, "kg")},
+)
+
+
+@pytest.mark.parametrize("gap", [8e-3, 9e-3 - 1e-9, 9e-3, 9e-3 + 1e-9, 9.00001e-3, 12e-3, 14.75e-3])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-6])
+def test_at_rest_on_the_reference_the_first_plan_is_the_feedforward(gap, tolerance):
+    """Without current a change of it does nothing, so the gradient of the zero plan is small: that is no certificate."""
+    reference, forward = fp.Trajectory(lambda t: {"gap": gap + 0 * t}), gap * np.sqrt(9.81 * 2 * 0.06 / 2e-4)
+    cost = fp.Quadratic(states={"gap": 1e6, "gap'": 1e2}, deviation={"current": 1.0})
+    horizon, limits = fp.Horizon(stages=20, step=5e-3), fp.Limits(inputs={"current": (0.0, 3.0)})
+    ocp = transcribe(MAGNET, reference, horizon, cost, limits)
+    data, first = stage_data(MAGNET, reference, horizon, cost)(0.0, MAGNET.approximate).full(), np.array([gap, 0.0])
+    optimiser = fp.FixedPoint(iterations=1, tolerance=tolerance)
+    layout = optimiser.memory(ocp)
+    bounds = ocp.input_lower, ocp.input_upper
+    inputs, diagnostics, _ = (v.full() for v in optimiser.converging(ocp)(first, data, *bounds, layout.start()))
+    assert diagnostics.ravel()[4] == fp.Status.OK
+    np.testing.assert_allclose(inputs, forward, atol=tolerance)
+    remembered = layout.unpack(optimiser.first_memory(ocp, first, data))["plan_inputs"]
+    np.testing.assert_allclose(remembered, forward, atol=tolerance)

@@ -27,9 +27,9 @@ def same(one: list[np.ndarray], other: list[np.ndarray], allowed: float = 1e-9) 
         np.testing.assert_allclose(a, b, rtol=allowed, atol=allowed)
 
 
-@pytest.fixture(scope="module", params=[(1, None), (4, fp.ExactHessian())], ids=["one", "four"])
+@pytest.fixture(scope="module", params=[(1, None), (4, fp.ExactHessian()), (None, None)], ids=["one", "four", "solved"])
 def stepping(request):
-    """Loops of one iteration per call, and of four with the exact Hessian."""
+    """Loops of one iteration per call, of four with the exact Hessian, and of as many as a plan needs."""
     iterations, hessian = request.param
     return pair("step", fp.FixedPoint(iterations=iterations, tolerance=1e-7, damping=0.02, hessian=hessian))
 
