@@ -21,7 +21,7 @@ from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.symbolic.live import LiveNumber, Number
 
 GAP = 1e-9  # half width of the bounds of what the end must meet, in sizes of the state
-_LEAST = 1e-3  # a smaller spread of the reference is no measure of a state
+_LEAST = 1e-3  # of what inputs move a state by: a smaller spread of the reference is no measure of it
 _POWER_STEPS = 50
 _RUNS_AWAY = 2e3  # times that a motion of the model grows over the horizon
 _MARGIN = 1.1  # a power iteration approaches the eigenvalue from below
@@ -239,6 +239,15 @@ class _ReferenceExpansion:
             slopes[i] = slope
         return slopes
 
+    def moved_by(self, inputs: np.ndarray) -> np.ndarray:
+        """Return the most by which finite inputs of this size (nu,) in the first stage move every state, (ns,)."""
+        slope, most = self.b[0] * np.where(np.isfinite(inputs), inputs, 0.0), np.zeros(self.b.shape[1])
+        with np.errstate(all="ignore"):
+            for a in (*self.a[1:], None):
+                most = np.fmax(most, np.abs(slope).max(axis=1, initial=0.0))
+                slope = slope if a is None else a @ slope
+        return np.where(np.isfinite(most), most, 0.0)
+
     def hessian(self) -> np.ndarray:
         """Return M (N nu, N nu), the Hessian of V with the dynamics linearised."""
         stages, _, nu = self.b.shape
@@ -290,10 +299,13 @@ def expand_along(
     return _ReferenceExpansion(a, b, q, s, r, final)
 
 
-def sizes_along(states: np.ndarray) -> np.ndarray:
-    """Return half the spread of every state along the reference and a tenth of its size, (ns,); 1 for one that stays zero."""
-    about = 0.5 * np.ptp(states, axis=1) + 0.1 * np.abs(states).max(axis=1)
-    return np.where(about > 0, np.maximum(about, _LEAST), 1.0)
+def sizes_along(states: np.ndarray, moved: np.ndarray | float = 1.0) -> np.ndarray:
+    """Return half the spread of every state along the reference and a tenth of its size, (ns,), at least a share of `moved`.
+
+    A state that stays zero has the size of what it is moved by; 1 where nothing is known to move it.
+    """
+    about = np.maximum(0.5 * np.ptp(states, axis=1) + 0.1 * np.abs(states).max(axis=1), _LEAST * np.asarray(moved))
+    return np.where(about > 0, about, 1.0)
 
 
 def input_curvature(along: _ReferenceExpansion, step: float) -> np.ndarray:

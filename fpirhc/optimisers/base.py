@@ -13,16 +13,15 @@ import numpy as np
 from fpirhc.describe import Same
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
+from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout, sizes_along
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, registered
 from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import Native, native
 
-FEASIBLE = 1e-4  # largest violation of a state bound that still counts as kept, where an optimiser has no unit for it
-_SHARE = 1e-3  # of half a range, where this is less than `FEASIBLE`
-KEPT = 1e-6  # the same where an optimiser has a unit for it
+FEASIBLE = 1e-4  # largest violation of a state bound, as a share of its unit, that still counts as kept
+KEPT = 1e-6  # the same for an optimiser that keeps limits more closely
 _ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
@@ -201,10 +200,15 @@ def counted(ocp: OptimalControl, violation: ca.MX, states: ca.MX) -> ca.MX:
 
 
 def feasible_to(ocp: OptimalControl) -> np.ndarray:
-    """Return the violation of every state's limits that counts as kept (ns,), by half its range; `FEASIBLE` where that is 1."""
+    """Return the violation of every state's limits that counts as kept (ns,): whatever its unit, the same share of it."""
+    return FEASIBLE * state_units(ocp)
+
+
+def state_units(ocp: OptimalControl) -> np.ndarray:
+    """Return the units of the states (ns,): half the range of their limits; without both, their size along the reference."""
     half = ocp.half_ranges
-    about = np.minimum(FEASIBLE * np.maximum(half, 1), _SHARE * half)
-    return np.where(np.isfinite(half), about, FEASIBLE)
+    sizes = sizes_along(ocp.nodes[0], ocp.along.moved_by(0.5 * (ocp.input_upper - ocp.input_lower)))
+    return np.where(np.isfinite(half), half, sizes)
 
 
 def paid(ocp: OptimalControl) -> ca.Function:

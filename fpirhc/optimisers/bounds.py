@@ -13,9 +13,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.problem import OptimalControl, answered_curvature, sizes_along
+from fpirhc.horizon.problem import OptimalControl, answered_curvature
 from fpirhc.horizon.riccati import Expansion, in_reverse
-from fpirhc.optimisers.base import FEASIBLE, KEPT, clip
+from fpirhc.optimisers.base import KEPT, clip, state_units
 from fpirhc.symbolic.expression import FINITE, is_finite
 
 _CAPACITY = 1e4  # largest multiplier of a hard limit, in units of cost per unit
@@ -55,8 +55,7 @@ def scales(ocp: OptimalControl) -> Scales:
 
     gamma = unit^2 / C turns a gradient into a move, and 1e4 C / unit is the largest multiplier that a limit of a state may have.
     """
-    range_ = ocp.half_ranges
-    states = np.where(np.isfinite(range_), range_, sizes_along(ocp.nodes[0]))
+    states = state_units(ocp)
     places = np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper))
     inputs = _input_units(ocp, states, places)
     cost = float(np.median(_answered_curvature(ocp) * inputs**2))
@@ -67,8 +66,7 @@ def scales(ocp: OptimalControl) -> Scales:
 
 def tolerated(ocp: OptimalControl) -> np.ndarray:
     """Return the violation of every state's limits that still counts as kept, shape (ns,)."""
-    half = ocp.half_ranges
-    return np.where(np.isfinite(half), np.minimum(FEASIBLE, KEPT * half), FEASIBLE)
+    return KEPT * state_units(ocp)
 
 
 def _input_units(ocp: OptimalControl, states: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -270,7 +268,7 @@ class Certified(NamedTuple):
     slope: ca.MX  # g (nu, N)
     left: ca.MX  # stationarity
     violation: ca.MX
-    broken: ca.MX  # violation of limits that are not given up
+    broken: ca.MX  # violation of limits that are not given up, as a share of their unit
     error: ca.MX  # E
 
 
@@ -297,7 +295,7 @@ def certified(ocp: OptimalControl, limits: Limited, scales: Scales, p: Expansion
     error = ca.if_else(given_up, ca.fmax(d, 0), complementarity)
     error = ca.if_else(counted, ca.fmax(error, limits.reach * ca.fmax(-z, 0)) / limits.unit, 0)
     beyond = ca.if_else(counted, ca.fmax(-d, 0), 0)
-    broken = ca.if_else(given_up, 0, beyond)
+    broken = ca.if_else(given_up, 0, beyond / limits.unit)
     worst = ca.fmax(ca.fmax(ca.mmax(step), largest_gap(p, scales)), ca.mmax(error))
     finite = is_finite(ca.vec(slope))
     numbers = [ca.if_else(finite, v, 10 * FINITE) for v in (left, worst)]

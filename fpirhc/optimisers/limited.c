@@ -49,8 +49,8 @@ static void log_terms(const Machine* m, const Point* p, const Duals* y, casadi_r
   EACH_LIMIT(&m->limits) {
     casadi_real t = y->t[side][k], e = y->e[side][k];
     *theta += fabs(distance(&m->limits, p, side, i, r) - t + e) / unit[r];
-    *phi -= m->mu * log(t);
-    if (r >= NU) *phi += capacity(r) * e - m->mu * log(e);
+    *phi -= m->mu * log(t / unit[r]);
+    if (r >= NU) *phi += capacity(r) * e - m->mu * log(e / unit[r]);
   }
 }
 
@@ -475,7 +475,7 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   /* A call that ends at its most iterations may still get inside, unless multipliers prove that it does not; one that has tried
      everything has not. */
   if (is_done(&c)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
-  else if (c.violation > NEAR_LIMIT && (m.stuck || cannot_be_kept(&m.limits, best, m.room->y.z))) status = INFEASIBLE;
+  else if (outside(&m.limits, best) > NEAR_LIMIT && (m.stuck || cannot_be_kept(&m.limits, best, m.room->y.z))) status = INFEASIBLE;
   else status = NOT_CONVERGED;
   status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;
   if (res[0])

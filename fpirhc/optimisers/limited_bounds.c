@@ -15,7 +15,7 @@ typedef struct {
 } Limits;
 
 typedef struct {
-  casadi_real gap, error, left, violation, broken; /* largest gap, scaled error, stationarity, violation, and that which is not certified */
+  casadi_real gap, error, left, violation, broken; /* largest gap, scaled error, stationarity, violation, and the share of a unit that is not certified */
 } Certificate;
 
 static const casadi_real state_limits[2][NB + 1] = {STATE_LOWER, STATE_UPPER};
@@ -49,13 +49,14 @@ static void set_limits(Limits* limits, In lower, In upper) {
     }
 }
 
-/* Multipliers of states as they enter the gradient, whose other rows stay; where a limit is farther than `near` they count as zero. */
+/* Multipliers of states as they enter the gradient, whose other rows stay; where a limit is farther than `near` of its unit they count
+   as zero. */
 static void pushes(Out push, const Limits* limits, const Point* p, casadi_real z[2][COUNT], casadi_real near) {
   int side, i, r, k;
   for (i = 0; i < N; ++i)
     for (r = NU; r < ROWS; ++r) push[i * ROWS + r] = 0;
   EACH_STATE_LIMIT(limits)
-    if (distance(limits, p, side, i, r) <= near) push[k] -= SIGN(side) * between(z[side][k], 0, capacity(r));
+    if (distance(limits, p, side, i, r) <= near * unit[r]) push[k] -= SIGN(side) * between(z[side][k], 0, capacity(r));
 }
 
 /* The reduced gradient g by an adjoint sweep. */
@@ -107,7 +108,7 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
       c.error = larger(c.error, larger(d, 0) / unit[r]);
     } else {
       c.error = larger(c.error, fabs(smaller(d, reach(r) * between(y, 0, capacity(r)))) / unit[r]);
-      c.broken = larger(c.broken, -d);
+      c.broken = larger(c.broken, -d / unit[r]);
     }
   }
   if (!all_finite(g, N * NU)) c.error = c.left = 10 * FINITE; /* fmax would hide NaN */

@@ -209,7 +209,7 @@ def _status(call: Call, s: State, p: Expansion, c: Certified, ok: ca.MX) -> ca.M
     solved = ca.if_else(call.limits.outside(p) > KEPT, int(Status.INFEASIBLE), int(Status.OK))
     # A call that ends at its most iterations may still get inside, unless multipliers prove that it does not; one that has tried
     # everything has not.
-    far = ca.logic_and(c.violation > FEASIBLE, ca.logic_or(s["stuck"], _cannot_be_kept(call, p, s["z"])))
+    far = ca.logic_and(call.limits.outside(p) > FEASIBLE, ca.logic_or(s["stuck"], _cannot_be_kept(call, p, s["z"])))
     unsolved = ca.if_else(far, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
     status = ca.if_else(ok, ca.if_else(call.is_done(c), solved, unsolved), int(Status.NON_FINITE))
     return ca.if_else(ca.mmax(call.lower - call.upper) > 0, int(Status.INFEASIBLE), status)
@@ -277,7 +277,7 @@ class _Turn:
 
 def _returned_left(call: Call, p: Expansion, z: ca.MX) -> ca.MX:
     """Return the stationarity with which a plan is returned: multipliers of limits that are not near count as zero."""
-    slope = certify(call.ocp, call.limits, p, z, call.limits.distance(p) <= FEASIBLE)
+    slope = certify(call.ocp, call.limits, p, z, call.limits.distance(p) <= FEASIBLE * call.limits.unit)
     return stationarity(call.ocp, p.inputs, slope, call.lower, call.upper)
 
 

@@ -302,8 +302,8 @@ def merit(call: Call, p: Expansion, y: Interior, mu: ca.MX) -> tuple[ca.MX, ca.M
     limits, gaps = call.limits, (p.next_states - p.states[:, 1:]) / call.spread
     apart = ca.if_else(limits.present, ca.fabs(limits.distance(p) - y.t + y.e) / limits.unit, 0)
     states = ca.logic_and(limits.present, limits.of_states)
-    price = ca.if_else(states, limits.rho * y.e - mu * ca.log(ca.if_else(states, y.e, 1)), 0)
-    barrier = price - mu * ca.log(ca.if_else(limits.present, y.t, 1))
+    price = ca.if_else(states, limits.rho * y.e - mu * ca.log(ca.if_else(states, y.e / limits.unit, 1)), 0)
+    barrier = price - mu * ca.log(ca.if_else(limits.present, y.t / limits.unit, 1))
     return ca.sum1(ca.vec(ca.fabs(gaps))) + ca.sum1(ca.vec(apart)), p.value + ca.sum1(ca.vec(barrier))
 
 

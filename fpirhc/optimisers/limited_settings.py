@@ -36,7 +36,7 @@ class LimitedSettings:
     """Settings of one Function."""
 
     tolerance: float  # of the stationarity, in the unit of the inputs
-    feasible: float  # violation of a state bound, in its unit, below which a plan counts as converged
+    feasible: float  # violation of a state bound, as a share of its unit, below which a plan counts as converged
     map: Deformation  # the deformation of pure steps
     hessian: HessianModel | None  # second derivatives of the quadratic model; None: exact
     damping: float  # added to the curvature of the inputs, in units of it

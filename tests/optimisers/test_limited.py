@@ -214,7 +214,7 @@ def same_optimum(seed: int) -> bool:
 def test_driver_and_graph_agree_with_limits(iterations):
     """The loops in C and the composed graph do the same turns: cold, warm, and from a first state outside its limits."""
     ocp, data, first = first_horizon("reactor")
-    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(iterations))
+    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(ocp, iterations))
     compiled = native(graph)
     assert compiled.compiled
     memories = [np.zeros(graph.size1_in(4))] * 2
@@ -238,7 +238,7 @@ def test_descents_solve_what_the_filter_gives_up(number):
     ocp = transcribe(case.plant, reference, case.horizon, case.cost, case.limits)
     data = stage_data(case.plant, reference, case.horizon, case.cost)(0.0, case.plant.approximate)
     first = case.first(ocp, first_states(case, 100, 1)[:, number])
-    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(1000))
+    graph = limited_step(ocp, fp.FixedPoint(1, tolerance_of(ocp))._limited(ocp, 1000))
     values = first, data, ocp.input_lower, ocp.input_upper, np.zeros(graph.size1_in(4))
     (one, diagnostics, _), (other, other_diagnostics, _) = graph(*values), native(graph).function(*values)
     assert int(diagnostics[4]) == fp.Status.OK
@@ -283,3 +283,38 @@ def test_horizons_with_limits_of_inputs_only_are_rescued(start):
     assert plan.status == fp.Status.OK
     assert known(plan.cost) <= known(other.cost) * (1 + 3e-5)
     assert Judge(ocp)(plan.inputs, first, np.asarray(data.full())).residual <= 1e-6
+
+
+@cache
+def _run_in_units(cost=1.0, force=1.0, length=1.0, time=1.0):
+    """Commands and statuses of a mass between limits of its position, its model wrong, in other units; in newtons."""
+
+    def response(q, v, u, p):
+        pull = u.F / force - p.b * v.q * time / length - p.k * q.q / length
+        return {"q": length / time**2 * pull / p.m}
+
+    parameters = {"m": fp.Parameter(1.5, 1.0, "kg"), "b": fp.Parameter(0.0, 0.2, "1"), "k": fp.Parameter(1.0, 2.0, "1")}
+    problem = fp.Problem(
+        plant=fp.Plant(coordinates={"q": "m"}, inputs={"F": "N"}, order=2, response=response, parameters=parameters),
+        reference=fp.Trajectory(lambda t: {"q": 0.3 * length * ca.sin(2 * t / time)}),
+        start={"q": 0.05 * length},
+        period=1e-2 * time,
+        duration=1.5 * time,
+        limits=fp.Limits(inputs={"F": (-8 * force, 8 * force)}, states={"q": (-0.25 * length, 0.25 * length)}),
+        horizon=fp.Horizon(stages=10, step=2e-2 * time),
+        cost=fp.Quadratic(
+            states={"q": 1e3 * cost / length**2, "q'": cost * time**2 / length**2},
+            deviation={"F": 1e-3 * cost / force**2},
+        ),
+    )
+    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPoint()), seed=0, compiled=False)
+    return np.ravel(run["command.F"]) / force, np.ravel(run["status"])
+
+
+@pytest.mark.parametrize("seed", slow_but(range(60), *range(8)))
+def test_commands_do_not_depend_on_the_units(seed):
+    """Random units of cost, force, length and time: what counts as kept and as solved is a share of the limits."""
+    cost, force, length, time = 10.0 ** np.random.default_rng(seed).uniform([-6, -4, -6, -3], [6, 4, 6, 3])
+    (command, status), (other, after) = _run_in_units(), _run_in_units(cost, force, length, time)
+    np.testing.assert_allclose(other, command, atol=8e-6)
+    np.testing.assert_array_equal(after, status)
