@@ -1,0 +1,26 @@
+"""A run of a variant is a run of the problem that is built with it, also where plans know the exact parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import fpirhc as fp
+
+
+@pytest.mark.parametrize("name", ["two_mass", "cart_pole", "two_link_arm"])
+def test_plans_with_the_exact_model_begin_with_the_parameters_of_their_run(name):
+    """The first plan too: to the tolerance of a plan, and with the same statuses."""
+    task = fp.load_problem(name)
+    problem = replace(task.problem, duration=200 * task.problem.period, measure_from=0.0)
+    controller = fp.ExactModel(replace(task.controllers["RHC"], optimiser=fp.FixedPoint()))
+    built, random = fp.simulator(problem, controller, compiled=False), np.random.default_rng(0)
+    exact, tolerance = np.ravel(problem.plant.exact), 1e-4 * np.ptp(problem.limits.input_bounds(problem.plant)) / 2
+    for factor in random.uniform(0.8, 1.25, (2, exact.size)):
+        variant = problem.with_exact(exact * factor)
+        one, other = built.run(variant=variant, seed=0), fp.simulate(variant, controller, seed=0, compiled=False)
+        np.testing.assert_allclose(one["command"][0], other["command"][0], rtol=0, atol=1e-6 * tolerance)
+        np.testing.assert_allclose(one["command"], other["command"], rtol=0, atol=tolerance)
+        np.testing.assert_array_equal(one["status"], other["status"])
