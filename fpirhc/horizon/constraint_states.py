@@ -15,6 +15,7 @@ import numpy as np
 
 from fpirhc.errors import Mistakes
 from fpirhc.horizon.cost import View
+from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import GAP
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
@@ -63,6 +64,33 @@ def _undeclared(view: View) -> list[tuple[str, Named, Callable[[Named], View], s
         ("input_before", view.input_before, lambda own: replace(view, input_before=own), by_rate),
         ("feedforward", view.feedforward, lambda own: replace(view, feedforward=own), by_cost),
     ]
+
+
+def check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
+    """Raise where the end or a margin is that of no state, or a margin leaves nothing between two limits.
+
+    Raises:
+        InvalidProblem: all such names.
+    """
+    mistakes = Mistakes("horizon")
+    mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
+    if plant.output.elements != plant.state.elements and horizon.terminal:
+        mistakes.add(
+            "terminal: the states of a plant with outputs have no reference to meet; leave it out, or weigh the end"
+        )
+    mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
+    for name in sorted(horizon.margins.keys() & {*limits.soft, *limits.prices}):
+        mistakes.add(
+            f"margins of '{name}': its limit is soft or has a price, and a margin makes it hard; leave one of them out"
+        )
+    for name in horizon.margins.keys() & limits.states.keys():
+        lower, upper = limits.states[name]
+        if 2 * horizon.margins[name] >= upper - lower:
+            mistakes.add(
+                f"margins of '{name}' is {horizon.margins[name]:.6g}, which leaves nothing between its limits "
+                f"{lower:g} and {upper:g}; widen the limits, or adapt faster"
+            )
+    mistakes.raise_if_any()
 
 
 def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:

@@ -14,6 +14,7 @@ from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
     check_declared,
+    check_names,
     ends,
     hard,
     hard_state_bounds,
@@ -78,7 +79,7 @@ def _transcribed(
 ) -> OptimalControl:
     nominal(cost).check(plant)
     limits.check(plant)
-    _check_names(plant, horizon, limits)
+    check_names(plant, horizon, limits)
     whole = limits
     if horizon.margins:
         inside_by = {
@@ -286,28 +287,6 @@ def _reach(limits: Limits, plant: Plant) -> ca.DM:
     lower, upper = limits.input_bounds(plant)
     half = 0.5 * (upper - lower)
     return ca.DM(np.where(np.isfinite(half) & (half > 0), half, 1.0))
-
-
-def _check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
-    mistakes = Mistakes("horizon")
-    mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
-    if plant.output.elements != plant.state.elements and horizon.terminal:
-        mistakes.add(
-            "terminal: the states of a plant with outputs have no reference to meet; leave it out, or weigh the end"
-        )
-    mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
-    for name in sorted(horizon.margins.keys() & {*limits.soft, *limits.prices}):
-        mistakes.add(
-            f"margins of '{name}': its limit is soft or has a price, and a margin makes it hard; leave one of them out"
-        )
-    for name in horizon.margins.keys() & limits.states.keys():
-        lower, upper = limits.states[name]
-        if 2 * horizon.margins[name] >= upper - lower:
-            mistakes.add(
-                f"margins of '{name}' is {horizon.margins[name]:.6g}, which leaves nothing between its limits "
-                f"{lower:g} and {upper:g}; widen the limits, or adapt faster"
-            )
-    mistakes.raise_if_any()
 
 
 def _joined(terms: Mapping[str, Expression], soft: Mapping[str, Expression], horizon: Horizon) -> dict[str, Expression]:

@@ -15,6 +15,7 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, Finite
+from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
@@ -126,6 +127,7 @@ class Problem(Checked):
         checks = (
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
+            lambda: check_names(plant, self.horizon, self.limits) if self.horizon else None,
             lambda: _check_reference(self),
             lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
