@@ -20,7 +20,7 @@ _SHARED = ("-shared", "-fvisibility=hidden")
 _MACHINES = {"amd64": "x86_64", "arm64": "aarch64"}
 _SYSTEMS = {"linux": "linux", "darwin": "darwin", "win32": "windows"}
 _ENDINGS = {"linux": ".so", "darwin": ".dylib", "windows": ".dll"}
-WEB_STACK = 262144  # bytes, which hold the deepest plan
+_WEB_STACK = 262144  # bytes, which hold the deepest plan
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def web_module(files: Mapping[str, str]) -> bytes:
     """Return a WebAssembly module of C files, without imports."""
     package("ziglang", "compiler", "the target wasm")
     # zig's own 16 MB are all that a page would ask for.
-    flags = ("-mexec-model=reactor", f"-Wl,-z,stack-size={WEB_STACK}", "-Wl,--no-entry")
+    flags = ("-mexec-model=reactor", f"-Wl,-z,stack-size={_WEB_STACK}", "-Wl,--no-entry")
     return _compiled(files, [sys.executable, "-m", "ziglang", "cc", "-target", "wasm32-wasi", *flags], "wasm32")
 
 

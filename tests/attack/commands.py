@@ -36,7 +36,7 @@ def random_line(seed: int) -> list[str]:
     options = [(o, not p.is_flag) for p in GROUP.commands[name].params for o in p.opts if o.startswith("--")]  # type: ignore[attr-defined]
     words = [name, *(["line.py"] if numbers.random() < 0.7 else [])]
     for _ in range(numbers.choice((0, 0, 1, 1, 2, 3, 4))):
-        if numbers.random() < 0.6:
+        if options and numbers.random() < 0.6:
             option, takes = numbers.choice(options)
             value = numbers.choice(("0", "-1", "1", "2", "x")) if option in SLOW else numbers.choice(WORDS)
             words += [option, value] if takes and numbers.random() < 0.9 else [option]

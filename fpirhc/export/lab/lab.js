@@ -56,8 +56,7 @@ function changed() {
   waiting = false;
   began = performance.now();
   const numbers = DATA.loops.map((_, j) => DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : s.places[j].map((place) => ({ place, value: now[k] })))));
-  const rows = DATA.sliders.flatMap((s, k) => s.rows.map((one) => ({ ...one, value: now[k], ratio: now[k] / s.value })));
-  worker.postMessage({ numbers, rows, number: ++sent });
+  worker.postMessage({ numbers, number: ++sent });
   remember();
 }
 
@@ -141,28 +140,20 @@ function remember() {
   const moved = DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : [[s.path, now[k]]]));
   link(moved);
   const among = (test) => moved.filter(([p]) => test(p));
-  const sides = /^(exact|approximate)\.(.*)/, points = /^setpoints\.(.*)\.(\d+)$/;
-  const scaled = (p) => DATA.sliders.some((s) => s.path === p && s.rows.some((one) => one.scaled));
+  const sides = /^(exact|approximate)\.(.*)/;
   const listed = (list) => "{" + list.map(([p, v]) => `"${p}": ${v}`).join(", ") + "}";
-  const numbers = among((p) => sides.test(p) || scaled(p)).map(([p, v]) => [p.replace(sides, "plant.parameters.$2.$1"), v]);
-  const aims = structuredClone(DATA.setPoints), changed = new Set();
-  for (const [p, v] of among((p) => points.test(p))) {
-    const [, name, k] = p.match(points);
-    aims[name][k][1] = v;
-    changed.add(name);
-  }
-  const settings = among((p) => ![sides, points].some((one) => one.test(p)) && !scaled(p));
-  const aimed = changed.size ? `, setpoints={${[...changed].map((name) => `"${name}": ${JSON.stringify(aims[name])}`).join(", ")}}` : "";
+  const numbers = among((p) => sides.test(p)).map(([p, v]) => [p.replace(sides, "plant.parameters.$2.$1"), v]);
+  const settings = among((p) => !sides.test(p));
   // Each loop as it was built for this page, and a run of it with other numbers; a controller that is built with them has another first
   // plan. A change of a device leaves the plan.
   const texts = DATA.loops.map((loop) => {
     const own = settings.filter(([p]) => loop.live.includes(p));
     const built = `task.problem, task.controllers[${JSON.stringify(loop.name)}]`;
-    if (!numbers.length && !own.length) return [`print(fp.simulate(${built}, seed=0${aimed}))`];
+    if (!numbers.length && !own.length) return [`print(fp.simulate(${built}, seed=0))`];
     const live = own.length ? `, live=${JSON.stringify(own.map(([p]) => p))}` : "";
     const variant = numbers.length ? `, variant=fp.with_settings(task.problem, ${listed(numbers)})` : "";
     const given = own.length ? `, changes={0.0: ${listed(own)}}, deployed=True` : "";
-    return [`loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}${aimed}))`];
+    return [`loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}))`];
   });
   const lines = ["import fpirhc as fp", "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, ...texts.flat()];
   say("python", lines.join("\n"));

@@ -1,9 +1,8 @@
 """A page with sliders: the closed loops of a problem as WebAssembly, run anew in the browser while a slider moves.
 
-Sliders write numbers into the loop's first memory, where parameters and live settings are, or into what it reads in every cycle:
-set-points, and random series in proportion. One whose number changes anything else there, which Python would have to compute, is
-left out, and the page says why. Automatic settings, scales of plans and the first plan stay those of the build, as in a deployed
-controller.
+Sliders write numbers into the loop's first memory, where parameters and live settings are. One whose number changes anything else
+there, which Python would have to compute, is left out, and the page says why. Automatic settings, scales of plans and the first
+plan stay those of the build, as in a deployed controller.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, package
 from fpirhc.export.lab.loop import LabLoop
 from fpirhc.export.targets.c import template
-from fpirhc.plant.motion import forcing_units
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
@@ -33,49 +31,28 @@ from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.pictures.planar import Planar
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
-from fpirhc.simulation.tables import run_tables
 from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.studies.comparison.compare import select
 from fpirhc.symbolic.live import PREFIX
-from fpirhc.symbolic.paths import changed_at, content_at, paths_to
+from fpirhc.symbolic.paths import changed_at, paths_to
 from fpirhc.task.problem import Problem
-from fpirhc.task.reference import pairs
 from fpirhc.whole_file import write_whole
 
 _SPAN = 4.0  # a slider goes from a fourth to four times its number
-_RANDOM = ("sensing", "disturbances")  # parts of a problem with random series
 _SETTINGS = ("gain", "rate")  # sliders where nobody asks for others, beside the limits of inputs
-_OF_REFERENCE = ("scale", "rate")  # and these of the reference
-
-
-@dataclass(frozen=True)
-class Rows:
-    """A part of a column of what the loops read in every cycle: rows `first` to before `last`.
-
-    Args:
-        scaled: whether the part is proportional to a slider's number; else it is this number.
-    """
-
-    table: int
-    column: int
-    first: int
-    last: int
-    scaled: bool
 
 
 @dataclass(frozen=True)
 class Slider:
     """A number that is moved in the page."""
 
-    # of a live setting, exact.NAME and approximate.NAME of a parameter, that of a deviation of noise in the problem, or
-    # setpoints.NAME.K of the K-th set-point of a coordinate
+    # of a live setting, or exact.NAME and approximate.NAME of a parameter
     path: str
     unit: str  # of it
     value: float  # number of the build
     low: float  # smallest number
     high: float  # largest number
     places: dict[int, list[int]]  # entries of the loops' memories, by the number of the loop
-    rows: tuple[Rows, ...] = ()  # of what the loops read in every cycle
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +97,7 @@ def make_lab(
 
     Args:
         problem: the task; its equations run in the page, so a reality outside cannot.
-        live: paths of settings with a slider; none: gains, rates, limits of inputs, and numbers of the reference.
+        live: paths of settings with a slider; none: gains, rates and limits of inputs.
         pictures: of the problem; the first `Planar` moves with the loops.
     """
     problem.require_equations(
@@ -137,12 +114,7 @@ def make_lab(
         raise InvalidValue(
             f"no controller of the lab can have '{lost[0]}' live: {without.get(lost[0], 'it is not there')}"
         )
-    sliders = [
-        *_settings(loops, without),
-        *_parameters(problem, loops, without),
-        *_noise(problem, loops, without),
-        *_set_points(problem, loops),
-    ]
+    sliders = [*_settings(loops, without), *_parameters(problem, loops, without)]
     return Lab(title, about, file, tuple(loops), tuple(sliders), without)
 
 
@@ -162,13 +134,9 @@ def _mechanism(ready: Simulator, pictures: Sequence[Picture], without: dict[str,
 
 
 def _usual(problem: Problem, controller: Controller) -> list[str]:
-    """Gains and rates of a controller, the limits of inputs that are finite, and the numbers of the reference."""
+    """Gains and rates of a controller, and the limits of inputs that are finite."""
     own = [path for name in _SETTINGS for path in paths_to(name, controller) if not path.startswith("optimiser.")]
-    return [
-        *own,
-        *(f"reference.{path}" for name in _OF_REFERENCE for path in paths_to(name, problem.reference)),
-        *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()),
-    ]
+    return [*own, *(f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any())]
 
 
 def _with_live(problem: Problem, controller: Controller, wanted: list[str], without: dict[str, str]) -> Simulator:
@@ -201,63 +169,6 @@ def _parameters(problem: Problem, loops: Sequence[LabLoop], without: dict[str, s
     return sliders
 
 
-def _noise(problem: Problem, loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
-    """Sliders of the deviations of sensors and disturbances: the series that the loops read are proportional to them."""
-    sliders = []
-    for path in (f"{part}.{inside}" for part in _RANDOM for inside in paths_to("deviation", getattr(problem, part))):
-        value = float(content_at(problem, path, "the problem"))  # type: ignore[arg-type]
-        twice = run_tables(changed_at(problem, path, 2 * value), 0, problem.cycles)
-        rows = _moved(loops[0].tables, twice, scaled=True)
-        if not rows:
-            without[path] = "it is zero: nothing says how far a slider would go"
-        elif any(
-            not np.array_equal(twice[r.table][:, r.column], 2 * loops[0].tables[r.table][:, r.column]) for r in rows
-        ):
-            without[path] = "the series that it belongs to is not proportional to it"
-        else:
-            unit = _unit_read(loops[0], rows[0])
-            sliders.append(Slider(path, unit, value, value / _SPAN, value * _SPAN, {}, rows))
-    return sliders
-
-
-def _set_points(problem: Problem, loops: Sequence[LabLoop]) -> list[Slider]:
-    """Sliders of the set-points of a run, each in force until the next one; the filter begins where it does in the file."""
-    sliders, units = [], dict(zip(problem.plant.chains, problem.plant.output.units, strict=False))
-    steps = {name: pairs(name, given) for name, given in problem.reference.set_points.items()}
-    for name, own in steps.items():
-        values = [value for _, value in own]
-        span = max(values) - min(values) or max(abs(values[0]), 1.0)
-        for k, (time, value) in enumerate(own):
-            other = {name: [*own[:k], (time, value + span), *own[k + 1 :]]}
-            rows = _moved(loops[0].tables, run_tables(problem, 0, problem.cycles, setpoints=other), scaled=False)
-            if rows:
-                sliders.append(
-                    Slider(f"setpoints.{name}.{k}", units[name], value, value - span, value + span, {}, rows)
-                )
-    return sliders
-
-
-def _moved(tables: Sequence[np.ndarray], others: Sequence[np.ndarray], *, scaled: bool) -> tuple[Rows, ...]:
-    """The parts of columns in which tables differ from others."""
-    parts = []
-    for number, (table, other) in enumerate(zip(tables, others, strict=True)):
-        for column in np.flatnonzero((other != table).any(axis=0)).tolist():
-            at = np.flatnonzero(other[:, column] != table[:, column])
-            parts.append(Rows(number, column, int(at[0]), int(at[-1]) + 1, scaled))
-    return tuple(parts)
-
-
-def _unit_read(loop: LabLoop, rows: Rows) -> str:
-    """The unit of a random series: that of the signal to which it adds."""
-    plant, trace = loop.ready.problem.plant, loop.ready.loop.trace
-    name = loop.ready.loop.reads.signals[rows.table].elements[rows.column].removesuffix(" noise")
-    units = dict(zip(plant.names, forcing_units(plant), strict=True))
-    signals = [trace["measured"]] if rows.table and "measured" in trace else [plant.input]
-    for signal in signals:
-        units |= dict(zip(signal.elements, signal.entry_units, strict=True))
-    return units.get(name, "")
-
-
 def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]:
     """Sliders of the live settings, within the bounds that each of them has."""
     sliders = []
@@ -278,10 +189,6 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
             without[path] = "its bounds leave no room"
             continue
 
-        if path.startswith("reference.") and not _moves(having[0].ready.problem, path, step):
-            without[path] = "the reference stays where it begins whatever it is"
-            continue
-
         def started(loop: LabLoop, path: str = path, step: float = step) -> np.ndarray:
             return loop.written({path: step}) if path in loop.ready.live.paths else loop.start
 
@@ -289,14 +196,6 @@ def _settings(loops: Sequence[LabLoop], without: dict[str, str]) -> list[Slider]
         if places:
             sliders.append(Slider(path, unit_of_setting(path, having[0].ready.problem), value, low, high, places))
     return sliders
-
-
-def _moves(problem: Problem, path: str, number: float) -> bool:
-    """Whether another number of a reference gives another motion; motions towards set-points follow those of the run."""
-    times = np.arange(problem.cycles)[None] * problem.period
-    motions = (one.reference.function(one.plant)(times) for one in (problem, changed_at(problem, path, number)))
-    one, other = (np.vstack([part.full() for part in parts]) for parts in motions)
-    return bool(problem.reference.set_points) or not np.array_equal(one, other)
 
 
 def _places(
@@ -349,15 +248,7 @@ def page(lab: Lab) -> str:
         "worker": _own("worker.js"),
         "colors": [PALETTE[k % len(PALETTE)] for k in range(len(lab.loops))],
         "loops": [_loop_data(loop) for loop in lab.loops],
-        "sliders": [
-            {
-                **vars(s),
-                "places": [s.places.get(k, []) for k in range(len(lab.loops))],
-                "rows": [vars(r) for r in s.rows],
-            }
-            for s in lab.sliders
-        ],
-        "setPoints": {name: pairs(name, own) for name, own in problem.reference.set_points.items()},
+        "sliders": [{**vars(s), "places": [s.places.get(k, []) for k in range(len(lab.loops))]} for s in lab.sliders],
         "without": lab.without,
         "charts": _charts(lab),
         "motion": _motion(lab),

@@ -11,20 +11,14 @@ async function made(loop) {
   const { instance } = await WebAssembly.instantiate(bytes(loop.module), {});
   const e = instance.exports;
   if (e._initialize) e._initialize();
-  const drawn = loop.tables.map((table) => new Float64Array(bytes(table).buffer));
-  drawn.forEach((table, k) => new Float64Array(e.memory.buffer, e["table_" + k](), table.length).set(table));
-  return { ...loop, drawn, exports: e };
+  loop.tables.map((table) => new Float64Array(bytes(table).buffer)).forEach((table, k) => new Float64Array(e.memory.buffer, e["table_" + k](), table.length).set(table));
+  return { ...loop, exports: e };
 }
 
-function run(loop, numbers, parts) {
+function run(loop, numbers) {
   const e = loop.exports, memory = new Float64Array(e.memory.buffer, e.memory_at(), loop.start.length);
   memory.set(loop.start);
   for (const { place, value } of numbers) memory[place] = value;
-  for (const { table, column, first, last, scaled, value, ratio } of parts) {
-    const drawn = loop.drawn[table], width = drawn.length / loop.cycles;
-    const read = new Float64Array(e.memory.buffer, e["table_" + table](), drawn.length);
-    for (let k = first * width + column; k < last * width; k += width) read[k] = scaled ? ratio * drawn[k] : value;
-  }
   const began = performance.now(), cycles = e.run();
   const rows = Math.ceil(cycles / loop.every), width = loop.shown;
   const kept = new Float64Array(e.memory.buffer, e.kept_at(), rows * width);
@@ -72,7 +66,7 @@ onmessage = async ({ data }) => {
       loops = await Promise.all(data.loops.map(made));
       postMessage({ ready: true });
     } else {
-      const answers = loops.map((loop, k) => run(loop, data.numbers[k], data.rows));
+      const answers = loops.map((loop, k) => run(loop, data.numbers[k]));
       const arrays = answers.flatMap((one) => [...one.columns, one.frames, one.factors]).filter(Boolean);
       postMessage({ number: data.number, answers }, arrays.map((array) => array.buffer)); // handed over, not copied
     }

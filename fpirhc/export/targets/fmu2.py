@@ -78,25 +78,10 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     library = shared_library({**files, **headers})
     if library and library.platform in _FOLDERS:
         contents[f"binaries/{_FOLDERS[library.platform]}/{device.name}{library.ending}"] = library.content
-    return {
-        f"{device.name}.fmu": _archive(contents),
-        "README.md": _page(device, variables, contents),
-        "sizes.txt": _sizes(device, contents),
-    }
+    return {f"{device.name}.fmu": _archive(contents), "README.md": _page(device, variables, contents)}
 
 
 TARGET = Target("fmu2", "FMI 2.0 unit for co-simulation", _files)
-
-
-def _sizes(device: Device, contents: Mapping[str, str | bytes]) -> str:
-    """Bytes of each library, those of the struct of unit.c that every instance allocates on 64 bits, and code and stack here."""
-    work, stepper = device.sizes, device.stepper
-    data = sum(layout.size for layout in data_of(device).values())
-    numbers = 3 * stepper.memory.size + stepper.signals.size + data + work["w"] + device.inputs.size
-    words = numbers + stepper.signals["command"].size + work["arg"] + work["res"] + work["iw"] + 3
-    libraries = {name: len(data) for name, data in contents.items() if name.startswith("binaries/")}
-    lines = [f"{name}: {size} bytes\n" for name, size in libraries.items()]
-    return "".join([*lines, f"an instance: {8 * words} bytes of RAM\n"])
 
 
 # Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
-from fpirhc.export.binaries import WEB_STACK, web_module
+from fpirhc.export.binaries import web_module
 from fpirhc.export.device import Device, identifiers
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
@@ -20,32 +20,15 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
             f'EXPORT("set") int put(int which, double value) {{ return {name}_set(&c, ({name}_setting)which, value); }}'
         )
     files = {**sources(device), f"{name}_wasm.c": filled(device, "wasm.c", data="\n".join(calls))}
-    module = web_module(files)
     text = json.dumps(layout, indent=1)
     return {
-        f"{name}.wasm": module,
+        f"{name}.wasm": web_module(files),
         f"{name}.mjs": filled(device, "wasm.mjs", layout=text, data=json.dumps(list(structs))),
         f"{name}.d.ts": _types(device, list(structs)),
         "layout.json": text,
         "samples.bin": recorded(device),
         "replay.mjs": filled(device, "wasm_replay.mjs"),
-        "sizes.txt": f"module: {len(module)} bytes; memory: {_memory(module)} bytes, {WEB_STACK} of them stack\n",
     }
-
-
-def _memory(module: bytes) -> int:
-    """Bytes of memory that a module asks for: the section of kind 5 has the number of pages of 64 kB."""
-    at, kind, size = 8, 0, 0
-    while kind != 5:
-        at += size
-        kind, (size, at) = module[at], _whole(module, at + 1)
-    return 65536 * _whole(module, at + 2)[0]
-
-
-def _whole(module: bytes, at: int) -> tuple[int, int]:
-    """A whole number in groups of seven bits, and the place behind it."""
-    end = next(k for k in range(at, len(module)) if module[k] < 128) + 1
-    return sum((module[k] & 127) << 7 * (k - at) for k in range(at, end)), end
 
 
 TARGET = Target("wasm", "WebAssembly with a wrapper in JavaScript and types", _files)
