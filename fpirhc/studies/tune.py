@@ -123,7 +123,10 @@ def tune(
         rows += [{"controller": name, "setting": p, "before": now[p], "best": v, **facts} for p, v in found.items()]
         tuned = with_settings(controller, found)
         harm[name] = harm_of_adaptation(task.problem, name, tuned)
-    return Tuning(task.name, pd.DataFrame(rows), harm)
+    table = pd.DataFrame(rows)
+    for column in ("before", "best"):  # a whole number stays one beside others: a setting takes no 2.0 for it
+        table[column] = pd.Series([row[column] for row in rows], dtype=object)
+    return Tuning(task.name, table, harm)
 
 
 def _finished(study: Any) -> list[Any]:
