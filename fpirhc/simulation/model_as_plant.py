@@ -16,7 +16,7 @@ from fpirhc.describe import identity
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Progress, Simulator, simulator
+from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
@@ -62,9 +62,11 @@ def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
     plant = problem.plant
     if not any(lags) or problem.integrator.steps_maps or plant.algebraic is not None:
         return problem
-    plant = behind_actuators(plant, lags)
     finer = problem.integrator.finer(math.ceil(problem.period / min(t for t in lags if t)))
-    return replace(problem, reality=Reality(plant, integrator=finer or problem.integrator))
+    before = zip(plant.inputs, lags, map(float, problem.inputs_before), strict=True)
+    start = {_free(f"{name}_acting", plant): value for name, lag, value in before if lag > 0}  # at rest
+    real = Reality(behind_actuators(plant, lags), integrator=finer or problem.integrator, start=start)
+    return replace(problem, reality=real)
 
 
 def _each(value: float | tuple[float, ...], count: int) -> tuple[float, ...]:
@@ -83,9 +85,9 @@ _EXACT: Latest[Plant] = Latest(8)
 class ModelAsPlant:
     """Models of controllers as the plant of their loops, without disturbances; a loop does not run twice on a model."""
 
-    def __init__(self, problem: Problem, *, seed: int, progress: Progress | None = None) -> None:
-        """Take the problem of the loops, the seed of the sensors' noise, and what is told the cycles of a pair, done and in all."""
-        self._problem, self._seed, self._progress = problem, seed, progress
+    def __init__(self, problem: Problem, *, seed: int) -> None:
+        """Take the problem of the loops and the seed of the sensors' noise."""
+        self._problem, self._seed = problem, seed
         self._models: dict[Hashable, Problem] = {}
 
     def of(self, controller: Controller) -> Problem:
@@ -109,21 +111,16 @@ class ModelAsPlant:
     def pair(self, loops: tuple[Simulator, Simulator]) -> tuple[Problem, tuple[Run, Run]]:
         """Return the problem of the second loop's model, and the runs of both loops on it."""
         model = self.of(loops[1].controller)
-        return model, (self.run(loops[0], model, self._part(0)), self.run(loops[1], model, self._part(1)))
+        return model, (self.run(loops[0], model), self.run(loops[1], model))
 
-    def _part(self, before: int) -> Progress | None:
-        """What a run tells that has so many before it in a pair."""
-        report = self._progress
-        return report and (lambda done, total: report(before * total + done, 2 * total))
-
-    def run(self, loop: Simulator, model: Problem, progress: Progress | None = None) -> Run:
+    def run(self, loop: Simulator, model: Problem) -> Run:
         """Return the run of a loop, of the problem, on one of the models."""
         own = self._behind(model, loop)
         # Random series of another length are others.
         length = () if not own.problem.sensing.drawn else (model.cycles,)
         longest = _RUNS.of((own, *_untimed(model)), (self._seed, *length), list)
         if not longest or (longest[0].cycles < model.cycles and longest[0].stop is None):
-            longest[:] = [own.run(seed=self._seed, variant=model, disturbed=False, progress=progress)]
+            longest[:] = [own.run(seed=self._seed, variant=model, disturbed=False)]
         return longest[0].first(model.cycles)
 
     def _behind(self, model: Problem, loop: Simulator) -> Simulator:

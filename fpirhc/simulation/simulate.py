@@ -190,11 +190,7 @@ class Simulator:
 
 @checked_call
 def simulator(
-    problem: Problem,
-    controller: Controller,
-    *,
-    compiled: bool | None = True,
-    live: Sequence[str] = (),
+    problem: Problem, controller: Controller, *, compiled: bool | None = True, live: Sequence[str] = ()
 ) -> Simulator:
     """Return the closed loop of problem and controller, ready to run.
 

@@ -10,8 +10,7 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from importlib import import_module
 
 import numpy as np
@@ -26,8 +25,6 @@ from fpirhc.simulation.metrics.entries.commands import at_limit
 from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run, judged_motion
-from fpirhc.simulation.simulate import Simulator
-from fpirhc.summary import beside
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.problem import Problem
 
@@ -52,10 +49,6 @@ class ErrorPair:
     # errors count
     at_limit: float = 0.0
 
-    def unit(self, name: str) -> str:
-        """The unit of a coordinate as it stands behind a number."""
-        return with_space(self.units[name])
-
     @property
     def worst(self) -> str:
         """The coordinate to which adaptation adds the largest share of its range."""
@@ -70,20 +63,9 @@ class ErrorPair:
         return self.adapted[name] / max(self.without[name], 1e-300)
 
     @property
-    def text(self) -> str:
-        """Both errors of the worst coordinate in a sentence."""
-        name, rounding = self.worst, beside(0.5 * _ROUNDING, 1.0)
-        before, after = (beside(e[name], self.ranges[name]) for e in (self.without, self.adapted))
-        before, after = (one if one == rounding else f"{one}{self.unit(name)}" for one in (before, after))
-        if before == after:
-            return f"run on its own model, rms error of {name} {before} without adaptation and with it"
-        share = f"{100 * self.added(name):+.2g} % of its range"
-        return f"run on its own model, rms error of {name} {before} without adaptation and {after} with it, {share}"
-
-    @property
     def sentence(self) -> str:
         """Both errors of the worst coordinate, where a run may have ended early."""
-        unit = self.unit(self.worst)
+        unit = with_space(self.units[self.worst])
         before, after = self.without[self.worst], self.adapted[self.worst]
         if not math.isfinite(before):
             other = f"with it the rms error of {self.worst} is {after:.3g}{unit}"
@@ -103,12 +85,6 @@ class ErrorPair:
     def passes(self) -> bool:
         """Whether adaptation makes no coordinate worse by more than a fifth and by a thousandth of its range."""
         return not self._beyond(WORSE, SLIGHT)
-
-    @property
-    def lower(self) -> bool:
-        """Whether the errors are smaller with adaptation, as a sum of squares of their shares of the ranges, and `passes`."""
-        sums = [sum((e[n] / max(self.ranges[n], 1e-300)) ** 2 for n in e) for e in (self.without, self.adapted)]
-        return self.passes and sums[1] < sums[0]
 
     @property
     def fails(self) -> bool:
@@ -173,64 +149,21 @@ def harm_in(real: ErrorPair | None, null: ErrorPair) -> str:
     return ""
 
 
-class Trials:
-    """Runs beside one controller without adaptation, whose own runs are made once. A plant outside is not run."""
+def experiment(problem: Problem, controller: Controller, cycles: int) -> tuple[ErrorPair | None, ErrorPair]:
+    """Return the errors of runs of so many cycles, without adaptation and with it: on the plant, and on the controller's model.
 
-    def __init__(self, problem: Problem, bare: Controller, *, cycles: int, goes_on: bool = False) -> None:
-        """Take the problem and the controller without adaptation.
+    They are of the coordinates that its cost weighs. A plant outside is not run: it has None.
 
-        Args:
-            goes_on: whether a run with more error, which may be one of the start alone, is made again with so many cycles where
-                errors count, unless they count in the short one.
-        """
-        self.problem = shortened(problem, cycles)
-        end = min(problem.duration, problem.measure_from + cycles * problem.period)
-        later = goes_on and 2 * problem.measure_from > cycles * problem.period
-        self._later = replace(problem, duration=end) if later else None
-        self._model = ModelAsPlant(self.problem, seed=0)
-        self._bare = loop_of(self.problem, bare)
-        self._counted: Latest[ErrorPair] = Latest(4)
-
-    @cached_property
-    def _plain(self) -> Run:
-        return self._bare.run(seed=0, variant=self.problem)
-
-    @cached_property
-    def _plain_later(self) -> Run:
-        return self._bare.run(seed=0, variant=self._later)
-
-    def errors(self, controller: Controller) -> tuple[ErrorPair | None, ErrorPair]:
-        """Return the errors on the plant, None where it is outside, and those on the model; of coordinates that the cost weighs.
-
-        Raises:
-            FpirhcError: every error that the controller raises about the problem.
-        """
-        loop = loop_of(self.problem, controller)
-        names = weighed(self.problem, loop.controller)
-        null = errors_of(*self._model.pair((self._bare, loop)), names)
-        if not self.problem.equations_known:
-            return None, null
-        real = errors_of(self.problem, (self._plain, loop.run(seed=0, variant=self.problem)), names)
-        if self._later is not None and not real.passes:
-            real = self._where_errors_count(self._later, loop)
-        return real, null
-
-    def counted(self, controller: Controller) -> ErrorPair | None:
-        """Return the errors on the plant where errors count, which a short run may not reach; None where it reaches them.
-
-        Raises:
-            FpirhcError: every error that the controller raises about the problem.
-        """
-        if self._later is None or not self.problem.equations_known:
-            return None
-        return self._where_errors_count(self._later, loop_of(self.problem, controller))
-
-    def _where_errors_count(self, later: Problem, loop: Simulator) -> ErrorPair:
-        def made() -> ErrorPair:
-            runs = self._plain_later, loop.run(seed=0, variant=later)
-            return errors_of(later, runs, weighed(self.problem, loop.controller))
-
-        return self._counted.of((loop,), (), made)
+    Raises:
+        FpirhcError: every error that the controller raises about the problem.
+    """
+    short = shortened(problem, cycles)
+    loops = loop_of(short, without_deformation(controller)), loop_of(short, controller)
+    names = weighed(short, loops[1].controller)
+    null = errors_of(*ModelAsPlant(short, seed=0).pair(loops), names)
+    if not short.equations_known:
+        return None, null
+    return errors_of(short, [loop.run(seed=0, variant=short) for loop in loops], names), null
 
 
 CYCLES = 300  # of a run
@@ -286,7 +219,7 @@ def _ignored() -> bool:
 
 
 def _reasons(problem: Problem, controller: Controller) -> list[str]:
-    real, null = Trials(problem, without_deformation(controller), cycles=CYCLES).errors(controller)
+    real, null = experiment(problem, controller, CYCLES)
     reasons = [] if real is None or not real.fails else [f"on the plant {real.sentence}"]
     if null.fails and (real is None or null.adapted[null.worst] > real.without[null.worst]):
         reasons.append(f"on its own model, with nothing to adapt {null.sentence}")

@@ -7,7 +7,6 @@ from fpirhc.simulation import loop
 from fpirhc.simulation.linearise.asked_loop import AskedLoop
 from fpirhc.simulation.linearise.linearisation import Linearisation
 from fpirhc.simulation.linearise.slopes import Step
-from fpirhc.simulation.trials import Trials
 from fpirhc.symbolic import block
 
 
@@ -47,13 +46,6 @@ def test_only_steps_that_are_called_are_written_out_as_scalar_code(monkeypatch):
     written = counted(monkeypatch, block, "scalar_code")
     assert loop.close_loop(task.problem, task.controllers["CTC"]).function.is_a("SXFunction")
     assert len(written) == 2
-
-
-def test_runs_where_errors_count_are_made_once():
-    task = fp.load_problem("two_mass")
-    trials = Trials(task.problem, task.controllers["CTC"], cycles=300, goes_on=True)
-    adapting = task.controllers["CTC+FPI (eq 6)"]
-    assert trials.counted(adapting) is trials.counted(adapting) is not None
 
 
 def test_plants_from_the_box_are_asked_of_controllers_that_adapt_alone(monkeypatch):

@@ -13,7 +13,7 @@ import numpy as np
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import innermost, resolved, without_deformation
+from fpirhc.controllers.contract import innermost, resolved
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -30,7 +30,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
-from fpirhc.simulation.trials import ErrorPair, Trials, errors_of, harm_in, weighed
+from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
 from fpirhc.studies.comparison.verdict import Finding, Outcome, Yardstick, findings
 from fpirhc.studies.objective import objective
 from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
@@ -341,7 +341,7 @@ def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> t
     if not controller.deformation.adapts:
         return ()
     try:
-        against = harm_in(*Trials(problem, without_deformation(controller), cycles=1000).errors(controller))
+        against = harm_in(*experiment(problem, controller, cycles=1000))
     except FpirhcError:
         return ()
     return (f"{name}: {against}.",) if against else ()
