@@ -1,7 +1,7 @@
 """How large a gain may be when the response is late, smoothed, or behind a map that saturates.
 
 W(z) = sum_j w_j z^-j goes from request to response; the map pairs the response with its own value of d cycles earlier, and
-filters the error with a pole. The derivations for large errors stand in docs/theory-robust.md.
+filters the error with a pole. The derivations for large errors stand in docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The part of a control cycle that all controllers share; the contract itself is in `contract`.
 
-Theory: docs/theory-questions.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

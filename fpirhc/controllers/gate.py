@@ -1,4 +1,4 @@
-"""The gate in front of a controller: a bad sample is a skipped cycle. Theory: docs/theory-questions.md."""
+"""The gate in front of a controller: a bad sample is a skipped cycle. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

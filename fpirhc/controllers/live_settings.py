@@ -2,7 +2,7 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-Automatic settings, such as the scale of a sigmoid, follow from the others. See docs/live-settings.md.
+Automatic settings, such as the scale of a sigmoid, follow from the others. See docs/simulators.md.
 """
 
 from __future__ import annotations

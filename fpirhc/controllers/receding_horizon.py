@@ -1,4 +1,4 @@
-"""Receding-horizon control whose nominal acceleration is deformed. Theory: docs/theory-questions.md."""
+"""Receding-horizon control whose nominal acceleration is deformed. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

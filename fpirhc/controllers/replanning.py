@@ -1,4 +1,4 @@
-"""Where a horizon starts and what is tracked between two plans: three choices. Theory: docs/theory-questions.md."""
+"""Where a horizon starts and what is tracked between two plans: three choices. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     delta_k = p delta_{k-1} + (1 - p) G(delta_{k-1-d}),
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The model-referenced form: the iteration runs on the difference between the measured response and the model's.
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The abstract-rotation fixed point transformation. Theory: docs/theory-maps.md."""
+"""The abstract-rotation fixed point transformation. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
     s+ = F(s, u, theta),   A = dF/ds,  B = dF/du,   l_s, l_u,   and the second derivatives Q = l_ss, S = l_us, R = l_uu.
 
 Loops in C call the parts: `evaluate` gives the stage with the entries m of its Jacobian, of which `pull` and `linearise` make the
-rest; `bend` and `curve` do the work of `hessian_stage`. Theory: docs/theory-plants.md.
+rest; `bend` and `curve` do the work of `hessian_stage`. Theory: docs/theory.md.
 """
 
 from __future__ import annotations

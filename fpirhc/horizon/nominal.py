@@ -236,7 +236,7 @@ _INSIDE = 0.99  # of the way to the end of a physical range, where a model may h
 def consistent_state(plant: Plant) -> ca.Function:
     """Return the Function (state, outputs, parameters) -> state x* at which the model has these outputs, y^(j) = h_j(x*, p), j < r.
 
-    The command moves outputs of order 0 at once, so no state has them, and they are left out. Theory: docs/theory-plants.md.
+    The command moves outputs of order 0 at once, so no state has them, and they are left out. Theory: docs/theory.md.
     """
     start, y, p = (
         ca.MX.sym("x", plant.state.size),

@@ -1,4 +1,4 @@
-"""The contract of optimisers, and how every plan is judged. Theory: docs/theory-plants.md."""
+"""The contract of optimisers, and how every plan is judged. Theory: docs/theory.md."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def _largest(value: ca.MX) -> ca.MX:
 def stationarity(
     ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX, data: ca.MX | None = None
 ) -> ca.MX:
-    """Return the projected residual of a plan (docs/theory-plants.md); live settings need the stages' data."""
+    """Return the projected residual of a plan (docs/theory.md); live settings need the stages' data."""
     scale = ca.repmat(ocp.scale_in(data), 1, ocp.stages)
     return _largest(inputs - clip(inputs - scale * gradient, lower, upper))
 

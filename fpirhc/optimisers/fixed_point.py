@@ -1,6 +1,6 @@
 """Fixed-point iteration on the reduced gradient, preconditioned by one Riccati sweep: the default optimiser.
 
-U+ = G(U, h, 0) with h = M^-1 g deforms the plan as a control loop deforms its request (docs/theory-optimisers.md). With limits of
+U+ = G(U, h, 0) with h = M^-1 g deforms the plan as a control loop deforms its request (docs/theory.md). With limits of
 states the iteration is that of `fpirhc.optimisers.limited`; it ends where the plan is solved, in a loop as in open loop.
 """
 

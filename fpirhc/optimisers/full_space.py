@@ -2,7 +2,7 @@
 
     z = (S, U, mu),   g = grad Psi(z),   H = Hessian of Psi (the KKT matrix),   h = H'g,   z+ = G(z, h, 0)
 
-It is the baseline to which `GradientFixedPoint` and `FixedPoint` are compared (docs/theory-optimisers.md); it serves no limits.
+It is the baseline to which `GradientFixedPoint` and `FixedPoint` are compared (docs/theory.md); it serves no limits.
 """
 
 from __future__ import annotations

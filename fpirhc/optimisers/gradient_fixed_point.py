@@ -2,7 +2,7 @@
 
     U+ = clip(G(U, h, 0)),     h = D g,     D = 1/(step c),
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

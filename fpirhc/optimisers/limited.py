@@ -1,6 +1,6 @@
 """The iteration of `FixedPoint` on horizons with limits of states, and where its plain iteration does not contract.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

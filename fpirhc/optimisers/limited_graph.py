@@ -3,7 +3,7 @@
 A turn expands a plan, judges it, and finds the next one by a sweep. A phase of pure steps accepts a plan that halves the scaled
 error E of the first-order conditions, with patience for a few steps, because a change of the active limits raises E at first. A
 phase of interior steps accepts a plan by a filter as in IPOPT. Where the filter accepts none, a Levenberg-Marquardt term grows,
-then another first plan is tried, and at last descents (docs/theory-optimisers.md).
+then another first plan is tried, and at last descents (docs/theory.md).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The parts of a turn of the iteration with limits: its state, how a phase begins, and how an interior plan is judged.
 
 A plan of an interior step is judged by a filter of infeasibility theta and barrier function phi. Where the filter has given up from
-every first plan, descents follow (docs/theory-optimisers.md): rollouts that carry a share of the gaps and lower
+every first plan, descents follow (docs/theory.md): rollouts that carry a share of the gaps and lower
 psi = phi + price sum |gaps| / unit.
 """
 

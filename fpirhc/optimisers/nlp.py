@@ -3,7 +3,7 @@
     variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F(s_i, u_i) = 0,
 
 Solvers judge what is small by absolute numbers, so they see every variable, constraint and the cost in a unit of its own size.
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

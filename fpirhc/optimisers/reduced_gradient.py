@@ -1,4 +1,4 @@
-"""The reduced-gradient method, which the fixed-point optimisers replace. Theory: docs/theory-plants.md."""
+"""The reduced-gradient method, which the fixed-point optimisers replace. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

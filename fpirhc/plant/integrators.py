@@ -1,4 +1,4 @@
-"""Integrators: the plant's state one control cycle later, with the command held. Theory: docs/theory-plants.md.
+"""Integrators: the plant's state one control cycle later, with the command held. Theory: docs/theory.md.
 
 Runge-Kutta 4, Euler, and collocation with a fixed number of Newton steps are plain expressions, so they can be compiled and
 exported. CVODES controls its own error, runs in CasADi's virtual machine, and is the reference for the methods with a fixed step.

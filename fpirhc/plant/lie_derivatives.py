@@ -1,6 +1,6 @@
 """Outputs y = h(x, p) or h(x, u, p): quantities that are controlled or judged and are expressions of the state, or of the inputs.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Maps x+ = f(x, u, p): plants that step, and have no differential equation. Theory: docs/theory-plants.md."""
+"""Maps x+ = f(x, u, p): plants that step, and have no differential equation. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The plant: coordinates, inputs, relative order, response, and two sets of parameters.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

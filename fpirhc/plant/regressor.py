@@ -2,7 +2,7 @@
 
     Q = Y(q, q', q'') theta + Q0(q, q', q''),     M = dQ/dq'',     C = (M' + E - E^T) / 2,  E = d(M q')/dq,
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

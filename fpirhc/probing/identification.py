@@ -2,7 +2,7 @@
 
     f_i = sum_j lambda_ij (G m)_j + w_i + n_i,        G: d cycles, then x_k = rho x_{k-1} + (1 - rho) m_k with rho = e^(-T / tau)
 
-For every d, tau and share of the drift w the differences are whitened, and lambda is least squares. Theory: docs/probe.md.
+For every d, tau and share of the drift w the differences are whitened, and lambda is least squares. Theory: docs/review.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The contracts of derivative estimators and of state observers, a plant that is measured as a whole, and what never shows.
 
-Theory: docs/theory-estimation.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

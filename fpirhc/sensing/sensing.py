@@ -2,7 +2,7 @@
 
     true plant -> sensors -> measurement dead time -> [estimator -> controller]
 
-Theory: docs/theory-estimation.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     f_k = p f_{k-1} + (1 - p) (y^(n-1)_k - y^(n-1)_{k-1}) / T,        p = exp(-T / tau)
 
-Without filter (p = 0) it is the mean response to the last request: the ideal pair. Theory: docs/theory-estimation.md.
+Without filter (p = 0) it is the mean response to the last request: the ideal pair. Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The time of a machine's steps: whether it can follow that of the step before, missed cycles, and how long steps take.
 
-Theory: docs/theory-questions.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

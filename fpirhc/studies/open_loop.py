@@ -1,7 +1,7 @@
 """Open-loop solves of a problem's first horizon with the optimisers that the command line names, and a certificate of each plan.
 
 A certificate says what is known beyond the residual: how fast the iteration contracts there, and how far the optimum is. Its
-bounds, and where they hold, stand in docs/theory-optimisers.md.
+bounds, and where they hold, stand in docs/theory.md.
 """
 
 from __future__ import annotations

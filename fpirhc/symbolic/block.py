@@ -1,6 +1,6 @@
 """The contract of everything that happens in a control cycle, how blocks become one Function, and cycles without a sample.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Numbers that stay open while a loop is built, so that a compiled loop takes other values.
 
 Beside them stand what Python computes from them, and functions that round alike for numbers and expressions: a power is a product,
-because the pow of Python and that of CasADi differ in the last digit. Theory: docs/theory-plants.md.
+because the pow of Python and that of CasADi differ in the last digit. Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Compilation of Functions to C, with a content-addressed cache of the compiled libraries.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Signals from outside: quantities that act on a plant and that nobody controls, such as weather, load, demand or prices.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A reality outside: hardware, another simulator, a physics engine. The loop is the same, its plant is an object outside.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

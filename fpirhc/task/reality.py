@@ -2,7 +2,7 @@
 
     command -> reality x' = f(x, u, p) -> its coordinates of the model's names, with their derivatives -> sensing -> controller
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """References: the nominal motion and its derivatives, as a function of time; of a map its divided forward differences.
 
-Theory: docs/theory-plants.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Power-law decay of the tracking error by a derivative of fractional order, for any relative order.
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

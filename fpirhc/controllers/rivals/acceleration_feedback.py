@@ -1,6 +1,6 @@
 """Computed torque with feedback of the measured response: u = model(q^Des) + K (q^Des - q^(n)).
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

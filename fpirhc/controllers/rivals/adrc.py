@@ -1,6 +1,6 @@
 """Active disturbance rejection control: a linear extended state observer of the output, and feedback of what it estimates.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Model reference adaptive control by nested errors that decay, with a deformation that realises the highest derivative.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A disturbance observer around the model's inverse: what the model's input differs by is taken off the next command.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Model reference adaptive control by fixed-point iteration: the command is deformed against a reference model.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

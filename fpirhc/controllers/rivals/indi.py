@@ -1,6 +1,6 @@
 """Incremental nonlinear dynamic inversion: the command moves by what the model's input gain asks for.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

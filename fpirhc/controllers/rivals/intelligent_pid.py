@@ -2,7 +2,7 @@
 
     F_k = d^n/dt^n of y less alpha u, by weights over the last L cycles,        u_k = (q^Des_k - F_k) / alpha.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

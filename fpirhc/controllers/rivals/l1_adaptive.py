@@ -1,6 +1,6 @@
 """L1 adaptive control with the piecewise-constant law: a predictor of the highest measured derivative, and a low-pass.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

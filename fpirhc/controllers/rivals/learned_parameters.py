@@ -2,7 +2,7 @@
 
     h = M_hat^-1 (u - Q(q, q', q''; p_hat)) = M_hat^-1 Y(q, q', q'') (p - p_hat)
 
-with the last command u and the response q'' to it: u = Q(q, q', q''; p) is exact. Theory: docs/theory-rivals.md.
+with the last command u and the response q'' to it: u = Q(q, q', q''; p) is exact. Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Direct model reference adaptive control by Lyapunov's method: gains adapted by the rule e'PB, the classical counterpart.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

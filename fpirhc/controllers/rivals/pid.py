@@ -1,4 +1,4 @@
-"""PID control, without any model: one input per controlled coordinate. Theory: docs/theory-rivals.md."""
+"""PID control, without any model: one input per controlled coordinate. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

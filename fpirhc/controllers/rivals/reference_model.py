@@ -1,6 +1,6 @@
 """The reference model of model reference adaptive control: a motion from the plant's start to the nominal one.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Repetitive control: what made the response wrong one period ago is taken off the request of now.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Resolved acceleration rate control: the law prescribes the rate of the response, and commands change by increments.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

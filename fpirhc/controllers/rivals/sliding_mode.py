@@ -1,6 +1,6 @@
 """Sliding mode control with a boundary layer, on the inverse of the model: a high gain instead of an iteration.
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

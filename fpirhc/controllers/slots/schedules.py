@@ -1,4 +1,4 @@
-"""Schedules of time slots: which slot a control cycle belongs to. Theory: docs/theory-rivals.md."""
+"""Schedules of time slots: which slot a control cycle belongs to. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time slots: one input serves several coordinates in turn. Theory: docs/theory-rivals.md."""
+"""Time slots: one input serves several coordinates in turn. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

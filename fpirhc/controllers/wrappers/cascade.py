@@ -2,7 +2,7 @@
 
     target = reference + shift,        command = inner controller(target)
 
-The shift may act in another unit, z = to(y): target = back(to(reference) + shift). Theory: docs/theory-rivals.md.
+The shift may act in another unit, z = to(y): target = back(to(reference) + shift). Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     command = controller(state; p + parameter_change),      parameter_change = estimator(state, last command, response; p).
 
-Theory: docs/theory-rivals.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A controller that acts on the state in which its command will act. Theory: docs/theory-rivals.md."""
+"""A controller that acts on the state in which its command will act. Theory: docs/theory.md."""
 
 from __future__ import annotations
 

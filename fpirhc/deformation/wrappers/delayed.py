@@ -1,6 +1,6 @@
 """Deformation under dead time: the response measured now belongs to the request of d + 1 cycles ago.
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     g_k = p g_{k-1} + (1 - p) (f_k - d_k),     r_{k+1} = G(r_k, d_k + g_k, d_k).
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

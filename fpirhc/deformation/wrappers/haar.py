@@ -2,7 +2,7 @@
 
     c_0 = f - d,   c_j(k) = (c_{j-1}(k) + c_{j-1}(k - 2^(j-1))) / 2,   d_j = c_{j-1} - c_j,   g = c_J + sum of large d_j.
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tunes the gain of a map on line, by stochastic approximation on the signs of successive response errors.
 
-Theory: docs/theory-maps.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def examples(inner: Deformation) -> tuple[Deformation, ...]:
 def expected_sign(product: Annotated[float, Range("a product from 0 to 2", 0.0, 2.0)], components: Count) -> float:
     """Return the mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2.
 
-    I is the regularised incomplete beta function; the proof stands in docs/theory-robust.md.
+    I is the regularised incomplete beta function; the proof stands in docs/theory.md.
 
     Args:
         product: g = a lambda, effective gain times eigenvalue, 0 to 2.

@@ -1,6 +1,6 @@
 """A disturbance model with a Kalman filter: the estimator of offset-free predictive control.
 
-Theory: docs/theory-estimation.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     S = lambda I + H P H',    K = P H' S^-1,    z <- z + K e,    P <- (P - K H P) / lambda,    lambda = exp(-period / time),
 
-Theory: docs/theory-estimation.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

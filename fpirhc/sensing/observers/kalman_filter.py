@@ -1,6 +1,6 @@
 """States that no sensor shows, by an extended Kalman filter with its covariance in memory.
 
-Theory: docs/theory-estimation.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

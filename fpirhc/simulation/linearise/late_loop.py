@@ -2,7 +2,7 @@
 
     det M(z) = 0,    M(z) = z I - F0 - sum_j f_j e_j' z^(-l_j)
 
-are its poles without the lines' entries, counted by the argument principle. Theory: docs/theory-questions.md.
+are its poles without the lines' entries, counted by the argument principle. Theory: docs/theory.md.
 """
 
 from __future__ import annotations

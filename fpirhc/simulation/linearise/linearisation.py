@@ -1,6 +1,6 @@
 """The linear loops at points of an asked loop's run: all their entries that move, in scales of their own.
 
-Theory: docs/theory-questions.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations

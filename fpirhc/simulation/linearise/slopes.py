@@ -1,6 +1,6 @@
 """Derivatives of one step of a closed loop at a point of its run, along as many directions as its motion reaches.
 
-Theory: docs/theory-questions.md.
+Theory: docs/theory.md.
 """
 
 from __future__ import annotations
