@@ -19,6 +19,7 @@ import numpy as np
 
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import FEW, Accuracy, Few
+from fpirhc.plant.maps import by_single_steps
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
@@ -249,6 +250,19 @@ def motion_of(plant: Plant, integrator: Integrator, usual: Integrator) -> Integr
     if integrator.steps_maps == is_map:
         return integrator
     return MapSteps() if is_map else usual
+
+
+def own_steps(plant: Plant, integrator: Integrator, period: float) -> int:
+    """Return how many steps of its own a plant makes in a cycle: those of a map, sub-steps, and else one."""
+    return round(period / plant.step) if plant.step is not None else getattr(integrator, "substeps", 1)
+
+
+def own_step(plant: Plant, integrator: Integrator, period: float) -> ca.Function:
+    """Return the Function of one of these steps, as `Integrator.step`."""
+    count = own_steps(plant, integrator, period)
+    if plant.step is None and count > 1:
+        integrator = replace(cast(_Substepped, integrator), substeps=1)
+    return integrator.step(by_single_steps(plant), period / count)
 
 
 USUAL = RungeKutta4()

@@ -21,6 +21,7 @@ from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.sensing_chain import first_estimates, first_shown
 from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
@@ -255,10 +256,13 @@ class Equations(Mover):
         return Block("sense", Layout(reads), Layout((*writes, *own)), step)
 
     def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
-        problem, plant = self.problem, self.problem.real_plant
-        advance = problem.real_integrator.step(plant, problem.period)
-        state, exact = like(plant.state, "_state_before"), like(plant.parameter, self.parameters)
-        reads = (state, arriving, exact, *disturbed)
+        problem, plant, count = self.problem, self.problem.real_plant, self.problem.signal_steps
+        integrator, values = problem.real_integrator, None if count == 1 else real_values(plant, problem.signals)
+        one = integrator.step(plant, problem.period) if values is None else own_step(plant, integrator, problem.period)
+        opaque = integrator.opaque or (values is not None and not values.is_a("SXFunction"))
+        state = like(plant.state, "_state_before")
+        exact = like(plant.parameter, self.parameters if values is None else Mover.parameters)
+        reads = (state, arriving, exact, *([] if values is None else [time_signal(problem.plant)]), *disturbed)
         writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -267,9 +271,13 @@ class Equations(Mover):
                 adds = _by_place(problem, s.disturbance)
                 u = u + ca.vertcat(*(adds.get((True, name), 0) for name in plant.inputs))
                 w = ca.vertcat(*(adds.get((False, name), 0) for name in plant.names))
-            return {"_state_after": advance(s._state_before, u, getattr(s, exact.name), w), "_acting": u, "_forcing": w}
+            after, now = s._state_before, getattr(s, exact.name)
+            for k in range(count):
+                there = now if values is None else values(s.time + (k + 0.5) * (problem.period / count), now)
+                after = one(after, u, there, w)
+            return {"_state_after": after, "_acting": u, "_forcing": w}
 
-        return Block("advance", Layout(reads), Layout(writes), step, opaque=problem.real_integrator.opaque)
+        return Block("advance", Layout(reads), Layout(writes), step, opaque=opaque)
 
 
 class Body(Mover):
@@ -498,23 +506,30 @@ def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
     if moving(problem).parameters == _REAL_NOW:
         values = real_values(real, problem.signals)
         assert values is not None
-        blocks.append(_block("outside", problem, real, values, "signals", (Mover.parameters, _REAL_NOW)))
+        ends = Mover.parameters, _REAL_NOW
+        blocks.append(_block("outside", problem, real, values, "signals", ends, problem.signal_steps))
     if outside_names(model):
         believed = model_values(model, known.signals) or _unchanged(model)
         blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
     return blocks
 
 
-def _block(name: str, problem: Problem, plant: Plant, values: ca.Function, shown: str, ends: tuple[str, str]) -> Block:
-    """Block (time, parameters `ends[0]`) -> their signals `shown`, and the parameters `ends[1]` where these have a name."""
-    places, half = [plant.parameter.elements.index(n) for n in outside_names(plant)], problem.period / 2
+def _block(
+    name: str, problem: Problem, plant: Plant, values: ca.Function, shown: str, ends: tuple[str, str], steps: int = 1
+) -> Block:
+    """Block (time, parameters `ends[0]`) -> the mean of their signals, `shown`, and the parameters `ends[1]` where that has a name.
+
+    The values are those in the middle of equal steps of the cycle, and the parameters those of the last one.
+    """
+    places = [plant.parameter.elements.index(n) for n in outside_names(plant)]
     source, target = ends
     units = tuple(plant.parameter.units[k] for k in places)
     writes = (Signal(shown, outside_names(plant), units), *([like(plant.parameter, target)] if target else []))
 
     def step(s: Signals) -> dict[str, Expression]:
-        now = values(s.time + half, getattr(s, source))
-        return {shown: now[places], **({target: now} if target else {})}
+        every = [values(s.time + (k + 0.5) * (problem.period / steps), getattr(s, source)) for k in range(steps)]
+        mean = ca.sum2(ca.horzcat(*every))[places] / steps if steps > 1 else every[0][places]
+        return {shown: mean, **({target: every[-1]} if target else {})}
 
     reads = Layout((time_signal(plant), like(plant.parameter, source)))
     return Block(name, reads, Layout(writes), step, opaque=not values.is_a("SXFunction"))

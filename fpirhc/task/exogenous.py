@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -177,6 +179,57 @@ def check_signals(
         for what, course in (("values", one.values), ("values of the model", one.known)):
             if course is not None and (what == "values" or course is not one.values):
                 _check_course(f"signals: {what} of '{name}'", course, times, mistakes)
+
+
+_OF_MODELS = ContextVar("fpirhc_signals_of_models", default=False)
+
+
+@contextmanager
+def signals_of_models() -> Iterator[None]:
+    """Within it no signal is refused: a model in place of a reality of finer steps holds it over its cycles, rightly or not."""
+    token = _OF_MODELS.set(True)
+    try:
+        yield
+    finally:
+        _OF_MODELS.reset(token)
+
+
+_LOOKS = 8  # at a signal within a step
+_MOST_STEPS = 20_000  # that are looked at
+_HELD_WELL = 0.1  # share of a signal's range by which its mean over a step may differ from the value in its middle, which is held
+
+
+def check_held(plant: Plant, signals: Mapping[str, Exogenous], duration: float, period: float, steps: int) -> None:
+    """Raise for a signal that changes within a step of what moves: the value in the middle of every step acts all through it.
+
+    Args:
+        plant: that moves.
+        steps: of its own in a cycle.
+
+    Raises:
+        InvalidProblem: names the signal, and the first such cycle.
+    """
+    values, names = real_values(plant, signals), [n for n in outside_names(plant) if n in signals]
+    if values is None or _OF_MODELS.get():
+        return
+    places = [plant.parameter.elements.index(name) for name in names]
+    count, step, mistakes = round(duration / period) * steps, period / steps, Mistakes("")
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).astype(int))
+    inside = (np.append(np.arange(_LOOKS), (_LOOKS - 1) / 2) + 0.5) / _LOOKS  # and the middle
+    looks = rows_of(values, ((chosen[:, None] + inside) * step).ravel(), plant.exact)[:, places]
+    looks = looks.reshape(len(chosen), len(inside), len(places))
+    off = np.abs(looks[:, :-1].mean(axis=1) - looks[:, -1]) / np.maximum(np.ptp(looks, axis=(0, 1)), 1e-300)
+    for k, name in enumerate(names):
+        if off[:, k].max() > _HELD_WELL:
+            first = chosen[int(np.argmax(off[:, k] > _HELD_WELL))]
+            cycle, unit = first // steps, plant.time_unit
+            shorter = f"Reality(..., integrator=RungeKutta4(substeps={2 * steps}))"
+            mistakes.add(
+                f"signals: '{name}' changes within the step of {step:g} {unit} at t = {first * step:g} {unit} (cycle {cycle}), and "
+                "the value in its middle would act all through it; let it change between steps, or give a reality finer steps, "
+                + ("a map with a shorter step" if plant.step else shorter)
+            )
+    mistakes.raise_if_any()
 
 
 def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistakes) -> None:

@@ -20,7 +20,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.chain import differentiated_signals
-from fpirhc.plant.integrators import USUAL, Integrator, motion_of
+from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import disturbed, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
@@ -32,7 +32,16 @@ from fpirhc.symbolic.live import nominal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
-from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
+from fpirhc.task.exogenous import (
+    Exogenous,
+    check_held,
+    check_signals,
+    not_held,
+    real_values,
+    rows_of,
+    signals_of,
+    signals_of_models,
+)
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
@@ -133,6 +142,9 @@ class Problem(Checked):
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.reality.check(plant, *self._needed) if self.reality else None,
+            lambda: check_held(
+                self.real_plant, {} if self.foreign else self.signals, self.duration, self.period, self.signal_steps
+            ),
         )
         for name, one in self.disturbances.items():
             with mistakes.caught(f"disturbances: '{name}': "):
@@ -264,7 +276,8 @@ class Problem(Checked):
         disturbances = {keys[place]: one for place, one in there.items() if place in keys}
         signals = signals_of(self.plant, self.signals)
         late = self.dead_time.all_simulated
-        return replace(self, reality=None, disturbances=disturbances, signals=signals, dead_time=late)
+        with signals_of_models():
+            return replace(self, reality=None, disturbances=disturbances, signals=signals, dead_time=late)
 
     @cached_property
     def of_equations(self) -> Problem:
@@ -309,10 +322,21 @@ class Problem(Checked):
         return self.truth.start_state(self.plant, self.start_state)
 
     @property
+    def signal_steps(self) -> int:
+        """Steps of its own that a reality makes in a cycle, each with the signals of its middle; 1 without signals.
+
+        A plant that moves as its model does has the signals of the middle of the cycle, as the model has them.
+        """
+        if self.reality is None or self.foreign is not None or real_values(self.real_plant, self.signals) is None:
+            return 1
+        return own_steps(self.real_plant, self.real_integrator, self.period)
+
+    @property
     def real_parameters(self) -> np.ndarray:
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
         plant = self.real_plant
-        return rows_of(real_values(plant, self.signals), np.array([self.period / 2]), plant.exact)[0]
+        middle = self.period / 2 / self.signal_steps
+        return rows_of(real_values(plant, self.signals), np.array([middle]), plant.exact)[0]
 
     def _check_derivatives(self, instants: np.ndarray) -> None:
         """Raise if the disturbance of an output does not have the derivatives that are needed."""
