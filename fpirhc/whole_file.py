@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,16 +23,22 @@ def write_whole(content: str | bytes, path: Path, what: str) -> None:
 
 @contextmanager
 def whole_file(path: Path, what: str) -> Iterator[IO[bytes]]:
-    """Open a file that takes the place of what was there when all of it is written."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    """Open a file that takes the place of what was there when all of it is written; links and modes stay.
+
+    The file beside it has a name that no other process meets: the number of a process comes again in containers.
+    """
+    target = path.resolve() if path.is_symlink() else path
+    beside = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}")
     try:
         handle = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
         try:
+            with suppress(FileNotFoundError):
+                beside.chmod(target.stat().st_mode & 0o7777)
             with os.fdopen(handle, "wb") as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
-            beside.replace(path)
+            beside.replace(target)
         except BaseException:
             beside.unlink(missing_ok=True)
             raise

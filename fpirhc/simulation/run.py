@@ -61,6 +61,13 @@ class Run(FoundByName):
     compiled: bool
     settings: Mapping[str, object]
 
+    def __post_init__(self) -> None:
+        """A log that is not finite is no finished run, whoever made it."""
+        if self.stop is None and not np.isfinite(self.log).all():
+            row, column = (int(k) for k in np.argwhere(~np.isfinite(self.log))[0])
+            where = f"'{self.layout.columns[column]}' is not finite in cycle {row}"
+            object.__setattr__(self, "stop", f"signal {where}; the run was not ended there")
+
     def __getitem__(self, name: str) -> np.ndarray:
         if name in self.layout:
             return self.log[:, self.layout.slice(name)]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from typing import TypeVar
+from unicodedata import normalize
 
 import casadi as ca
 import numpy as np
@@ -113,6 +114,10 @@ class Named:
         self.vector = column
 
     def __getattr__(self, name: str) -> Expression:
+        if (
+            name not in self._elements
+        ):  # Python reads identifiers in NFKC (PEP 3131): of the micro sign it makes the letter mu
+            name = next((e for e in self._elements if normalize("NFKC", e) == name), name)
         return self[name]
 
     def __getitem__(self, name: str) -> Expression:

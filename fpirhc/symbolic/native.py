@@ -5,6 +5,7 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import hashlib
 import os
@@ -145,13 +146,20 @@ def cache_folder() -> Path:
         with tempfile.TemporaryFile(dir=base):
             return base
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
-        return Path(_temporary_folder().name)
+        return _temporary_folder()
 
 
 @cache
-def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
-    """A folder for this process, removed when the process ends."""
-    return tempfile.TemporaryDirectory(prefix="fpirhc-", ignore_cleanup_errors=True)
+def _temporary_folder() -> Path:
+    """A folder for this process, removed when it ends, and not when a process that was forked from it ends."""
+    folder, owner = Path(tempfile.mkdtemp(prefix="fpirhc-")), os.getpid()
+
+    def remove() -> None:
+        if os.getpid() == owner:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    return folder
 
 
 def why_no_compiler() -> str:

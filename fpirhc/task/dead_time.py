@@ -84,6 +84,17 @@ class DeadTime(Checked):
         known = {n: added.get(n, 0.0) + outside.get(n, 0.0) for n in {**outside, **added}}
         return replace(self, inputs=known, outside=dict(outside))
 
+    def over(self, period: float) -> DeadTime:
+        """Return it without dead times that are below the rounding of a cycle, as .3 - .1 - .2 is."""
+        least = _WHOLE * period
+        small = [n for n, late in self.inputs.items() if 0 < nominal(late) < least and not is_live(late)]
+        measurement = (
+            0.0 if 0 < nominal(self.measurement) < least and not is_live(self.measurement) else self.measurement
+        )
+        if not small and measurement is self.measurement:
+            return self
+        return replace(self, inputs={n: v for n, v in self.inputs.items() if n not in small}, measurement=measurement)
+
     @property
     def queued(self) -> tuple[str, ...]:
         """Names of the inputs that wait in a queue, and "measurement" where measurements do."""

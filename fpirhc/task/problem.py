@@ -116,7 +116,7 @@ class Problem(Checked):
         known = self.plant, self.reality, self.period, self.integrator, self.horizon, self.sensing
         for name, value in settled_maps(*known, mistakes).items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "dead_time", self.dead_time.behind(self.moves.dead_time, mistakes))
+        object.__setattr__(self, "dead_time", self.dead_time.behind(self.moves.dead_time, mistakes).over(self.period))
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
