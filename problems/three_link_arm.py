@@ -10,13 +10,13 @@ accelerations are differences of these velocities behind a low-pass of 1/600 s. 
 by 30 rad/s^2. Fixed-point iteration feeds that acceleration back; the law of Slotine and Li needs only the velocity. Errors
 count from 10 s on:
 
-    rms error, seed 0    q1 [rad]    q2 [rad]    q3 [rad]    moves tau1 [N m/s]
-    CT                      0.044        0.15        0.38                    81
-    CT+FPI                0.00095      0.0029      0.0071                   883
-    CT+FPI, half gain      0.0015      0.0055       0.015                   304
-    AID                    0.0025      0.0039      0.0037                   161
-    AID+FPI               0.00084      0.0011      0.0013                  1190
-    Slotine-Li            0.00092       0.001      0.0016                    90
+    rms error, seed 0    q1 [rad]    q2 [rad]    q3 [rad]
+    CT                      0.044        0.15        0.38
+    CT+FPI                0.00095      0.0029      0.0071
+    CT+FPI, half gain      0.0015      0.0055       0.015
+    AID                    0.0025      0.0039      0.0037
+    AID+FPI               0.00084      0.0011      0.0013
+    Slotine-Li            0.00092       0.001      0.0016
 
 Slotine-Li is more precise than FPI here, and its torque moves a tenth as much, because the velocity is coarse and the motion
 excites every parameter that matters; a learned model is then better than a corrected one. FPI is better at first, because it

@@ -1,15 +1,14 @@
-"""A mass whose model is too heavy, and the answers of its review by question."""
+"""A mass whose model is too heavy, and the answers of its review by their keys."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import casadi as ca
-import numpy as np
 from plants import heavy
 
 import fpirhc as fp
-from fpirhc.simulation.linearise.linear_loop import LinearCycle, LinearLoop
+from fpirhc.controllers.base import Controller
 
 PERIOD = 1e-3  # s
 
@@ -25,19 +24,7 @@ def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.Com
     return fp.ComputedTorque(fp.Exponential(rate=rate), fp.Sigmoid(gain=gain, scale=scale))
 
 
-def answers(problem: fp.Problem, controller=None, mismatch: float = 0.0) -> dict[str, fp.Answer]:
-    """All answers by question."""
-    controllers = {"it": torque() if controller is None else controller}
-    return {a.question: a for a in fp.review(problem, controllers, mismatch=mismatch, seed=0).answers}
-
-
-def about(result: dict[str, fp.Answer], words: str) -> fp.Answer:
-    [question] = [q for q in result if words in q]
-    return result[question]
-
-
-def linear(dynamics: Any, entry: Any, arriving: Any, state: Any, period: float) -> LinearLoop:
-    """A linear loop of one cycle by its matrices, with the numbers of the plant's states among its entries; every mode counts."""
-    shown = np.eye(len(dynamics))[list(state)]
-    cycle = LinearCycle(np.asarray(dynamics), np.asarray(entry), np.asarray(arriving), shown)
-    return LinearLoop((cycle,), np.zeros((0, len(dynamics))), shown.T, period)
+def answers(problem: fp.Problem, controller: Controller | None = None, mismatch: float = 0.0) -> dict[str, fp.Answer]:
+    """All answers about the problem and one controller."""
+    found = fp.review(problem, {"it": controller or torque()}, mismatch=mismatch, seed=0).answers
+    return {a.key: a for some in found.values() for a in some}

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import ast
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import fpirhc as fp
 from fpirhc import errors
-from fpirhc.errors import InvalidField, InvalidName
+from fpirhc.errors import InvalidName
 from fpirhc.members import FAMILIES, examples, member_classes, member_modules
 
 
@@ -52,31 +51,6 @@ def test_names_that_tools_look_for_cost_nothing(monkeypatch):
 def test_examples_of_wrappers_need_something_inside():
     """Without an inner map only maps that stand alone are given."""
     alone = examples("deformations")
-    assert {type(m).__name__ for m in alone}.isdisjoint({"Guarded", "Paired"})
+    assert {type(m).__name__ for m in alone}.isdisjoint({"Paired", "ModelReferenced"})
     around = examples("deformations", alone[0])
-    assert {type(m).__name__ for m in around} >= {"Guarded", "Paired"}
-
-
-PLANT: Any = fp.Plant
-SENSING: Any = fp.Sensing
-
-
-def _stepper() -> Any:
-    task = fp.load_problem("two_link_arm")
-    return fp.Stepper(task.problem, fp.ComputedTorque(fp.Exponential(rate=10.0)), compiled=False)
-
-
-@pytest.mark.parametrize(
-    ("ask", "message"),
-    [
-        (lambda: PLANT.of_map, "Plant has no attribute 'of_map'; it is called 'discrete' now"),
-        (lambda: PLANT.of_maps, "Plant has no attribute 'of_maps'"),
-        (lambda: SENSING(belief=None), "Sensing has no field 'belief'. It is called 'observer' now."),
-        (lambda: _stepper().aim({}), "Stepper has no attribute 'aim'; it is called 'set_reference' now"),
-        (lambda: _stepper().stale(), "Stepper has no attribute 'stale'; it is called 'outdated' now"),
-    ],
-)
-def test_a_former_member_leads_to_the_present_one(ask, message):
-    with pytest.raises((AttributeError, InvalidField)) as caught:
-        ask()
-    assert message in str(caught.value)
+    assert {type(m).__name__ for m in around} >= {"Paired", "ModelReferenced"}
