@@ -62,7 +62,6 @@ from .sensing.observers.kalman_filter import KalmanFilter
 from .simulation.machine import RunMonitor
 from .simulation.metrics import Metric, figures, measure
 from .simulation.pictures.base import Quantity
-from .simulation.pictures.cases import Band, Grid
 from .simulation.pictures.heat_map import HeatMap
 from .simulation.pictures.lines import OverTime, Portrait, Raster
 from .simulation.pictures.planar import Planar, Shape
@@ -96,7 +95,6 @@ __all__ = [
     "Affine",
     "Algebraic",
     "Answer",
-    "Band",
     "Believed",
     "ByDesired",
     "ByModel",
@@ -127,7 +125,6 @@ __all__ = [
     "FullSpaceFixedPoint",
     "GaussNewton",
     "GradientFixedPoint",
-    "Grid",
     "Haar",
     "HarmfulAdaptation",
     "HeatMap",

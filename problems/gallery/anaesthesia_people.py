@@ -316,6 +316,5 @@ def lowest(problem, run):
 metrics = (fp.figures.InBand(BIS, 40.0, 60.0), fp.Metric("lowest", lowest, better="larger", headline=True, finite=True))
 headline_metric = "in_band"
 pictures = (
-    fp.Band("Depth", what=BIS, target=(40.0, 60.0)),
     fp.OverTime("Depth and infusion", panels=(BIS, "reality_state.infusion"), levels={BIS: (40.0, 60.0)}),
 )

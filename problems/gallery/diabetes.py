@@ -293,6 +293,5 @@ metrics = (
 )
 headline_metric = "in_range"
 pictures = (
-    fp.Band("Ambulatory glucose profile", what=GLUCOSE, target=(70.0, 180.0), fold=1440.0),  # min
-    fp.Grid("Control variability", what=GLUCOSE, low=(110.0, 90.0, 70.0, 50.0), high=(110.0, 180.0, 300.0, 400.0)),
+    fp.OverTime("Glucose and insulin", panels=(GLUCOSE, "command.extra"), levels={GLUCOSE: (70.0, 180.0)}),  # mg/dl
 )

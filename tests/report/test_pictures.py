@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
 from fpirhc.report.html import own_pictures, render
-from fpirhc.simulation.pictures.base import Kept, averaged, extremes
+from fpirhc.simulation.pictures.base import averaged, extremes
 from fpirhc.simulation.pictures.lines import passages
 
 
@@ -169,101 +169,6 @@ def test_a_heat_map_has_rows_of_one_unit(runs):
         mixed.draw(Figure(), runs)
     with pytest.raises(InvalidValue, match=r"expected at least one signal, such as 'state.q'"):
         fp.HeatMap("h", rows=())
-
-
-def case_of(values, end=None):
-    """What a band keeps of a case at the times 0, 1, ...; one that ended early has fewer."""
-    values = list(values)[:end]
-    return {"up": "q [m]", "across": "time [s]", "times": [float(k) for k in range(len(values))], "values": values}
-
-
-def test_a_band_has_the_quantiles_of_the_cases():
-    """Median, quartiles and extremes at each time, of the cases that last until then."""
-    values = np.random.default_rng(5).normal(size=(9, 20))
-    cases = [case_of(row.tolist(), 10 if k == 8 else None) for k, row in enumerate(values)]
-    figure = Figure()
-    fp.Band("b", what="state.q", target=(-1.0, 1.0)).draw_cases(figure, {"RHC": cases, "PID": cases[:1]})
-    upper, lower = figure.axes
-    least, most, middle = (np.asarray(line.get_ydata(), dtype=float) for line in upper.lines)
-    values[8, 10:] = np.nan
-    np.testing.assert_allclose(least, np.nanmin(values, axis=0))
-    np.testing.assert_allclose(most, np.nanmax(values, axis=0))
-    np.testing.assert_allclose(middle, np.nanmedian(values, axis=0))
-    quarters = upper.collections[-1].get_paths()[0].get_extents()
-    low, high = np.nanquantile(values, (0.25, 0.75), axis=0)
-    assert (quarters.y0, quarters.y1) == (pytest.approx(low.min()), pytest.approx(high.max()))
-    assert (upper.get_title(), lower.get_title()) == ("RHC (9 cases)", "PID")
-    assert (upper.get_ylabel(), lower.get_xlabel()) == ("q [m]", "time [s]")
-
-
-def test_days_of_all_cases_lie_over_each_other():
-    """Two and a half days of three cases, ten values a day: nine mornings count, and six evenings."""
-    values = np.random.default_rng(6).normal(size=(3, 25))
-    cases = [case_of(row.tolist()) for row in values]
-    times = np.array(cases[0]["times"], dtype=float)
-    day = 10 * (times[1] - times[0])
-    figure = Figure()
-    fp.Band("b", what="state.q", fold=day).draw_cases(figure, {"RHC": cases})
-    least, most, middle = (np.asarray(line.get_ydata(), dtype=float) for line in figure.axes[0].lines)
-    late = np.full((3, 5), np.nan)
-    days = np.hstack([values, late]).reshape(9, 10)
-    np.testing.assert_allclose(least, np.nanmin(days, axis=0))
-    np.testing.assert_allclose(most, np.nanmax(days, axis=0))
-    np.testing.assert_allclose(middle, np.nanmedian(days, axis=0))
-    assert np.max(np.asarray(figure.axes[0].lines[2].get_xdata(), dtype=float)) < day
-
-
-def test_a_band_of_a_comparison_shows_its_runs(runs):
-    """The median of one run is the run, averaged."""
-    figure = Figure()
-    fp.Band("b", what=ENERGY).draw(figure, runs)
-    np.testing.assert_allclose(
-        np.asarray(figure.axes[1].lines[2].get_ydata(), dtype=float), averaged(ENERGY.values(runs["quick"]), 240)
-    )
-
-
-GLUCOSE = fp.Grid("g", what="state.q", low=(110, 90, 70, 50), high=(110, 180, 300, 400))
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "zone"),
-    [
-        *((95, 170, "A"), (120, 100, "A"), (90, 180, "A")),
-        *((95, 250, "B"), (80, 170, "B"), (80, 250, "B"), (70, 300, "B")),
-        *((95, 350, "C"), (60, 170, "C"), (60, 250, "D"), (80, 350, "D")),
-        *((60, 350, "E"), (20, 500, "E")),
-    ],
-)
-def test_the_zones_of_a_grid_are_the_published_ones(low, high, zone):
-    """Magni et al. 2008, figure 2: A accurate, B benign, C over-corrected, D failure to deal with one side, E erroneous."""
-    assert GLUCOSE.zone(low, high) == zone
-
-
-def test_a_grid_counts_zones_and_leaves_out_the_ends_of_a_run(runs):
-    """A point for each case; what lies beyond the edges is drawn at the edge; `beyond` cuts the rarest values off."""
-    cases: list[Kept] = [
-        {"label": "q [mg/dl]", "low": low, "high": high} for low, high in ((95.0, 170.0), (20.0, 500.0))
-    ]
-    figure = Figure()
-    GLUCOSE.draw_cases(figure, {"RHC": cases})
-    [axis] = figure.axes
-    np.testing.assert_array_equal(axis.lines[0].get_xydata(), [[95, 170], [50, 400]])
-    assert axis.lines[0].get_label() == "RHC: A 1, E 1"
-    assert (axis.get_xlabel(), axis.get_ylabel()) == ("lowest q [mg/dl]", "highest q [mg/dl]")
-    assert axis.get_xlim() == (110, 50)
-    q = runs["slow"]["state.q"]
-    assert GLUCOSE.kept(runs["slow"]) == {"label": "q [m]", "low": q.min(), "high": q.max()}
-    inside = replace(GLUCOSE, beyond=0.025).kept(runs["slow"])
-    assert (inside["low"], inside["high"]) == tuple(np.quantile(q, (0.025, 0.975)))
-
-
-def test_wrong_edges_of_a_grid_are_told():
-    with pytest.raises(InvalidValue, match=r"Grid\('g', low=\(50, 70, 90, 110\)\): expected 4 falling numbers"):
-        fp.Grid("g", what="state.q", low=(50, 70, 90, 110), high=(110, 180, 300, 400))
-    with pytest.raises(InvalidValue, match=r"Grid\('g', high=\(110, 180\)\): expected 4 rising numbers"):
-        fp.Grid("g", what="state.q", low=(110, 90, 70, 50), high=(110, 180))
-    with pytest.raises(InvalidValue, match=r"beyond=0.5\): expected a share from 0 to below 0.5"):
-        fp.Grid("g", what="state.q", low=(110, 90, 70, 50), high=(110, 180, 300, 400), beyond=0.5)
 
 
 def cart(q, p):

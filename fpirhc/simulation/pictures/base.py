@@ -7,10 +7,10 @@ module imports no plotting library.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,8 +20,6 @@ from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Kept: TypeAlias = Mapping[str, float | str | list[float]]
 
 INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
@@ -50,8 +48,6 @@ class Picture(Checked, ABC):
     title: str
     caption: str
     controllers: tuple[str, ...]
-    keeps: ClassVar[bool] = False
-    """Whether `kept` is asked of every run."""
 
     @abstractmethod
     def size(self, count: int) -> tuple[float, float]:
@@ -68,13 +64,6 @@ class Picture(Checked, ABC):
     def motion(self, runs: Mapping[str, Run]) -> Mapping[str, object]:  # noqa: ARG002
         """Return what a page needs to play the runs, by name of their controller; nothing where the picture stands still."""
         return {}
-
-    def kept(self, run: Run) -> Kept:  # noqa: ARG002
-        """Return what the picture needs of the run of a case to show many of them; nothing where it shows single runs."""
-        return {}
-
-    def draw_cases(self, figure: Figure, kept: Mapping[str, Sequence[Kept]]) -> None:
-        """Draw what was kept of all cases, by name of their controller, into an empty figure; called where something is."""
 
 
 def numbers(run: Run, what: str | Quantity) -> np.ndarray:
