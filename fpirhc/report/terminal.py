@@ -314,8 +314,6 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     for one in solved:
         for text in one.plan.violations():
             say(f"{one.name}: {text}")
-        for text in one.plan.reasons():
-            say(f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
             say(f"{one.name}: soft limit '{name}' costs {number(price)}")
         if one.plan.overflow():

@@ -112,15 +112,6 @@ def test_a_wall_that_the_inputs_feel_late_is_solved_in_one_call(speed):
     assert plan.states[0].max() == pytest.approx(0.3, abs=1e-7)
 
 
-def test_too_fast_for_the_wall_is_said_with_the_stage_at_which_the_plan_is_back():
-    ocp, data, first = behind_a_wall(2.0)
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
-    assert plan.status == fp.Status.INFEASIBLE
-    assert plan.reasons()[0].startswith(
-        "'x' above 0.3: begins inside, passes it by 0.0831 m and cannot be back before stage 10"
-    )
-
-
 @cache
 def linear_horizon():
     """Two states and two inputs whose every coefficient is a parameter: one horizon serves all plants."""
