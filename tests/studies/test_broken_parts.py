@@ -48,11 +48,7 @@ def test_a_broken_metric_is_told_by_its_name():
 
 @pytest.mark.parametrize(
     ("part", "name"),
-    [
-        ("_cycle_time", "the time of a cycle"),
-        ("_contraction", "the contraction"),
-        ("errors_of", "the null test"),
-    ],
+    [("_cycle_time", "the time of a cycle"), ("_contraction", "the contraction"), ("errors_of", "the null test")],
 )
 def test_a_part_of_a_comparison_that_breaks_loses_no_run(part, name, monkeypatch):
     """The runs and their metrics are there, and the notes name the part."""
