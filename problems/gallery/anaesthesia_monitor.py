@@ -15,7 +15,7 @@ add 25 to 40 to it, or take 30 off. Controllers know of none of this. For the pa
     cascade, slow low-pass      4.6
     cascade, Haar               4.2
 
-The 22 patients on whom the cascade was not tuned (`fpirhc compare anaesthesia_monitor --cases 'A unseen'`), seed 0: the worst
+The 22 patients on whom the cascade was not tuned (`fpirhc study anaesthesia_monitor --cases 'A unseen'`), seed 0: the worst
 patient's share of the time from 40 to 60 in %, the lowest bis, the mean share, and how far the target is moved up and down in mg/l
 per min; the poles of the low-pass and the levels were chosen on them:
 

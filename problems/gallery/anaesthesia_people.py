@@ -25,7 +25,7 @@ the patient of medians:
     cascade in mg/l                        3.5
 
 What counts is who fares worst: the worst patient's share of the time from 40 to 60 in %, the lowest bis of anybody with the
-induction, and then the mean share (`fpirhc compare anaesthesia_people --cases all`), seed 0:
+induction, and then the mean share (`fpirhc study anaesthesia_people --cases all`), seed 0:
 
     worst, lowest, mean                A tuned             A unseen            B                   C
     pump alone                         0    35.4   67.1    0    26.7   59.5    0    28.9   64.9    0    14.7   52.4

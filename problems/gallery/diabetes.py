@@ -24,7 +24,7 @@ this file, over two days:
     RHC+FPI on the target               46
 
 Nobody may be below 70 mg/dl for more than 4 % of the time; the time from 70 to 180 mg/dl is what is won. Over all thirty people
-(`fpirhc compare diabetes --cases all`), seed 0:
+(`fpirhc study diabetes --cases all`), seed 0:
 
     shares of the time [%]    from 70 to 180    worst person    below 70    worst person
     PID                                   35              28           0               0

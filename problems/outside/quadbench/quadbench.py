@@ -5,7 +5,7 @@ The vehicle (RotorPy's equations, 17 states) starts at rest with its rotors at r
 The model is r'' = thrust - g; an attitude loop of nominal parameters turns the thrust. Nobody is told what disturbs: the response
 is the difference of the measured velocity. One setting serves all trials.
 
-`fpirhc compare problems/outside/quadbench/quadbench.py --cases all` flies the trials; `benchmarks/quadbench.py` prints the table.
+`fpirhc study problems/outside/quadbench/quadbench.py --cases all` flies the trials; `benchmarks/quadbench.py` prints the table.
 """
 
 import math
