@@ -9,7 +9,7 @@ For the same adult:
     RHC offset-free                           63
 
 The adult's error is half of what it is without the announcement, and yet it is no controller for people. Over the ten children
-(`fpirhc study diabetes_announced --cases 'child*'`), seed 0:
+(`fpirhc study diabetes_announced --cases child`), seed 0:
 
     shares of the time [%]       from 70 to 180    worst person    below 70    worst person
     RHC                                      75              48          12              34
