@@ -229,24 +229,6 @@ def adaptation_is_told(trial: _Cycles, generator: np.random.Generator) -> None: 
     )
 
 
-def desired_passes_as_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """`slows_desired` is false where a change of the desired response is a change of the request at once, and only there."""
-    deformation, size = trial.deformation, _SMALL * trial.amplitude
-    calm = trial.calm_memory()
-    before, after = (float(trial.function(0.0, 0.0, d, calm)[0]) for d in (0.0, size))
-    passes, share = abs(after - before - size) <= _SAME * size, (after - before) / size
-    if deformation.iteration.slows_desired:
-        first = deformation.effective_gain() * (1 - deformation.iteration.error_pole)
-        told = not passes or abs(first - 1) <= _SAME or not deformation.iteration.constant
-    else:
-        told = passes
-    hold(
-        told,
-        f"`slows_desired` is {str(deformation.iteration.slows_desired).lower()}, but of a change of the desired response the "
-        f"request has the share {share:.4g} one cycle later: the rate of its loop would be judged wrongly",
-    )
-
-
 def leak_is_told(trial: _Cycles, generator: np.random.Generator) -> None:  # noqa: ARG001
     """An error changes the next request by the effective gain times 1 - `leak` times 1 - `error_pole`."""
     deformation = trial.deformation
@@ -266,7 +248,6 @@ LAWS = (
     inner_can_be_exchanged,
     automatic_settings_are_chosen,
     adaptation_is_told,
-    desired_passes_as_told,
     constant_map_keeps_its_gain,
     filter_and_pairing_are_told,
     reach_is_told,

@@ -139,8 +139,6 @@ class Iteration:
 
     Args:
         constant: whether gain and pairing stay as they are at the start of a run.
-        slows_desired: whether the form is the plain one, in which a change of the desired response passes through the iteration, a
-            low-pass.
         error_pole: pole of a low-pass filter on the response error, from 0 (none) to below 1.
         leak: pole of the leak between the deformation of the last cycle and the next; 0: none.
         pairing: the earlier request that a response is paired with; None: the last one.
@@ -151,7 +149,6 @@ class Iteration:
     """
 
     constant: bool = True
-    slows_desired: bool = True
     error_pole: float = 0.0
     leak: float = 0.0
     pairing: Pairing | None = None
@@ -433,10 +430,6 @@ class Identity(Deformation):
     """
 
     adapts = False
-
-    @property
-    def iteration(self) -> Iteration:
-        return Iteration(slows_desired=False)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

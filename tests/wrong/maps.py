@@ -123,14 +123,6 @@ class GivesAnotherGain(Softsign):
         return replace(self, gain=2 * gain)
 
 
-class SaysDesiredPassesAtOnce(Softsign):
-    """Is the plain form and says that it is not."""
-
-    @property
-    def iteration(self):
-        return Iteration(slows_desired=False)
-
-
 class SaysItFilters(Softsign):
     """Names a filter that it does not have."""
 

@@ -31,7 +31,6 @@ MAPS = {
     maps.Fades: ("only desired is fixed", "a false fixed point is near"),
     maps.Rests: ("only desired is fixed", "an error of 1.* a false fixed point is near"),
     maps.GivesAnotherGain: ("gain can be set", "effective gain 1.6"),
-    maps.SaysDesiredPassesAtOnce: ("desired passes as told", "`slows_desired` is false, but.*the share 0.3"),
     maps.SaysItFilters: ("filter and pairing are told", "the pole 0.9"),
     maps.SaysItDoesNotAdapt: ("adaptation is told", "`adapts` is false, but.*0.3 per unit"),
     maps.SaysItLeaks: ("leak is told", "its leak is 0.5.*by -0.3 and not by -0.15"),

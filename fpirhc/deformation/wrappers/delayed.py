@@ -193,7 +193,7 @@ class Increment(_Queued):
 
     @property
     def iteration(self) -> Iteration:
-        return replace(super().iteration, slows_desired=False, leak=self._leak)
+        return replace(super().iteration, leak=self._leak)
 
     @property
     def _leak(self) -> float:
