@@ -511,7 +511,9 @@ def export(
 @app.callback(invoke_without_command=True)
 def about(
     version: Annotated[bool, typer.Option("--version", help="print the version")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="print the traceback of an error; may stand anywhere")] = False,  # noqa: ARG001
+    _debug: Annotated[
+        bool, typer.Option("--debug", help="print the traceback of an error; may stand anywhere")
+    ] = False,
 ) -> None:
     """What stands before a command."""
     if version:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import ClassVar, NoReturn, Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -85,9 +85,6 @@ class ExternalPlant(Checked):
     make: Make | None = field(default=None, metadata={"setting": "apart"})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
     period: Positive | None = field(default=None, metadata={"setting": False})
-
-    states_dead_time: ClassVar[str] = "ExternalPlant(dead_time=...)"
-    """Where a user states the dead time of its inputs: the body has it, and a run does not add it."""
 
     def __post_init__(self) -> None:
         if (self.body is None) == (self.make is None):

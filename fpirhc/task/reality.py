@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -47,9 +46,6 @@ class Reality(Checked):
     start: Mapping[str, Finite] = field(default_factory=dict)
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
-
-    states_dead_time: ClassVar[str] = "Problem(dead_time=...)"
-    """Where a user states the dead time of its inputs."""
 
     @property
     def symbolic(self) -> Reality:

@@ -531,3 +531,18 @@ def test_a_long_list_of_valid_names_is_cut():
     said = str(caught.value)
     assert said.startswith("fpirhc has no name 'Sigmiod'. Did you mean 'Sigmoid'? Valid: Sigmoid, ")
     assert re.search(r" and \d+ more\.$", said)
+
+
+@pytest.mark.parametrize("mistake", ["raise RuntimeError('the drive is not armed')", "fp.Parameter(order=3)", "1 / 0"])
+def test_a_file_is_executed_once_and_not_beyond_its_first_mistake(mistake, tmp_path, capsys):
+    """What stands behind a guard is not reached, by no command."""
+    log = tmp_path / "log"
+    note = (
+        f"import pathlib; log = pathlib.Path({str(log)!r}); log.write_text((log.read_text() if log.exists() else '') + "
+    )
+    text = f"import fpirhc as fp\n{note}'before ')\n{mistake}\n{note}'behind ')\n"
+    (tmp_path / "armed.py").write_text(text, encoding="utf-8")
+    for count, command in enumerate(("compare", "review", "check"), 1):
+        assert main([command, str(tmp_path / "armed.py")]) == 2
+        assert "armed.py, line 3: " in capsys.readouterr().err
+        assert log.read_text() == count * "before "

@@ -77,11 +77,6 @@ class AskedLoop:
         """Whether the gain of a `LinearMap` is in the memory."""
         return bool(self.gain_places)
 
-    @property
-    def keeps_learned(self) -> bool:
-        """Whether a model or gains that change on line stay in the linear loop what they are at its point."""
-        return Kind.ADAPTED in self.loop.memory.kinds
-
     @cached_property
     def repeats(self) -> int:
         """Cycles after which the loop repeats itself: those between two plans."""

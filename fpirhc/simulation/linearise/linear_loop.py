@@ -176,25 +176,6 @@ class LinearLoop:
             z = one.dynamics @ z
         return np.array(states), np.array(commands)
 
-    def impulses(self, entering: np.ndarray, cycles: int) -> np.ndarray:
-        """Return the states (count, cycles, nx, m) after commands (nu, m) that enter in one of the `count` cycles."""
-        count, width = len(self.cycles), entering.shape[1]
-        shown, own = self._shown, np.zeros((count, count, len(self.placed.T), width))
-        after = []  # of each cycle of entry: z at the next period's first cycle
-        for k, one in enumerate(self.cycles):
-            z = one.entry @ entering
-            for place in range(k + 1, count):
-                own[k, place] = self.cycles[place].state @ z
-                z = self.cycles[place].dynamics @ z
-            after.append(z)
-        z, periods = np.hstack(after), [own]
-        for _ in range(-(-cycles // count)):
-            states = (shown @ z).reshape(count, -1, count, width)
-            periods.append(np.moveaxis(states, 2, 0))
-            z = self.dynamics @ z
-        whole = np.concatenate(periods, axis=1)
-        return np.stack([whole[k, k + 1 : k + 1 + cycles] for k in range(count)])
-
     def spread(self, covariance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, n) of z at the first cycle where w is white noise with a covariance (nw, nw) in every cycle.
 

@@ -11,10 +11,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import with_optimiser
 from fpirhc.deformation.base import Deformation, Iteration, with_inner
-from fpirhc.errors import FpirhcError
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -60,24 +57,6 @@ class LinearMap(Deformation):
 
     def with_effective_gain(self, gain: float) -> Self:
         return replace(self, gain=gain)
-
-
-def near_fixed_point(controller: Controller) -> Controller:
-    """Return the controller with its map as it is near the fixed point, and its optimiser as it is near a plan that is solved.
-
-    A map that changes on line, or does not adapt, stays as it is.
-    """
-    if controller.planner is not None:
-        optimiser = controller.planner.optimiser
-        near = optimiser.near_plan
-        controller = controller if near is optimiser else with_optimiser(controller, near)
-    deformation = controller.deformation
-    if not deformation.adapts or not deformation.iteration.constant:
-        return controller
-    try:
-        return controller.with_deformation(linear(deformation))
-    except FpirhcError:  # a controller whose map cannot be replaced
-        return controller
 
 
 def linear(deformation: Deformation, *, noisy: bool = False) -> Deformation:
