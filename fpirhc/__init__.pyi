@@ -40,7 +40,7 @@ from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
 from .optimisers.plan import Plan, solve
 from .optimisers.reduced_gradient import ReducedGradient
 from .plant.integrators import Collocation, Cvodes, Euler, RungeKutta4
-from .plant.motion import Algebraic, Output
+from .plant.motion import Output
 from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
 from .plant.plant import Parameter, Plant
 from .probing.probe import probe
@@ -93,7 +93,6 @@ __all__ = [
     "PID",
     "RFPT",
     "Affine",
-    "Algebraic",
     "Answer",
     "Believed",
     "ByDesired",

@@ -175,7 +175,7 @@ def spelled_by_states(problem: Problem) -> Problem | None:
     Horizon and cost are left out. None for a plant that has outputs, moves in steps, or has limits of its states.
     """
     plant = problem.plant
-    own = bool(problem.limits.states) or problem.signals or problem.reality is not None or plant.algebraic is not None
+    own = bool(problem.limits.states) or problem.signals or problem.reality is not None
     if plant.outputs or plant.step is not None or own:
         return None
     elements = plant.state.elements

@@ -77,9 +77,8 @@ def disturbance_name(name: str) -> str:
 
 def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
     def response(*arguments: Named) -> Mapping[str, Expression]:
-        count = 1 if plant.algebraic is None else 2  # algebraic states come after the parameters
-        others, (p, *algebraic) = arguments[:-count], arguments[-count:]
-        responses = plant.response(*others, _own(plant, p), *algebraic)
+        *others, p = arguments
+        responses = plant.response(*others, _own(plant, p))
         return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in responses.items()}
 
     vars(response)["__signature__"] = inspect.signature(plant.response)
@@ -97,9 +96,8 @@ def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str
     original, step = plant.next, float(plant.step or 1.0)
 
     def next_states(*arguments: Named) -> Mapping[str, Expression]:
-        count = 1 if plant.algebraic is None else 2  # algebraic states come after the parameters
-        others, (p, *algebraic) = arguments[:-count], arguments[-count:]
-        values = original(*others, _own(plant, p), *algebraic)
+        *others, p = arguments
+        values = original(*others, _own(plant, p))
         return {c: v + step * p[disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
 
     vars(next_states)["__signature__"] = inspect.signature(original)

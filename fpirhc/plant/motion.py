@@ -1,6 +1,6 @@
 """The motion of a plant: named quantities with units, two sets of parameters, and their CasADi Functions.
 
-    response    r = f(x, u, p),        algebraic states    z(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w)
+    response    r = f(x, u, p),        x' = (q', q'', ..., f(x, u, p) + w)
 
 with the state x = (q, q', ...), derivative-major, and a forcing w that adds to the highest derivatives.
 """
@@ -22,7 +22,7 @@ from fpirhc.fields.checked import Checked, missing
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.parameter import Parameter, with_exact_values
-from fpirhc.symbolic.expression import FINITE, expression, graph, total
+from fpirhc.symbolic.expression import FINITE, expression, graph
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
 from fpirhc.symbolic.live import nan_where
 
@@ -61,7 +61,6 @@ class Motion(Checked):
     ranges: Mapping[str, tuple[float, float]] = field(
         default_factory=dict, kw_only=True, metadata={"setting": "where given"}
     )
-    algebraic: Algebraic | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
     outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
     step: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
@@ -238,7 +237,7 @@ def places(motion: Motion, derivative: int) -> list[int]:
 
 
 def arguments_of(motion: Motion, x: Expression, u: Expression, p: Expression) -> tuple[Named, ...]:
-    """Return the arguments of the response by name, without algebraic states: q, q', ..., u, p."""
+    """Return the arguments of the response by name: q, q', ..., u, p."""
     *derivatives, parameters = by_name(motion, x, p)
     return (*derivatives, Named(motion.input.elements, u, "input"), parameters)
 
@@ -270,20 +269,9 @@ class MotionEquations:
             differences = (self.next(x, u, p, ca.SX.zeros(len(self.motion.names))) - x) / sampling(self.motion)
             return ca.Function("fpirhc_response", [x, u, p], [differences], ["x", "u", "p"], ["r"])
         views = arguments_of(self.motion, x, u, p)
-        if self.motion.algebraic is not None:
-            views = (*views, self.motion.algebraic.view(self.algebraic(x, u, p)))
         responses = called(words(self.motion)[1], self.motion.response, *views)
         column = ca.vertcat(*(ca.SX(responses[c]) for c in self.motion.names))
         return ca.Function("fpirhc_response", [x, u, p], [ca.densify(column)], ["x", "u", "p"], ["r"])
-
-    @cached_property
-    def algebraic(self) -> ca.Function:
-        """Function (state, input, parameters) -> algebraic states (nz); empty without any."""
-        x, u, p = self.motion.symbols()
-        solution = ca.SX(0, 1)
-        if self.motion.algebraic is not None:
-            solution = self.motion.algebraic.solved(arguments_of(self.motion, x, u, p), ca.vertcat(x, u, p))
-        return ca.Function("fpirhc_algebraic", [x, u, p], [ca.densify(solution)], ["x", "u", "p"], ["z"])
 
     @cached_property
     def forced_rate(self) -> ca.Function:
@@ -331,8 +319,6 @@ class MotionEquations:
 
 def _one_step(motion: Motion, step: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> ca.SX:
     views = arguments_of(motion, x, u, p)
-    if motion.algebraic is not None:
-        views = (*views, motion.algebraic.view(motion.equations.algebraic(x, u, p)))
     values = called("next", step, *views)
     symbols = (x, u, p)
     entries = [scalar_expression(f"next of '{name}'", values[name], of=step, symbols=symbols) for name in motion.names]
@@ -355,78 +341,7 @@ def with_space(unit: str) -> str:
     return "" if unit == "1" else f" {unit}"
 
 
-SMALL = 1e-6  # last step of Newton's method, relative; the error left is about its square
-NEGLIGIBLE = 1e-3  # share of a guess, or of terms that cancel, beside which a number counts as zero
-ROUNDING = 1e-12  # relative change of what is known that nobody tells from the rounding of its numbers
-
-
-@dataclass(frozen=True, eq=False)
-class Algebraic(Checked):
-    """Algebraic states of a plant: `Plant(algebraic=Algebraic(units={"node": "V"}, ...))`.
-
-    The response has their values by name as its last argument, after the parameters.
-
-    Args:
-        units: name -> unit of every algebraic state.
-        equations: function of (q, q', ..., u, p, z) that returns {algebraic state: an expression that is to be zero}; which name
-            an equation has does not matter.
-        guess: from where Newton's method begins: numbers by name, or a function of (q, q', ..., u, p) that returns expressions.
-        steps: of Newton's method, where the equations are not affine in z.
-    """
-
-    units: Mapping[str, str]
-    equations: Callable[..., Mapping[str, Expression]]
-    guess: Mapping[str, float] | Callable[..., Mapping[str, Expression]]
-    steps: Few = 6
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the algebraic states."""
-        return tuple(self.units)
-
-    def view(self, z: Expression) -> Named:
-        """Return values of the algebraic states by name."""
-        return Named(self.names, z, "algebraic state")
-
-    def residual(self, views: tuple[Named, ...], z: Expression) -> Expression:
-        """Return g as a column."""
-        values = named_results("algebraic", called("algebraic", self.equations, *views, self.view(z)))
-        return ca.vertcat(*(ca.SX(scalar_expression(f"algebraic: equation '{n}'", values[n])) for n in self.names))
-
-    def first(self, views: tuple[Named, ...]) -> Expression:
-        """Return the guess as a column."""
-        values = called("algebraic: guess", self.guess, *views) if callable(self.guess) else self.guess
-        return ca.vertcat(*(ca.SX(scalar_expression(f"algebraic: guess of '{n}'", values[n])) for n in self.names))
-
-    def solved(self, views: tuple[Named, ...], known: Expression) -> Expression:
-        """Return z that solves the equations, as a column; NaN where Newton's method has not arrived.
-
-        Args:
-            views: of state, input and parameters.
-            known: their symbols in one column.
-        """
-        z = ca.SX.sym("z", len(self.names))
-        residual = self.residual(views, z)
-        slope = ca.jacobian(residual, z)
-        step_of = ca.Function("fpirhc_newton_step", [z, known], [ca.densify(ca.solve(slope, residual))])
-        guess = at = self.first(views)
-        if not ca.depends_on(slope, z):
-            return at - step_of(at, known)
-        # A state that is zero, found from a guess of zero, has no size: only rounding is left of its equations then.
-        rounding = ROUNDING * ca.mtimes(ca.fabs(ca.jacobian(residual, known)), ca.fabs(known))
-        rounded_at = ca.Function("fpirhc_rounded", [z, known], [_all_below(residual, rounding)])
-        before: Expression = at
-        for _ in range(self.steps):
-            before, at = at, at - step_of(at, known)
-        arrived = _all_below(at - before, SMALL * (ca.fabs(at) + NEGLIGIBLE * ca.fabs(guess)))
-        # NaN is on neither side of a comparison, so arriving is asked for and not missing.
-        return at + nan_where(ca.logic_not(ca.logic_or(arrived, rounded_at(at, known))))
-
-
-def _all_below(values: Expression, most: Expression) -> Expression:
-    """Whether every entry is at most so large, by its size."""
-    inside = total(ca.fabs(values[k]) <= most[k] for k in range(values.numel()))
-    return inside > values.numel() - 0.5
+NEGLIGIBLE = 1e-3  # share of terms that cancel beside which a number counts as zero
 
 
 INVERSE_TOLERANCE = 1e-8  # relative response error beyond which an input of Newton's method is NaN

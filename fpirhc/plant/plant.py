@@ -24,7 +24,6 @@ from fpirhc.plant.lie_derivatives import (
 )
 from fpirhc.plant.maps import Differences, check_map
 from fpirhc.plant.motion import (
-    Algebraic,
     Motion,
     MotionEquations,
     Output,
@@ -60,7 +59,6 @@ class Plant(Motion):
             Newton's method otherwise.
         ranges: physical range (lowest, highest) of states by name, such as {"level": (0.0, 2.0)}. A run whose plant leaves one ends
             there, by name; it limits nothing (see `Limits`).
-        algebraic: quantities that equations tie to the state at every instant; the response has them as its last argument.
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
@@ -96,7 +94,6 @@ class Plant(Motion):
         controlled: Sequence[str] | None = None,
         inverse: Callable[..., Mapping[str, Expression]] | None = None,
         ranges: Mapping[str, tuple[float, float]] | None = None,
-        algebraic: Algebraic | None = None,
         time_unit: str = "s",
     ) -> Self:
         """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
@@ -111,7 +108,6 @@ class Plant(Motion):
             inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
                 outputs; see `Plant`.
             ranges: physical range (lowest, highest) of states by name.
-            algebraic: quantities that equations tie to the state at every instant; see `Plant`.
             time_unit: unit of time of the equations.
 
         Raises:
@@ -127,7 +123,6 @@ class Plant(Motion):
             inverse=inverse,
             ranges=ranges or {},
             outputs=outputs,
-            algebraic=algebraic,
             time_unit=time_unit,
         )
 
@@ -143,7 +138,6 @@ class Plant(Motion):
         outputs: Mapping[str, Output] | None = None,
         controlled: Sequence[str] | None = None,
         ranges: Mapping[str, tuple[float, float]] | None = None,
-        algebraic: Algebraic | None = None,
         time_unit: str = "s",
     ) -> Self:
         """Return the map x+ = f(x, u, p), y = h(x, p), which steps and has no differential equation.
@@ -162,7 +156,6 @@ class Plant(Motion):
             outputs: name -> Output(unit, function of (x, p)); None: the states follow a reference.
             controlled: outputs, or states, on which a tracking law and a deformation act, as many as there are inputs; None: all.
             ranges: physical range (lowest, highest) of states by name.
-            algebraic: quantities that equations tie to the state in every step; see `Plant`.
             time_unit: unit of time of the step.
 
         Raises:
@@ -177,7 +170,6 @@ class Plant(Motion):
             controlled=controlled,
             ranges=ranges or {},
             outputs=outputs or {},
-            algebraic=algebraic,
             time_unit=time_unit,
             step=step,
             next=next,

@@ -5,15 +5,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Mapping
 
-import casadi as ca
-import numpy as np
-
 from fpirhc.errors import FpirhcError, Mistakes
 from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
 from fpirhc.plant.lie_derivatives import structural_order
-from fpirhc.plant.motion import Algebraic, Motion, arguments_of, controlled_places, inverse_by_user, words
-from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.plant.motion import Motion, arguments_of, controlled_places, inverse_by_user, words
+from fpirhc.symbolic.layout import Expression
 
 HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
 
@@ -68,11 +65,7 @@ def check_response(plant: Motion, mistakes: Mistakes) -> None:
     """Add every mistake of the response and of the orders to `mistakes`."""
     x, u, p = plant.symbols()
     arguments_of_step, symbols = arguments_of(plant, x, u, p), [x, u, p]
-    algebraic, (quantity, function) = plant.algebraic, words(plant)
-    if algebraic is not None:
-        check_algebraic(plant, algebraic, arguments_of_step, mistakes)
-        symbols.append(ca.SX.sym("z", max(1, len(algebraic.names))))
-        arguments_of_step = (*arguments_of_step, algebraic.view(symbols[-1]))
+    quantity, function = words(plant)
     expected = len(arguments_of_step)
     if not takes(plant.response, expected):
         mistakes.add(_wrong_arguments(plant, expected))
@@ -104,7 +97,7 @@ def _wrong_arguments(plant: Motion, expected: int) -> str:
     kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
     arguments, order = len(kinds), max(plant.orders, default=0)
     lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
-    names = [*lower[:order], "u", "p", *(["z"] if plant.algebraic else [])]
+    names = [*lower[:order], "u", "p"]
     state, fitting, place = quantity == "state", order + arguments - expected, place_of(plant.response)
     mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else _OF_STATES
     mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
@@ -166,73 +159,3 @@ def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
                 f"order of '{name}' is given as {stated}, but its response has no input: the first derivative that an "
                 f"input reaches is number {order}. Write the response of order {order}, or control another coordinate"
             )
-
-
-SINGULAR = 1e-12  # ratio of the least to the largest singular value of dg/dz
-
-
-def check_algebraic(plant: Motion, algebraic: Algebraic, views: tuple[Named, ...], mistakes: Mistakes) -> None:
-    """Add every mistake in the names, the guess and the equations to `mistakes`."""
-    others = [*plant.state.elements, *plant.inputs, *plant.parameters]
-    for name in algebraic.names:
-        if not str(name).isidentifier() or name in others:
-            mistakes.add(
-                f"algebraic: '{name}' is no name of its own; use letters, digits and underscores, and no other name twice"
-            )
-    if not algebraic.names:
-        mistakes.add("algebraic: units are empty; name at least one algebraic state, with its unit")
-    z = ca.SX.sym("z", max(1, len(algebraic.names)))
-    parts: dict[str, Callable[[], object]] = {
-        "equations": lambda: called("algebraic", algebraic.equations, *views, algebraic.view(z)),
-        "guess": lambda: (
-            called("algebraic: guess", algebraic.guess, *views) if callable(algebraic.guess) else algebraic.guess
-        ),
-    }
-    for what, part in parts.items():
-        with mistakes.caught():
-            values = named_results(f"algebraic: {what}", part())
-            mistakes.unknown(f"algebraic: {what}: algebraic state", values, algebraic.names)
-            for name in algebraic.names:
-                if name not in values:
-                    mistakes.add(f"algebraic: {what} have nothing for '{name}'; add it")
-    if mistakes.none:
-        with mistakes.caught():
-            algebraic.residual(views, z)
-            algebraic.first(views)
-
-
-def unsolved(plant: Motion, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> str:
-    """Return why the algebraic states cannot be computed at a point; empty where they can, and without any.
-
-    Args:
-        state: shape (nx,).
-        command: shape (nu,).
-        parameters: shape (np,).
-    """
-    algebraic = plant.algebraic
-    if algebraic is None:
-        return ""
-    names = ", ".join(algebraic.names)
-    solution = np.asarray(plant.equations.algebraic(state, command, parameters).full()).ravel()
-    x, u, p = plant.symbols()
-    z = ca.SX.sym("z", len(algebraic.names))
-    slope = ca.jacobian(algebraic.residual(arguments_of(plant, x, u, p), z), z)
-    first = algebraic.first(arguments_of(plant, x, u, p))
-    at_guess = np.asarray(ca.Function("fpirhc_guess", [x, u, p], [first])(state, command, parameters).full()).ravel()
-    at = np.where(np.isfinite(solution), solution, at_guess)
-    values = np.asarray(
-        ca.Function("fpirhc_regular", [x, u, p, z], [ca.densify(slope)])(state, command, parameters, at).full()
-    )
-    if not np.isfinite(values).all():
-        return f"the slopes of the equations of {names} are not finite; choose another guess"
-    sizes = np.linalg.svd(values / np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-300), compute_uv=False)
-    if sizes[-1] <= SINGULAR * sizes[0]:
-        return (
-            f"the equations of {names} do not determine them: their slopes are singular (index above 1); differentiate them, "
-            "or make one of them a coordinate"
-        )
-    if not np.isfinite(solution).all():
-        return (
-            f"Newton's method does not arrive at {names} in {algebraic.steps} steps; give a nearer guess, or more steps"
-        )
-    return ""

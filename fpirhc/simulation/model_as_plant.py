@@ -31,7 +31,7 @@ def with_believed_way(problem: Problem, deformation: Deformation) -> Problem:
     """Return the problem of a right model; itself where the deformation believes nothing beyond the problem.
 
     A lag or a dead time that a deformation believes is a part of its model, so a plant without it is no right model. A dead time
-    that the problem states is a fact, and stays. A lag before a map, or before algebraic states, is left out.
+    that the problem states is a fact, and stays. A lag before a map is left out.
     """
     mirror = deformation.mirror
     return _with_lag(_with_dead_time(problem, mirror), mirror)
@@ -60,7 +60,7 @@ def _with_lag(problem: Problem, mirror: Mirror) -> Problem:
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
     plant = problem.plant
-    if not any(lags) or problem.integrator.steps_maps or plant.algebraic is not None:
+    if not any(lags) or problem.integrator.steps_maps:
         return problem
     finer = problem.integrator.finer(math.ceil(problem.period / min(t for t in lags if t)))
     before = zip(plant.inputs, lags, map(float, problem.inputs_before), strict=True)

@@ -24,7 +24,6 @@ from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import disturbed, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
-from fpirhc.plant.plant_check import unsolved
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import behind_equals, line, number, table
 from fpirhc.symbolic.evaluate import Latest
@@ -521,10 +520,6 @@ def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = 
     known = {"approximate": plant.approximate}
     known |= {} if problem.reality else {"exact": plant.exact}  # with a reality these values move nothing
     sets = [(which, known[which]) for which in asked if which in known]
-    for which, values in sets:
-        why = unsolved(plant, problem.start_state, problem.inputs_before, values)
-        if why:
-            mistakes.add(f"algebraic states at the start ({which} parameters): {why}")
     if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
         return
     gain_of = _GAINS.of((plant.equations,), (), lambda: _gain(plant))

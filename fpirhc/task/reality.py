@@ -22,7 +22,6 @@ from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.maps import check_time, over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters, with_outputs_of
 from fpirhc.plant.plant import Plant, plant_facts
-from fpirhc.plant.plant_check import unsolved
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +214,6 @@ class Reality(Checked):
             InvalidProblem: with the fastest pole, and the sub-steps that would do.
         """
         plant = self.plant
-        why = unsolved(plant, start, command, plant.exact)
-        if why:
-            raise InvalidProblem(f"reality: algebraic states at the start: {why}")
         rates = np.asarray(plant.equations.rate(start, command, plant.exact).full()).ravel()
         if not np.isfinite(rates).all():
             wrong = plant.state.elements[int(np.argmin(np.isfinite(rates)))]

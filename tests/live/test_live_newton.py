@@ -1,4 +1,4 @@
-"""Live settings of plants whose inverse is Newton's, or whose algebraic states are: changed loops are rebuilt loops."""
+"""Live settings of plants whose inverse is Newton's: changed loops are rebuilt loops."""
 
 from __future__ import annotations
 
@@ -36,18 +36,6 @@ def cubic() -> fp.Plant:
     )
 
 
-def implicit() -> fp.Plant:
-    """The same force as an algebraic state: s with s + s^3 = u, found by Newton's steps in the response."""
-    return fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        parameters={"b": fp.Parameter(1.0, 1.4, "1/kg")},
-        response=lambda q, v, u, p, z: {"y": p.b * (u.u + z.s) - q.y},
-        inverse=lambda q, v, r, p: {"u": (r.y + q.y) / p.b / 1.5},
-        algebraic=fp.Algebraic({"s": "N"}, lambda q, v, u, p, z: {"s": z.s + z.s**3 - q.y}, {"s": 0.0}, steps=12),
-    )
-
-
 def task(plant: fp.Plant) -> fp.Problem:
     """The plant along a sine."""
     return fp.Problem(
@@ -63,9 +51,7 @@ def task(plant: fp.Plant) -> fp.Problem:
 
 
 @pytest.mark.parametrize(
-    ("plant", "name"),
-    [(cubic, "computed torque"), (implicit, "computed torque"), (cubic, "receding horizon")],
-    ids=["newton", "algebraic", "plan"],
+    ("plant", "name"), [(cubic, "computed torque"), (cubic, "receding horizon")], ids=["newton", "plan"]
 )
 def test_every_setting_is_live_and_changed_equals_rebuilt(plant, name):
     """Bit by bit in the virtual machine, as for every other plant."""

@@ -233,30 +233,6 @@ def test_a_disturbance_of_a_map_is_the_growth_that_the_model_lacks() -> None:
     assert run["estimate"][-10:, 0] == pytest.approx(lacking[-11:-1], rel=0.01)
 
 
-def test_a_disturbance_of_a_map_is_that_of_the_same_map_with_an_algebraic_state() -> None:
-    forms: dict[str, Any] = {"states": {"x": "1"}, "inputs": {"u": "1"}, "step": 1.0}
-    forms["parameters"] = {"a": fp.Parameter(0.9, 0.8, "1")}
-    kept = fp.Algebraic(units={"n": "1"}, equations=lambda x, u, p, z: {"n": z.n - p.a * x.x}, guess={"n": 0.0})
-    plants = (
-        fp.Plant.discrete(**forms, next=lambda x, u, p: {"x": p.a * x.x + u.u}),
-        fp.Plant.discrete(**forms, next=lambda x, u, p, z: {"x": z.n + u.u}, algebraic=kept),
-    )
-    law = fp.ComputedTorque(fp.Exponential(rate=0.5, integral=False))
-    estimates = []
-    for plant in plants:
-        problem = fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(lambda t: {"x": 1.0 + 0 * t}),
-            start={"x": 0.0},
-            period=1.0,
-            duration=9.0,
-        )
-        run = simulated(problem, fp.Estimating(law, fp.DisturbanceKalman({"x": 1.0}, {"x": 0.1})))
-        estimates.append(run["estimate"])
-    assert np.abs(estimates[0][-1]) > 0.05
-    assert estimates[1] == pytest.approx(estimates[0], abs=1e-12)
-
-
 def test_the_residual_of_a_map_corrects_its_prediction() -> None:
     """The response belongs to the state of the cycle before; with the residual 1.4e-2 that the state is missed by is 6e-5."""
     problem = replace(stock(), horizon=None, cost=None, duration=8.0, dead_time=fp.DeadTime(inputs={"catch": 0.2}))

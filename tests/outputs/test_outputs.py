@@ -385,19 +385,6 @@ def test_a_scale_that_is_chosen_covers_an_output() -> None:
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_algebraic_states_and_outputs_go_together() -> None:
-    """A quantity that an equation ties to the state enters the rates, and the output is that of the plant without it."""
-    through = replace(
-        hill(5.5),
-        response=lambda x, u, p, z: {"C": u.u - z.lost, "E": 0.5 * (x.C - x.E)},
-        algebraic=fp.Algebraic(
-            {"lost": "mg/l/min"}, lambda x, u, p, z: {"lost": z.lost - x.C}, lambda x, u, p: {"lost": 0 * x.C}
-        ),
-    )
-    one, other = (simulated(sedated(p), fp.ComputedTorque(fp.Exponential(rate=1.0))) for p in (hill(5.5), through))
-    assert np.allclose(one["output.depth"], other["output.depth"], rtol=1e-9)
-
-
 def test_a_deviation_needs_references_of_all_states() -> None:
     cost = fp.Quadratic(outputs={"depth": 1.0}, deviation={"u": 1e-3})
     with pytest.raises(FpirhcError, match="needs the states C, E"):

@@ -40,36 +40,6 @@ def test_an_input_that_nothing_gives_is_not_a_number_in_any_unit(k):
     assert abs(float(plant.equations.inverse(0.0, k, k))) < 1e-6
 
 
-def _root(size: float, guess: float, steps: int, root: float = 1.0) -> float:
-    """The algebraic state z of z^2 + z size = (root^2 + root) size^2, in `size`."""
-    algebraic = fp.Algebraic(
-        units={"z": "mol/L"},
-        equations=lambda q, u, p, z: {"z": z.z**2 + z.z * p.s - (root**2 + root) * p.s**2 * (1 + u.u)},
-        guess={"z": guess * size},
-        steps=steps,
-    )
-    plant = fp.Plant(
-        coordinates={"c": "mol/L"},
-        inputs={"u": "1"},
-        order=1,
-        response=lambda q, u, p, z: {"c": z.z + u.u},
-        algebraic=algebraic,
-        parameters={"s": fp.Parameter(size, size, "mol/L")},
-    )
-    return float(plant.equations.algebraic(0.0, 0.0, size)) / size
-
-
-@pytest.mark.parametrize("size", [1.0, 1e-7])
-def test_an_algebraic_state_is_found_or_not_a_number_in_any_unit(size):
-    assert np.isnan(_root(size, guess=100.0, steps=6))
-    assert _root(size, guess=100.0, steps=14) == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("guess", [0.0, 0.1])
-def test_an_algebraic_state_of_zero_is_found(guess):
-    assert _root(1e-7, guess, steps=6, root=0.0) == pytest.approx(0.0, abs=1e-9)
-
-
 def test_what_a_kalman_filter_can_determine_does_not_depend_on_a_unit():
     size = 1e-9
     plant = fp.Plant.of_states(

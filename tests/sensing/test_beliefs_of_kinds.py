@@ -1,4 +1,4 @@
-"""Observers of other kinds of plants - maps, algebraic states, outputs that the command moves at once - and their live settings."""
+"""Observers of other kinds of plants - maps, outputs that the command moves at once - and their live settings."""
 
 from __future__ import annotations
 
@@ -72,58 +72,6 @@ def test_a_filter_of_a_map_is_that_of_the_books() -> None:
     start, noise = (np.array([0.9, 0.7]), np.array([0.1, 0.1])), np.array([0.02, 0.01])
     states, _ = extended_filter(result, step, lambda x: x[1:], start, noise, 0.02)
     np.testing.assert_allclose(result["state"], states, atol=1e-12)
-
-
-# Algebraic states
-
-
-def drained(algebraic: bool, observer: StateObserver) -> fp.Problem:
-    """Two tanks in a row; the flow between them solves q |q| + q = h1 - h2, by Newton's method or by hand."""
-
-    def by_hand(difference: Any) -> Any:
-        return ca.sign(difference) * (ca.sqrt(0.25 + ca.fabs(difference)) - 0.5)
-
-    def rates(q: Any, u: Any, p: Any, z: Any = None) -> dict[str, Any]:
-        flow = z.flow if algebraic else by_hand(q.h1 - q.h2)
-        return {"h1": u.u - flow, "h2": p.pipe * flow - 0.3 * q.h2}
-
-    solved = fp.Algebraic(
-        units={"flow": "m^2/s"},
-        equations=lambda q, u, p, z: {"flow": z.flow * ca.fabs(z.flow) + z.flow - (q.h1 - q.h2)},
-        guess=lambda q, u, p: {"flow": q.h1 - q.h2},
-        steps=12,
-    )
-    if algebraic:
-        response: Any = lambda q, u, p, z: rates(q, u, p, z)  # noqa: E731
-    else:
-        response = lambda q, u, p: rates(q, u, p)  # noqa: E731
-    plant = fp.Plant(
-        coordinates={"h1": "m", "h2": "m"}, inputs={"u": "m/s"}, controlled=("h1",), order=1, response=response,
-        parameters={"pipe": fp.Parameter(approximate=1.2, exact=1.0, unit="1")}, algebraic=solved if algebraic else None,
-    )  # fmt: skip
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"h1": 1.2 + 0.3 * ca.sin(t), "h2": 0.6 + 0 * t}),
-        start={"h1": 1.0, "h2": 0.5},
-        period=0.05,
-        duration=4.0,
-        sensing=fp.Sensing(
-            {"h1": fp.Sensor(noise=fp.Noise(1e-3))}, fp.VelocityDifference(), measured=["h1"], observer=observer
-        ),
-    )
-
-
-LEVELS: dict[str, Any] = {"measured": {"h1": 1e-3}, "noise": {"h1": 0.02, "h2": 0.05}}
-
-
-@pytest.mark.parametrize("observer", [fp.KalmanFilter(**LEVELS)], ids=lambda b: type(b).__name__)
-def test_algebraic_states_are_believed_as_those_that_are_solved_by_hand(observer: StateObserver) -> None:
-    """Newton's flow and its derivatives are those of the root: the wrong pipe is corrected alike."""
-    one, other = (
-        run(drained(algebraic, observer), fp.ComputedTorque(fp.Exponential(1.0))) for algebraic in (True, False)
-    )
-    np.testing.assert_allclose(one["state"], other["state"], atol=1e-9)
-    assert np.abs(one["state.h2"] - one["plant_state.h2"]).max() > 1e-3
 
 
 # Outputs that the command moves at once

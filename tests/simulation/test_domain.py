@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -229,41 +228,6 @@ def test_what_ends_a_run_in_its_log():
     assert judged(Status.NON_FINITE, time, 1e200)[0] == (1, time)
     assert judged(Status.OK, own, np.nan)[0] == (1, own)
     assert judged(Status.OK, own, 1e200)[0] is None
-
-
-# Algebraic states
-
-
-def with_algebraic(**changes: Any) -> fp.Problem:
-    """The same tank, with the outflow as an algebraic state: z^2 = s^2 h has no solution below the bottom."""
-    plant = fp.Plant(
-        coordinates={"h": "m"},
-        inputs={"u": "l/s"},
-        order=1,
-        response=lambda h, u, p, z: {"h": (u.u - z.flow) / 1.5},
-        parameters={"s": fp.Parameter(approximate=1.0, exact=0.6, unit="l/s/m^0.5")},
-        algebraic=fp.Algebraic(
-            units={"flow": "l/s"},
-            equations=lambda h, u, p, z: {"flow": z.flow**2 - p.s**2 * h.h},
-            guess={"flow": 0.3},
-            steps=8,
-        ),
-    )
-    return replace(TANK, plant=plant, **changes)
-
-
-@pytest.mark.parametrize("controller", [fp.ComputedTorque(TRACK, SHAPE), fp.RecedingHorizon(PLAN, SHAPE)])
-def test_algebraic_states_without_a_solution(controller):
-    """Newton's method does not arrive, and the cycle is skipped as one with a square root of a negative number."""
-    stepper = fp.Stepper(with_algebraic(), controller, compiled=False)
-    times, rows = measurements()
-    command, memory = before_the_fault(stepper)
-    held, after = stepper.step_measured(times[BAD], rows[BAD] * [0, 1] + [BELOW, 0], memory)
-    assert status(stepper) == Status.NON_FINITE
-    assert np.array_equal(held, command)
-    one, _ = stepper.step_measured(times[BAD + 1], rows[BAD + 1], after)
-    other, _ = stepper.step_measured(times[BAD + 1], rows[BAD + 1], memory)
-    assert np.array_equal(one, other)
 
 
 # Memories that have become absurd

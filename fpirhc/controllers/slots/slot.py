@@ -219,7 +219,6 @@ def integrators(plant: Plant, quantities: Mapping[str, tuple[str, int]], inputs:
         inverse=None,
         ranges={},
         outputs={},
-        algebraic=None,
         next=None,
     )
 
