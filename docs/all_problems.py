@@ -13,9 +13,11 @@ import math
 import re
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from math import inf
 from pathlib import Path
+
+import numpy as np
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
@@ -101,13 +103,15 @@ def candidates(task: Task, *, filters: bool) -> Iterator[tuple[str, Controller]]
         yield f"PID, rate {rate:.2g}", placed(plant.controlled_names, plant.chains, gains, rate)
         yield f"ADRC, bandwidth {rate:.2g}", fp.rivals.ADRC(bandwidth=rate, observer=3 * rate)
     plan = next((task.controllers[n] for n in ("RHC", "RHC, predicted") if n in task.controllers), None)
-    for drift in DRIFTS if filters and plan is not None else ():
+    if plan is None:
+        return
+    for drift in DRIFTS if filters else ():
         measured = dict.fromkeys(problem.sensing.measured or plant.state.elements, 1e-3)
         filter = fp.DisturbanceKalman(drift=dict.fromkeys(plant.controlled_names, drift), measured=measured)
         yield f"RHC offset-free, drift {drift:g}", fp.Estimating(plan, filter, at_once=True)
 
 
-def placed(names: tuple[str, ...], orders: dict[str, int], gains: object, rate: float) -> fp.PID:
+def placed(names: tuple[str, ...], orders: Mapping[str, int], gains: np.ndarray, rate: float) -> fp.PID:
     """PID with all poles of the model's chain of integrators at -rate: (s + rate)^(r + 1)."""
     integral, proportional, derivative = {}, {}, {}
     for k, name in enumerate(names):
@@ -135,8 +139,10 @@ def best_rival(path: Path) -> tuple[str, float] | None:
         own = errors_of(task, controller)
         if quantity in own:
             found[name] = max(own[n] / max(first[n], 1e-300) for n in own), own[quantity]
-    name = min(found, key=found.__getitem__, default=None)
-    return None if name is None else (name, float(f"{found[name][1]:.3g}"))
+    if not found:
+        return None
+    name = min(found, key=found.__getitem__)
+    return name, float(f"{found[name][1]:.3g}")
 
 
 def main(words: list[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import all_problems
 import typer
@@ -59,10 +60,16 @@ def _entry(name: str) -> list[str]:
     return [f".. auto{kind}:: fpirhc.{name}", *(["   :members:"] if name in MEMBERS else []), ""]
 
 
+def commands() -> dict[str, Any]:
+    """The commands by name."""
+    group: Any = typer.main.get_command(app)
+    return dict(group.commands)
+
+
 def command_line() -> str:
     """The page of all commands with their options."""
     lines = ["# The command line", "", "Exit codes stand on [comparing and studies](study.md#exit-codes).", ""]
-    for name in typer.main.get_command(app).commands:
+    for name in commands():
         text = CliRunner().invoke(app, [name, "--help"], prog_name="fpirhc").output.strip()
         lines += [f"## fpirhc {name}", "", "```text", text, "```", ""]
     return "\n".join(lines)

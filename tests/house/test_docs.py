@@ -9,10 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
 
 import fpirhc as fp
-from fpirhc.cli import app
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.sensing_chain import compose_with_sensing
 from fpirhc.members import FAMILIES, member_classes
@@ -47,7 +45,7 @@ def test_code_runs(page, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", TEXTS, ids=lambda p: p.stem)
 def test_commands_are_those_of_the_command_line(page):
     """Every `fpirhc` line of a page has a command and options that are there, and all that the command needs."""
-    commands = typer.main.get_command(app).commands
+    commands = made_pages.commands()
     for line in re.findall(r"^ {4}(?:\.venv/bin/)?fpirhc (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE):
         name, *words = shlex.split(line, comments=True)
         commands[name].make_context(name, words)  # raises for what is wrong
@@ -55,7 +53,7 @@ def test_commands_are_those_of_the_command_line(page):
 
 def test_a_command_that_is_not_there_is_found():
     """The check above sees a wrong option and a missing argument."""
-    commands = typer.main.get_command(app).commands
+    commands = made_pages.commands()
     for words in (["two_mass", "--scenarios", "50"], []):
         with pytest.raises(Exception, match=r"No such option|Missing parameter"):
             commands["compare"].make_context("compare", words)
@@ -101,7 +99,7 @@ def test_every_public_name_is_on_the_api_page_once():
 
 def test_every_command_is_on_its_page():
     page = made_pages.command_line()
-    assert re.findall(r"^## fpirhc (\w+)$", page, re.MULTILINE) == list(typer.main.get_command(app).commands)
+    assert re.findall(r"^## fpirhc (\w+)$", page, re.MULTILINE) == list(made_pages.commands())
     assert "--mismatch" in page
 
 
