@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,11 +27,8 @@ class _Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         options = {name: p for p in self.params if p.param_type_name == "option" for name in p.opts}
         places = sum(p.param_type_name == "argument" and p.required for p in self.params)
-        words, last, value = (
-            list[str](),
-            "",
-            False,
-        )  # the option that may have more values; whether its value comes next
+        # The option that may have more values, and whether its first one comes next.
+        words, last, value = list[str](), "", False
         for word in args:
             name = word.partition("=")[0]
             if value:
@@ -169,7 +166,7 @@ def compare(
     from fpirhc.report.html import render
     from fpirhc.report.terminal import announce_backend, progress_bars
 
-    with progress_bars(as_json=json) as progress:
+    with progress_bars() as progress:
         result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
     announce_backend(entry.run for entry in result.entries)
     _publish(result.view, render(result), folder, json, verbose)
@@ -298,13 +295,18 @@ def study(
 
     select(task, controllers)
     folder = _folder(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")
+    import joblib
+
+    from fpirhc.errors import package
     from fpirhc.report.html import render_charted
+    from fpirhc.report.terminal import progress_bars
 
     with ExitStack() as stack:
         facts = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
-        facts["progress"] = stack.enter_context(_progress(json))
+        facts["progress"] = stack.enter_context(progress_bars())
         if cluster:
-            stack.enter_context(_dask(cluster))
+            stack.enter_context(package("distributed", "cluster", "--cluster").Client(cluster))
+            stack.enter_context(joblib.parallel_config(backend="dask"))
         if limits:
             result: Any = find_limits(task, over=limits, seed=seed, folder=folder, **facts)
             page = render_charted(result.view)
@@ -316,22 +318,6 @@ def study(
             page = render_charted(result.view, figure_of(result), "Every run", "")
     write_csv(result.table, folder / "study.csv")
     _publish(result.view, page, folder, json, verbose)
-
-
-def _progress(as_json: bool = False) -> Any:
-    from fpirhc.report.terminal import progress_bars
-
-    return progress_bars(as_json=as_json)
-
-
-@contextmanager
-def _dask(address: str) -> Iterator[None]:
-    import joblib
-
-    from fpirhc.errors import package
-
-    with package("distributed", "cluster", "--cluster").Client(address), joblib.parallel_config(backend="dask"):
-        yield
 
 
 @_command(
@@ -382,7 +368,7 @@ def tune(
 ) -> None:  # fmt: skip
     """Find better settings, with the same budget and cost for every controller. The problem file lists them: tuning = {...}."""
     task = _task(problem)
-    from fpirhc.report.terminal import show_harm
+    from fpirhc.report.terminal import progress_bars, show_harm
     from fpirhc.studies.tune import tune as search
     from fpirhc.studies.variants import CasesOf, Draws
 
@@ -391,7 +377,7 @@ def tune(
     drawn = Draws(draws, mismatch, seed + 10**6) if draws else None  # never the plants of a comparison
     variants = CasesOf(tuple(cases), seed) if cases else drawn
     facts = {"trials": trials, "variants": variants, "seed": seed, "controllers": controllers, "metric": metric}
-    with _progress(json) as progress:
+    with progress_bars() as progress:
         found = search(task, folder=_folder(out, task.name, "tuning"), progress=progress, **facts)
     for sentences in found.harm.values():
         show_harm(sentences)
@@ -412,10 +398,10 @@ def check(
     """Compare fresh results with the committed baselines. Exit code 5: a metric changed; 6: no usable baseline."""
     from fpirhc.baselines.baseline import check as judge
     from fpirhc.baselines.baseline import problems_here
-    from fpirhc.report.terminal import say
+    from fpirhc.report.terminal import progress_bars, say
 
     facts: dict[str, Any] = {"baselines": baselines, "processes": processes, "compiled": not no_compile}
-    with _progress() as progress:
+    with progress_bars() as progress:
         names = problems or list(map(str, problems_here(Path())))
         found = [judge(_task(one), ignore=ignore_below / 100, progress=progress, **facts) for one in names]
     for one in found:
@@ -435,9 +421,10 @@ def accept(
     """Measure a problem anew and write its baseline, which check compares with."""
     task = _task(problem)
     from fpirhc.baselines.baseline import accept as write
+    from fpirhc.report.terminal import progress_bars
 
     facts: dict[str, Any] = {"baselines": baselines, "processes": processes, "compiled": not no_compile}
-    with _progress() as progress:
+    with progress_bars() as progress:
         path = write(task, reason, seed=seed, seeds=seeds, progress=progress, **facts)
     print(f"baseline: {path}")
 

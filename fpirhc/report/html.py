@@ -136,7 +136,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     """
     from markupsafe import Markup
 
-    every = [Markup(script) for script in (asset("table.js"), *scripts)]
+    every = [Markup(script) for script in scripts]
     styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")] + [Markup(planar.styles())]
     template = _environment().get_template(name)
     others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome is not None)
@@ -252,7 +252,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
 
 
 def _reality_charts(entries: Sequence[Entry], edges: np.ndarray) -> list[dict[str, Any]]:
-    """Charts of realities that are plants: states that the model does not have, and the response that the model expected."""
+    """Charts of states of realities that the model does not have."""
     real = [e for e in entries if _REALITY in e.run.layout]
     if not real:
         return []
@@ -260,20 +260,6 @@ def _reality_charts(entries: Sequence[Entry], edges: np.ndarray) -> list[dict[st
     for name in (n for n in first.layout[_REALITY].elements if n not in first.layout["state"].elements):
         column = f"{_REALITY}.{name}"
         charts.append(_chart(f"reality: {name}", first.unit(column), [(e.name, e.run[column]) for e in real], edges))
-    return charts + [chart for e in real for chart in _responses(e.name, e.run, edges)]
-
-
-def _responses(name: str, run: Run, edges: np.ndarray) -> list[dict[str, Any]]:
-    """The response that the model expected of the last command, and the real one, by coordinate."""
-    if not {"deformed", "plant_realised"} <= set(run.layout.names):
-        return []
-    shown = run.layout["plant_realised"].elements  # of what is controlled; slots may serve other coordinates
-    charts = []
-    for c in (c for c in run.layout["deformed"].elements if c in shown):
-        requested, real = run[f"deformed.{c}"], run[f"plant_realised.{c}"]
-        lines = [("the model expected", np.concatenate([real[:1], requested[:-1]])), ("the reality did", real)]
-        title = f"{name}: response of {c}, observer and reality"
-        charts.append({**_chart(title, run.unit(f"deformed.{c}"), lines, edges), "only": name})
     return charts
 
 

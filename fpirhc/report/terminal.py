@@ -6,7 +6,6 @@ the rows.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import sys
@@ -53,7 +52,6 @@ _IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, a
 _MOST_STEPS = 6  # of the set-points of one coordinate in a text
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
-_EVERY = 1.0  # s from one line of progress to the next
 _DRAWN = 0.1  # s from one picture of a bar to the next
 _EDGES = 2  # columns left and right of a table
 
@@ -196,14 +194,8 @@ def _widths(table: Table, places: Sequence[int], width: int) -> list[int]:
 
 
 @contextmanager
-def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
-    """Yield a function (name, done, total) that shows on standard error how far each controller is, its rate and the time left.
-
-    `as_json`: in place of bars, a line with a JSON object every second.
-    """
-    if as_json:
-        yield _Status().report
-        return
+def progress_bars() -> Iterator[Report]:
+    """Yield a function (name, done, total) that shows on standard error how far each controller is, its rate and the time left."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -232,30 +224,6 @@ def progress_bars(*, as_json: bool = False) -> Iterator[Report]:
     finally:
         if known:
             bars.stop()
-
-
-class _Status:
-    """Lines of progress for programs, the last one with all that was to do.
-
-    A rate counts from the first answer of this process: before it loops are built, and what was done earlier stands in the file.
-    """
-
-    def __init__(self) -> None:
-        self._kept: dict[str, int] = {}  # done when this process began
-        self._begun: dict[str, tuple[float, int]] = {}  # time and number of the first answer
-        self._told = time.monotonic()
-
-    def report(self, name: str, done: int, total: int) -> None:
-        now, rate = time.monotonic(), None
-        if done > self._kept.setdefault(name, done):
-            since, before = self._begun.setdefault(name, (now, done))
-            rate = (done - before) / (now - since) if now > since else None
-        if done < total and now - self._told < _EVERY:
-            return
-        self._told = now
-        left = 0.0 if done == total else (total - done) / rate if rate else None
-        line = {"controller": name, "done": done, "of": total, "per second": rate, "seconds left": left}
-        print(json.dumps(line), file=sys.stderr, flush=True)
 
 
 def announce_backend(runs: Iterable[Run]) -> None:

@@ -100,8 +100,6 @@ function draw({ box, spec }) {
     width: box.clientWidth,
     height: HEIGHT,
     series,
-    // What was predicted before the run, between its two edges.
-    bands: spec.band ? [{ series: spec.band, fill: "#0072b222" }] : [],
     scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec)) } },
     axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: { sync: { key: sync.key } },
