@@ -32,11 +32,6 @@ class Objective:
         return "error" if self.metric is None else self.metric.key(self.element)
 
     @property
-    def noun(self) -> str:
-        """What a sentence calls it."""
-        return self.column
-
-    @property
     def sign(self) -> int:
         """-1 where larger is better: a number times it is better when it is smaller."""
         return -1 if self.metric is not None and self.metric.better == "larger" else 1

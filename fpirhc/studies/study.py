@@ -74,7 +74,7 @@ class VariantStudy(Study):
         return self.viewed([*_sentences(self)], f"{self.variants}.", tables, facts, lists=lists)
 
     def _shown(self, title: str, summary: pd.DataFrame) -> Table:
-        noun = self.figure.noun
+        noun = self.figure.column
         heads = ["controller", f"worst {noun}", "in", "failures", f"median {noun}", "difference", "95 %", "better in"]
         shown = Table(title, [*map(Column, heads[:-1]), Column(heads[-1], None)])  # the verdict has it
         text, apart = self.figure.text, self.figure.difference
@@ -196,13 +196,13 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     for row in _rows(summary.iloc[1:]):
         share = f"{than} in {row.better} of {row.variants}"
         if math.isnan(row.low):  # too few for an interval
-            yield f"{row.controller} against {summary.index[0]} by {aim.noun}: {share}.", None
+            yield f"{row.controller} against {summary.index[0]} by {aim.column}: {share}.", None
             continue
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
         clear = Outcome.BETTER if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
         said = _CLEAR.get(clear, "is not clearly different from")
         yield (
-            f"{row.controller} {said} {summary.index[0]} by {aim.noun}: {than} in {row.better} of {row.variants}.",
+            f"{row.controller} {said} {summary.index[0]} by {aim.column}: {than} in {row.better} of {row.variants}.",
             clear,
         )
     axes = getattr(result.variants, "axes", {})
@@ -211,7 +211,7 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
         if len(good) and good[aim.column].nunique() > 1:
             best = int((aim.sign * good[aim.column]).to_numpy().argmin())
             number, place = aim.text(good[aim.column].iloc[best]), good.variant.iloc[best]
-            yield f"{name}: the {most} {aim.noun} is {number}, at {place}.", None
+            yield f"{name}: the {most} {aim.column} is {number}, at {place}.", None
     for row in _rows(summary):
         low, high = share_interval(row.failures, row.variants)
         drawn = f": {in_percent(low)} to {in_percent(high)} of what is drawn so, with 95 % confidence"

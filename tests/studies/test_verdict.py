@@ -37,7 +37,7 @@ def entry(name: str, pair: str | None = None, *, errors: Any = None, **facts: An
     numbers = {"rms_error": errors or BOTH, **facts.pop("measured", {})}
     metrics = Metrics(numbers, {}, {m.name: m for m in (*known_metrics(), NUMBER)})
     grows = facts.pop("grows", None)
-    usual: dict[str, Any] = {"weighed": None, "exact": False, "plan_every": 1, "adaptive": pair is not None}
+    usual: dict[str, Any] = {"weighed": None, "exact": False, "adaptive": pair is not None}
     contraction = cast(Any, None if grows is None else SimpleNamespace(growing=grows))
     return Entry(name, run, metrics, pair=pair, contraction=contraction, **(usual | facts))
 

@@ -13,7 +13,7 @@ import numpy as np
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import innermost, resolved
+from fpirhc.controllers.contract import resolved
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -37,7 +37,7 @@ from fpirhc.studies.view import Progress, Study, View, circumstances, status_sha
 from fpirhc.summary import Column, Table
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compiling_ahead
-from fpirhc.task.problem import Problem, cycles_per_plan
+from fpirhc.task.problem import Problem
 
 
 def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
@@ -88,7 +88,6 @@ class Entry:
     pair: str | None  # name of the same controller without adaptation
     weighed: frozenset[str] | None  # judged coordinates that its cost weighs; None: all
     exact: bool  # whether its model is exact where the others' is not
-    plan_every: int  # cycles from plan to plan
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
     cycle: tuple[float, float] | None = None  # median and largest time of a cycle, us
@@ -191,6 +190,7 @@ def compare(
     mistakes.raise_if_any()
     check_gains(task, selected)
     problem, skipped = task.problem, dict[str, str]()
+    aim = objective(task.headline_metric, task.metrics, problem)
     rows, entries = _Rows(task, selected, seed, compiled), list[Entry]()
     with compiling_ahead() as compiling:
         for name in selected:
@@ -207,7 +207,6 @@ def compare(
                 done = {*skipped, *(e.name for e in entries)}
                 skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
                 break
-    aim = objective(task.headline_metric, task.metrics, problem)
     return Comparison(
         **circumstances(task, selected, command, begin),
         seed=seed,
@@ -255,7 +254,6 @@ class _Rows:
         part, loop = partial(attempted, broken=broken), self._loop(name)
         run = judged_run(loop, seed=self._seed, name=name, progress=progress, changes=changes)
         ready, metrics = loop.controller, measure(problem, run, self._task.metrics)
-        plans = innermost(ready).planner is not None
         pair = pair_of(self._controllers, name) if ready.deformation.adapts else None
         pair = pair if pair in self.composed else None
         step, judged = self.composed[name][1], weighed(problem, ready)
@@ -271,7 +269,6 @@ class _Rows:
             pair=pair,
             weighed=judged,
             exact=_has_exact_model(problem, ready),
-            plan_every=cycles_per_plan(problem.horizon, problem.period) if plans and problem.horizon else 1,
             contraction=contraction,
             null=null,
             cycle=cycle,

@@ -256,14 +256,14 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     lost = [n for n, v in zip(names, (before, after), strict=True) if not math.isfinite(v)]
     if lost:
         outcome = Outcome.NOT_COMPARABLE if len(lost) == 2 else Outcome.WORSE if lost == [names[1]] else Outcome.BETTER
-        return Finding(f"{' and '.join(lost)}: no {aim.noun}.", outcome, names)
+        return Finding(f"{' and '.join(lost)}: no {aim.column}.", outcome, names)
     ratio = after / before if before * after > 0 else math.nan
     if abs(after - before) <= metric.floor or HELPS <= ratio <= HURTS:
         outcome = Outcome.NO_DIFFERENCE
     else:
         outcome = Outcome.BETTER if aim.sign * (after - before) < 0 else Outcome.WORSE
-    text = f"{names[1]} against {names[0]} by {aim.noun}: {outcome} ({aim.text(before)} -> {aim.text(after)})."
-    return Finding(text, outcome, names, {aim.noun: ratio})
+    text = f"{names[1]} against {names[0]} by {aim.column}: {outcome} ({aim.text(before)} -> {aim.text(after)})."
+    return Finding(text, outcome, names, {aim.column: ratio})
 
 
 def findings(
