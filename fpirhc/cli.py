@@ -302,7 +302,7 @@ def study(
     from fpirhc.report.terminal import progress_bars
 
     with ExitStack() as stack:
-        facts = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
+        facts: dict[str, Any] = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
         facts["progress"] = stack.enter_context(progress_bars())
         if cluster:
             stack.enter_context(package("distributed", "cluster", "--cluster").Client(cluster))
@@ -376,7 +376,7 @@ def tune(
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     drawn = Draws(draws, mismatch, seed + 10**6) if draws else None  # never the plants of a comparison
     variants = CasesOf(tuple(cases), seed) if cases else drawn
-    facts = {"trials": trials, "variants": variants, "seed": seed, "controllers": controllers, "metric": metric}
+    facts: dict[str, Any] = {"trials": trials, "variants": variants, "seed": seed, "controllers": controllers, "metric": metric}
     with progress_bars() as progress:
         found = search(task, folder=_folder(out, task.name, "tuning"), progress=progress, **facts)
     for sentences in found.harm.values():

@@ -82,7 +82,7 @@ def test_mismatch_is_limited_by_the_gain_of_the_map():
 
 def test_drawn_plants_are_limited_by_the_largest_of_them():
     """Of a hundred factors up to 1 + P/100 around 0.7 of the limit of the sampled law the largest decides."""
-    problem = pump(0.7 * 2 / (PERIOD * RATE))
+    problem = pump(0.7 * 2 / (PERIOD * RATE), duration=30.0, measure_from=20.0)
     one = limit_of("plants", problem)
     largest = {
         percent: max(v.problem.plant.exact[0] for v in Draws(100, percent).of_problem(problem))
