@@ -16,9 +16,9 @@ from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.fields.kinds import Count, Seed
+from fpirhc.probing.choice import DARING, Candidate, Choice, mean_ratio, steps_of
 from fpirhc.probing.identification import Estimates, Interval, identify
 from fpirhc.probing.recording import Record, excited, read_recording
-from fpirhc.probing.rule import DARING, Predicted, Rule, mean_ratio, steps_of
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
@@ -167,15 +167,17 @@ def probe(
     if not why:
         notes += [estimates.unbounded] if estimates.unbounded else []
         try:
-            rule = Rule(problem, bare, estimates, chatter)
-            estimated = rule.problem
-            shortlist = rule.shortlist()
-            why = "" if shortlist else "no setting that keeps its margins makes the error clearly less"
+            choice = Choice(problem, bare, estimates, chatter)
+            estimated = choice.problem
+            shortlist = choice.shortlist()
+            why = (
+                "" if shortlist else "no setting that comes back at the ends of the record makes the error clearly less"
+            )
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"
     try_them = trying and bool(shortlist)
     if try_them:
-        results = OnPlant(problem, bare, rule.allowed).walk(rule, shortlist, notes, seed + 1)
+        results = OnPlant(problem, bare, choice.allowed).walk(choice, shortlist, notes, seed + 1)
     candidates = {name: one.deformation for name, one in shortlist.items()}
     name = best(results) if try_them else "cautious" if "cautious" in candidates else None
     if try_them and not results:
@@ -373,7 +375,7 @@ class OnPlant:
         by_input = dict(zip(self._problem.plant.inputs, steps.tolist(), strict=True))
         return Trial(ratio, max(pair.ratio(n) for n in pair.without), calm=calm, steps=by_input)
 
-    def walk(self, rule: Rule, shortlist: dict[str, Predicted], notes: list[str], seed: int) -> dict[str, Trial]:
+    def walk(self, choice: Choice, shortlist: dict[str, Candidate], notes: list[str], seed: int) -> dict[str, Trial]:
         """Return trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none.
 
         A larger share counts where it is clearly better: of shares that are alike the smallest is kept. The best one is run with
@@ -393,15 +395,15 @@ class OnPlant:
                 proven.add(name)
                 if not self._bears_more(chosen.deformation, results[name], seed):
                     notes.append(f"{name} is not kept: on the plant it does not bear {MARGIN:g} times its gain")
-                    lost = [n for n in results if _walked(n) and shortlist[n].setting.is_larger(chosen.setting)]
+                    lost = [n for n in results if _walked(n) and shortlist[n].is_larger(chosen)]
                     results |= {n: replace(results[n], bears=False) for n in (name, *lost)}
                 continue
             known = [one.deformation for one in shortlist.values()]
-            beside = rule.beside(chosen, shortlist.values())
+            beside = choice.beside(chosen, shortlist.values())
             titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
             new = {title: one for title, one in titled.items() if one.deformation not in known}
             # An error falls with the share until the loop is lost, so a smaller one is tried where no larger one is better.
-            larger = {title: one for title, one in new.items() if one.setting.is_larger(chosen.setting)}
+            larger = {title: one for title, one in new.items() if one.is_larger(chosen)}
             new, needed = (larger, _CLEARLY * results[name].error) if larger else (new, np.inf)
             shortlist |= new
             if not new and name in again:

@@ -1,11 +1,9 @@
-"""Probing signals, a recording of a run from a CSV file, and its replay by a controller."""
+"""Probing signals, and a recording of a run from a CSV file."""
 
 from __future__ import annotations
 
 import csv
-import io
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
@@ -19,16 +17,12 @@ from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation, Iteration
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import input_columns
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
-from fpirhc.simulation.stepper import Stepper
-from fpirhc.status import Status
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
-from fpirhc.whole_file import write_whole
 
 _HOLDS = (1, 2, 4, 8, 16)  # cycles
 _NOISES, _SHARE = 2.0, 0.1  # amplitude: of the noise, and of the deviation of the desired response
@@ -146,10 +140,22 @@ def _run(
     at_once = ModelReferenced(excitation, cycles=0.0, lag=0.0)  # all lateness is identified, the stated one too
     with any_gain():  # nothing is iterated, so the sign of the plant's gain does not matter
         run = simulate(problem, bare.with_deformation(at_once), seed=seed, compiled=False)
+    if run.stop is None:
+        require_moving(run["command"], problem.plant.inputs, "probe")
     modelled, measured = (np.column_stack([run[pair[k]] for pair in excitation._names]) for k in (0, 1))
     held = np.asarray(run["foreign_held"]).ravel() if "foreign_held" in run.layout.names else np.zeros(len(measured))
     clipped = float(np.mean(np.asarray(run["clipped"]) > 0)) if len(measured) else 0.0
     return run, Record(measured, modelled, held == 0, amplitude, run.stop or "", clipped)
+
+
+def require_moving(commands: np.ndarray, inputs: Iterable[str], where: str) -> None:
+    """Raise if an input never changes."""
+    still = np.ptp(commands, axis=0) <= 1e-9 * np.abs(commands).max(axis=0)  # NaN moves
+    if still.any():
+        raise InvalidValue(
+            f"{where}: the input '{list(inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain; "
+            "record a run in which it steps, or excite it"
+        )
 
 
 _EVEN = 0.01  # share of the period by which a time may be off
@@ -183,6 +189,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     mistakes.raise_if_any()
     states = np.column_stack([columns[e] for e in plant.state.elements])
     commands = np.column_stack([columns[n] for n in input_columns(plant)])
+    require_moving(commands, plant.inputs, f"recording {path.name}")
     measured = np.column_stack(
         [columns[n] if n in columns else np.diff(columns[lower[n]], prepend=np.nan) / period for n in responses]
     )[1:]
@@ -247,89 +254,3 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
             ) from None
     table = np.array(values).reshape(-1, len(head))
     return {name.strip(): column for name, column in zip(head, table.T, strict=True)}
-
-
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """The commands of a controller over a recording."""
-
-    times: np.ndarray  # of the cycles, shape (cycles,)
-    inputs: tuple[str, ...]  # names of the inputs
-    commands: np.ndarray  # that the controller would have sent, shape (cycles, inputs)
-    recorded: np.ndarray | None  # commands in the recording; None: it has none
-    statuses: Mapping[str, int]  # number of cycles by status
-
-    def differences(self) -> dict[str, tuple[float, float, float]]:
-        """Return by input: the rms difference from the recorded command, the largest one, and its time; {} without a record."""
-        if self.recorded is None:
-            return {}
-        away = self.commands - self.recorded
-        at = np.nanargmax(np.abs(away), axis=0)
-        rms = np.sqrt(np.nanmean(away**2, axis=0))
-        return {
-            name: (float(rms[k]), float(away[at[k], k]), float(self.times[at[k]])) for k, name in enumerate(self.inputs)
-        }
-
-    def write(self, path: Path) -> None:
-        """Write a table: time and the commands by input."""
-        text = io.StringIO(newline="")
-        table = csv.writer(text)
-        table.writerow(("time", *self.inputs))
-        table.writerows(np.column_stack([self.times, self.commands]).tolist())
-        write_whole(text.getvalue(), path, "table of commands")
-
-
-@checked_call
-def replay(problem: Problem, controller: Controller, recording: Path) -> Replay:
-    """Return what a controller would have commanded over a recording.
-
-    Columns of the CSV file are "time", what the problem's controller is given ("q1", "q1'", "q1''", or what its sensors show), and
-    the inputs that were sent, where they are known; every memory of the last command is then the recorded one. A response ("q1''")
-    without a column is the difference of its lower derivative. An empty entry is a sample that was lost: the cycle is skipped, as
-    it would have been.
-
-    Args:
-        problem: the task.
-        controller: any controller.
-        recording: path of the file.
-
-    Raises:
-        InvalidValue: a file that is no table of numbers.
-        InvalidProblem: missing columns, or times that are not a period apart; all together.
-    """
-    columns = columns_of(recording)
-    stepper = Stepper(problem, controller, compiled=False)
-    inputs = tuple(problem.plant.inputs)
-    measured, recorded = _table(columns, problem, stepper.measures, recording.name)
-    places = [stepper.memory.slice(name) for name in stepper.memory.holding(problem.plant.input.name)]
-    memory, commands, statuses = stepper.start(), np.empty((len(measured), len(inputs))), Counter[str]()
-    for k, row in enumerate(measured):
-        command, memory = stepper.step_measured(float(columns["time"][k]), row, memory)
-        commands[k] = command
-        statuses[Status(int(stepper.trace()["status"].item())).name] += 1
-        if recorded is not None and np.isfinite(recorded[k]).all():
-            for place in places:
-                memory[place] = recorded[k]
-    return Replay(columns["time"], inputs, commands, recorded, dict(statuses))
-
-
-def _table(
-    columns: Mapping[str, np.ndarray], problem: Problem, measures: tuple[str, ...], name: str
-) -> tuple[np.ndarray, np.ndarray | None]:
-    """Measurements in the order of the controller, and recorded commands."""
-    mistakes, period, inputs = Mistakes(f"recording {name}"), problem.period, input_columns(problem.plant)
-    values = dict(columns)
-    for one in measures:
-        lower = one.removesuffix("'")
-        if one not in columns and lower in columns:
-            values[one] = np.diff(columns[lower], prepend=columns[lower][:1]) / period
-    lacking(columns, [one for one in measures if one not in values], mistakes, ", which the controller is given")
-    present = [one for one in inputs if one in columns and np.isfinite(columns[one]).any()]
-    if present and len(present) < len(inputs):
-        mistakes.add(
-            f"it has the commands of {', '.join(present)} alone; expected those of {', '.join(inputs)}, or of none"
-        )
-    check_times(columns, problem, mistakes)
-    mistakes.raise_if_any()
-    recorded = np.column_stack([columns[one] for one in inputs]) if present else None
-    return np.column_stack([values[one] for one in measures]), recorded

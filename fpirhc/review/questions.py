@@ -34,6 +34,7 @@ from fpirhc.task.problem import Problem
 MORE = 8  # times the optimiser's iterations, with a tenth of its tolerance
 WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size of the task
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
+MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing of a loop
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
 
 
@@ -87,12 +88,12 @@ class Case:
         planner = self.bench.controller.planner
         if planner is None:
             return None
-        own = {n: getattr(planner.optimiser, n, None) for n in ("iterations", "most_iterations", "tolerance")}
-        more = {n: v / 10 if n == "tolerance" else MORE * v for n, v in own.items() if v}
-        if not more.keys() - {"tolerance"}:
+        longer: Any = planner.optimiser.longer(MORE)
+        if longer is None:
             return None
-        optimiser: Any = planner.optimiser
-        return self.other(with_optimiser(self.bench.controller, replace(optimiser, **more)), short=True)
+        if getattr(longer, "tolerance", None):
+            longer = replace(longer, tolerance=longer.tolerance / 10)
+        return self.other(with_optimiser(self.bench.controller, longer), short=True)
 
     @cached_property
     def lacks_iterations(self) -> bool:
@@ -171,14 +172,15 @@ def _mended(case: Case, fact: Fact) -> Fact:
 
 
 def _follows(case: Case) -> Fact:
-    (name, share), held = case.bench.worst(case.bench.nominal), case.bench.held
+    run = case.bench.nominal
+    (name, share), held = case.bench.worst(run), case.bench.held(run)
     verdict = Verdict.CAUTION if share <= GOOD and held > 0.2 else graded(share, GOOD, BAD)
     return _mended(case, Fact(verdict, {"error": share, "at_a_limit": held}, name))
 
 
 def _returns(case: Case) -> Fact:
     bench = case.bench
-    if bench.held > 0.5:
+    if bench.held(bench.nominal) > MOSTLY:
         raise NotAsked("A command at its limits is no loop: see whether it follows.")
     back, far, step = bench.back, bench.along[0], bench.steps(bench.start)
     worst = max(one.factor for one in bench.along)
@@ -270,7 +272,8 @@ def _latency(case: Case) -> Fact | None:
         if left > 1:
             borne = cycles - 1
             break
-    numbers = {"cycles_borne": borne, "left": left, "error": share, "mean_step": step, "mean_step_without": calm}
+    numbers = {"cycles_borne": borne, "error": share, "mean_step": step, "mean_step_without": calm}
+    numbers |= {"left": left} if left < math.inf else {}
     return Fact(graded(borne, LATENCY, -1), numbers)
 
 
@@ -416,8 +419,14 @@ def _added(
 def _model(case: Case) -> Fact:
     task = case.models.of(case.bench.built.controller)
     benches = [case.other(one.controller, model=task) for one in (case.plain, case.bench)]
-    name, numbers, harms = _added(case, *(one.errors(one.undisturbed) for one in benches))
-    no = harms > 2 and numbers["added"] > 0.01
+    runs = [one.undisturbed for one in benches]
+    if min(one.held(run) for one, run in zip(benches, runs, strict=True)) > MOSTLY:
+        raise NotAsked("The command stands at a limit: run it where commands are free.")
+    name, numbers, harms = _added(case, *(one.errors(run) for one, run in zip(benches, runs, strict=True)))
+    spoils = (
+        case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
+    )  # more than it may cure
+    no = harms > 2 and numbers["added"] > 0.01 and spoils
     return Fact(Verdict.NO if no else Verdict.CAUTION if harms > WORSE else Verdict.YES, numbers, name)
 
 

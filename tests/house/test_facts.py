@@ -228,7 +228,6 @@ GENERIC_FILES += ["deformation/base.py", "tracking/base.py"]
 # Values that generic code builds for itself; it asks nobody whether he is one.
 BUILDS = {
     "controllers/contract.py": {"Identity"},  # no adaptation: the neutral map
-    "simulation/linearise/asked_loop.py": {"Jump"},  # the entry of signals at the inputs
     "studies/comparison/verdict.py": {"HeldInput"},  # the plant with nobody at it
     "studies/limits.py": {"Noise"},  # the noise of the sensors at which a controller fails is sought
     "task/checks.py": {"MapSteps", "StepDifference"},  # what a map has in place of an integrator and of its response

@@ -1,4 +1,4 @@
-"""Reviews of maps: the linear loop is that of the run, questions about time are not asked, and what is not covered says so."""
+"""Reviews of maps: what is left of a push is the decay of the run."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from reviewed import answers
 
 import fpirhc as fp
-from fpirhc.review.grid import review_grid
-from fpirhc.review.loops import loops_along
 
 T = 10.0  # s, one step
 ITERATION = fp.ModelReferenced(fp.Affine(gain=-1.0))
@@ -65,47 +64,17 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_linear_loop_is_that_of_the_run(name: str) -> None:
-    """The difference of two runs from nearby starts satisfies the recursion of the loop's characteristic polynomial."""
+def test_the_factor_is_the_decay_of_the_run(name: str) -> None:
+    """Two runs from nearby starts; a map has no integrator, and a right model nothing to adapt."""
     make, controller = CASES[name]
     problem = make()
-    loops = loops_along(review_grid(problem, mismatch=0.0, seed=0), controller)
-    poles = loops.loops[0].poles
+    told = answers(problem, controller)
     runs = [
         fp.simulate(replace(problem, start={**problem.start, "a": 0.5 + d}), controller, seed=0, compiled=False)
         for d in (1e-5, -1e-5)
     ]
-    apart = (runs[0]["plant_state.a"] - runs[1]["plant_state.a"])[2:]  # the first cycles have no pair yet
-    poles = poles[np.abs(poles) > 1e-6]
-    polynomial = np.real(np.poly(poles))
-    windows = np.lib.stride_tricks.sliding_window_view(apart[:60], len(poles) + 1)
-    left = np.abs(windows @ polynomial[::-1]) / np.abs(windows).max(axis=1)
-    assert np.median(left[:20]) < 5e-3
-    assert loops.loops[0].radius < 1
-
-
-def test_questions_about_time_are_not_asked() -> None:
-    review = fp.review(task(), {"CTC+FPI": fp.ComputedTorque(LAW, ITERATION)}, mismatch=0.0, seed=0)
-    answers = review.controllers["CTC+FPI"]
-    asked = [answer.question for answer in (*review.problem, *answers)]
-    assert not any("integrator" in q or "discretisation" in q or "small lag" in q for q in asked), asked
-    assert [a.question for a in answers if a.verdict.name == "NO"] == []
-    [null] = [a for a in answers if "right model alone" in a.question]
-    assert null.evidence.startswith(
-        ("predicted rms response error on a right model 0 ", "predicted rms response error on a right model 0,")
-    )
-
-
-def test_the_loop_of_a_map_of_the_second_order_has_the_poles_of_its_law() -> None:
-    """(q - 1 + rate T)^2 of the error: 0.6 twice, a double pole, which rounding splits."""
-    plant = fp.Plant.discrete(
-        states={"y": "1", "v": "1"},
-        inputs={"u": "1"},
-        parameters={},
-        next=lambda x, u, p: {"y": x.v, "v": 0.5 * x.y + u.u},
-        step=T,
-        outputs={"y": fp.Output("1", lambda x, _: x.y)},
-    )
-    problem = fp.Problem(plant, fp.Trajectory(lambda t: {"y": 0 * t}), {"y": 0.0, "v": 0.0}, T, 200.0)
-    loops = loops_along(review_grid(problem, mismatch=0.0, seed=0), fp.ComputedTorque(LAW, ITERATION))
-    assert loops.radii == pytest.approx(1 - 0.04 * T, rel=1e-3)
+    apart = np.abs(runs[0]["plant_state.a"] - runs[1]["plant_state.a"])
+    decay = (apart[20:26].max() / apart[2:8].max()) ** (1 / 18)
+    assert told["returns"].verdict == "yes"
+    assert told["returns"].numbers["factor"] == pytest.approx(decay, abs=0.1)
+    assert "no" not in {one.verdict for key, one in told.items() if key != "pays"}

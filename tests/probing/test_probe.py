@@ -16,10 +16,10 @@ from bodies import PERIOD, RHC, body_problem
 
 import fpirhc as fp
 from fpirhc.deformation.base import Deformation
+from fpirhc.probing.choice import Candidate, Choice, Form
 from fpirhc.probing.identification import Channel, Estimates, delayed, identify
 from fpirhc.probing.probe import OnPlant, Trial, best
 from fpirhc.probing.recording import excited, sequence
-from fpirhc.probing.rule import Predicted, Rule, Setting, _between
 
 KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),
@@ -65,7 +65,7 @@ def test_the_estimates_are_those_of_the_body(gain, dead, lag, noise):
 )
 def test_lateness_that_is_stated_is_found_as_if_it_were_not(monkeypatch, body, stated):
     """The plant as estimated has all of it: margins on a plant without it would let through what destroys the loop."""
-    monkeypatch.setattr(Rule, "shortlist", lambda _: {})
+    monkeypatch.setattr(Choice, "shortlist", lambda _: {})
     problem = replace(body_problem(1.0, noise=0.05, **body), duration=2.0)
     assert isinstance(problem.reality, fp.ExternalPlant)
     reality = replace(problem.reality, **stated.get("body", {}))
@@ -155,7 +155,7 @@ def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
 
 def test_the_plant_as_estimated_predicts_the_body(monkeypatch):
     """The error of the controller alone, and with an adaptation, is that on the body within a tenth."""
-    monkeypatch.setattr(Rule, "shortlist", lambda _: {})
+    monkeypatch.setattr(Choice, "shortlist", lambda _: {})
     problem = body_problem(1.6, 2, 0.03, 0.1)
     found = fp.probe(problem, RHC, trials=False)
     assert found.trials == {}
@@ -194,73 +194,67 @@ def test_trials_keep_none_that_is_worse():
     assert best({"wild": wild}) is None
     assert best({"a": Trial(0.5, 1.04), "b": Trial(0.7, 1.0), "c": Trial(0.97, 0.97)}) == "b"
     assert (
-        best({"bold": Trial(0.5, 1.0), "daring, share 0.4": Trial(0.48, 1.0)}) == "bold"
+        best({"bold": Trial(0.5, 1.0), "prompt, share 0.4": Trial(0.48, 1.0)}) == "bold"
     )  # a tenth is no reason to dare
-    assert best({"bold": Trial(0.5, 1.0), "daring": Trial(0.4, 1.0)}) == "daring"
+    assert best({"bold": Trial(0.5, 1.0), "prompt": Trial(0.4, 1.0)}) == "prompt"
 
 
-def forms(rule: Rule, *names: str) -> dict[str, Predicted]:
-    """The first forms that a rule compares, by other names: a list of candidates without the search."""
-    return {name: rule._predicted(form) for name, form in zip(names, rule._forms(), strict=False)}
+def forms(choice: Choice, *names: str) -> dict[str, Candidate]:
+    """The first forms of a choice, by other names: a list of candidates without the search."""
+    return {name: choice._candidate(form, 0.2) for name, form in zip(names, choice._forms().values(), strict=False)}
 
 
 def test_a_daring_candidate_that_bears_no_more_gain_is_told_as_such(monkeypatch):
     """It passes, but not with 1.4 times its gain: its trial is shown, and nobody says that the loop refuses it."""
-    monkeypatch.setattr(Rule, "shortlist", lambda rule: forms(rule, "daring"))
+    monkeypatch.setattr(Choice, "shortlist", lambda choice: forms(choice, "prompt"))
     monkeypatch.setattr(OnPlant, "trial", lambda *_, loud=False: Trial(1.5 if loud else 0.5, 1.0))
     found = fp.probe(body_problem(1.0, 0, 0.0, 0.05), RHC, cycles=100)
     assert found.deformation is None
     assert "bore 1.4 times its gain" in found.why
-    assert found.trials["daring"] == Trial(0.5, 1.0, bears=False)
-    assert "daring is not kept: on the plant it does not bear 1.4 times its gain" in found.notes
+    assert found.trials["prompt"] == Trial(0.5, 1.0, bears=False)
+    assert "prompt is not kept: on the plant it does not bear 1.4 times its gain" in found.notes
 
 
-def test_shares_between_two_that_are_tried_are_finer_towards_the_larger_one():
-    """The next ones of the list first; then the geometric mean upwards, until two are a twentieth apart."""
-    assert set(_between(0.25, {0.25})) == {0.16, 0.4}
-    assert set(_between(0.25, {0.16, 0.25, 0.4})) == {0.32}
-    assert set(_between(0.25, {0.16, 0.25, 0.32, 0.4})) == {0.28}
-    assert set(_between(0.25, {0.16, 0.25, 0.262})) == set()
-    assert set(_between(1.0, {0.65, 1.0})) == set()
+PROMPT = Form(True, (0.0,), (0.0,))
+
+
+def candidate(share: float, error: float = 0.1) -> Candidate:
+    return Candidate(PROMPT, share, fp.Affine(gain=-share), error, 0.5)
 
 
 def test_shares_beside_the_best_one_are_tried_whatever_is_predicted_of_them(monkeypatch):
-    """A margin at the ends of the likelihood refused a larger share that the plant bears with 1.4 times its gain."""
-    monkeypatch.setattr(Rule, "_predicted", lambda _, one: Predicted(one, fp.Identity(), np.inf, np.inf))
-    monkeypatch.setattr(Rule, "_accepted", lambda *_: True)
-    monkeypatch.setattr(Rule, "_safe", lambda _, one: one.setting.share <= 0.25)
-    best_one = Predicted(Setting(True, 0.25, 0.0, (0.0,), (0.0,), 0.0), fp.Identity(), 0.1, 0.5)
-    assert set(Rule.__new__(Rule).beside(best_one, [best_one])) == {0.16, 0.4}
+    """The next ones of the list first; then the geometric mean upwards, until two are a twentieth apart."""
+    monkeypatch.setattr(Choice, "_accepted", lambda *_: True)
+    monkeypatch.setattr(Choice, "_candidate", lambda _, form, share: Candidate(form, share, fp.Identity()))
+    choice = Choice.__new__(Choice)
+
+    def beside(share: float, *known: float) -> set[float]:
+        return set(choice.beside(candidate(share), [candidate(one) for one in known]))
+
+    assert beside(0.25, 0.25) == {0.16, 0.4}
+    assert beside(0.25, 0.16, 0.25, 0.4) == {0.32}
+    assert beside(0.25, 0.16, 0.25, 0.32, 0.4) == {0.28}
+    assert beside(0.25, 0.16, 0.25, 0.262) == set()
+    assert beside(1.0, 0.65, 1.0) == set()
 
 
 @pytest.mark.parametrize(("error", "kept"), [(0.29, ["bold"]), (0.2, ["bold", "bold, share 0.4"])])
 def test_of_shares_that_are_alike_the_smallest_is_kept(monkeypatch, error, kept):
     """With errors that hardly depend on the share every larger one was tried with three seeds and a larger gain."""
-    small, large = (
-        Predicted(Setting(True, g, 0.0, (0.0,), (0.0,), 0.0), fp.Affine(gain=-g), 0.1, 0.5) for g in (0.25, 0.4)
-    )
+    small, large = candidate(0.25), candidate(0.4)
     errors = {small.deformation: 0.295, large.deformation: error}
     monkeypatch.setattr(OnPlant, "trial", lambda _, one, *__, **___: Trial(errors.get(one, error), 0.3))
     monkeypatch.setattr(OnPlant, "_seeds", lambda *_: [1])
-    rule = cast(Rule, SimpleNamespace(beside=lambda *_: {0.4: large}))
-    assert list(OnPlant(body_problem(1.0), RHC).walk(rule, {"bold": small}, [], 1)) == kept
-
-
-def test_a_candidate_lags_as_estimated_without_a_dead_time():
-    """A mirror that knows the dead time too leaves it as it is."""
-    rule = Rule.__new__(Rule)
-    rule.estimates = cast(Estimates, SimpleNamespace(lag=np.array([[0.01], [0.02], [0.03]])))
-    ways = [((c,), (tau,)) for c in (0.0, 3.0) for tau in (0.0, 0.02, 0.03)]
-    every = [Setting(True, 0.25, 0.0, cycles, lags, 0.0) for cycles, lags in ways]
-    assert [rule._lags(Predicted(one, fp.Identity(), 1.0, 0.5)) for one in every] == [False, True, *[False] * 4]
+    choice = cast(Choice, SimpleNamespace(beside=lambda *_: {0.4: large}))
+    assert list(OnPlant(body_problem(1.0), RHC).walk(choice, {"bold": small}, [], 1)) == kept
 
 
 def test_a_lucky_trial_counts_with_its_worst_seed(monkeypatch):
     """What rings with one seed and not with another: a choice by one trial would be the one that was lucky."""
     lucky: list[Deformation] = []
 
-    def two(rule: Rule) -> dict[str, Predicted]:
-        found = forms(rule, "lucky", "steady")
+    def two(choice: Choice) -> dict[str, Candidate]:
+        found = forms(choice, "lucky", "steady")
         lucky.append(found["lucky"].deformation)
         return found
 
@@ -268,8 +262,8 @@ def test_a_lucky_trial_counts_with_its_worst_seed(monkeypatch):
         error = {1: 0.1, 2: 0.1, 3: 0.8}[seed] if deformation in lucky else 0.3
         return Trial(error, error)
 
-    monkeypatch.setattr(Rule, "shortlist", two)
-    monkeypatch.setattr(Rule, "beside", lambda *_: {})
+    monkeypatch.setattr(Choice, "shortlist", two)
+    monkeypatch.setattr(Choice, "beside", lambda *_: {})
     monkeypatch.setattr(OnPlant, "trial", trial)
     found = fp.probe(body_problem(1.0, 0, 0.0, 0.05), RHC, cycles=100)
     assert found.why.startswith("steady")
@@ -320,7 +314,7 @@ def test_the_budget_of_chatter_is_kept():
 
 def test_a_budget_of_chatter_that_every_trial_exceeds_is_named(monkeypatch):
     """With what is to give, something is kept."""
-    monkeypatch.setattr(Rule, "shortlist", lambda rule: forms(rule, "bold"))
+    monkeypatch.setattr(Choice, "shortlist", lambda choice: forms(choice, "bold"))
     problem = body_problem(1.6, 0, 0.0, 0.05)
     found = fp.probe(problem, RHC, cycles=100, chatter=1e-6)
     assert found.deformation is None
@@ -346,13 +340,23 @@ def write_recording(path: Path, *, response: bool) -> fp.Problem:
 def test_a_recording_is_probed_without_a_run(tmp_path, monkeypatch, response):
     """Gain and dead time follow from a file, where the response is a column and where it is a difference of velocities."""
     if not response:  # what is chosen does not depend on how the response is recorded
-        monkeypatch.setattr(Rule, "shortlist", lambda _: {})
+        monkeypatch.setattr(Choice, "shortlist", lambda _: {})
     problem = write_recording(tmp_path / "run.csv", response=response)
     broken = replace(problem, reality=fp.ExternalPlant(Untouched(), QUANTITIES))
     found = fp.probe(broken, RHC, recording=tmp_path / "run.csv")
     assert found.dead_time["u"].value == 2
     assert found.gain["q"]["q"].low <= 1.6 <= found.gain["q"]["q"].high
     assert found.trials == {}
+
+
+def test_a_recording_whose_input_never_changes_tells_nothing(tmp_path):
+    """A drive at a constant current: the noise of its speed is no answer to it."""
+    problem, noise = body_problem(1.0), np.random.default_rng(0).normal(size=(200, 2))
+    rows = [(f"{k * PERIOD:.2f}", 4, *noise[k], 0.1 * noise[k, 0]) for k in range(200)]
+    with (tmp_path / "run.csv").open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([("time", "u", "q", "q'", "q''"), *rows])
+    with pytest.raises(fp.FpirhcError, match="the input 'u' never changes, so nothing can be known of its gain"):
+        fp.probe(problem, RHC, recording=tmp_path / "run.csv")
 
 
 QUANTITIES = {"q": "m", "q'": "m/s", "q''": "m/s^2"}
@@ -417,7 +421,7 @@ def test_a_candidate_that_the_loop_refuses_is_not_tried_and_the_others_are():
 def test_a_sign_that_is_not_certain_is_asked_again_louder(monkeypatch):
     """An excitation half as large as usual in much noise leaves the sign open; 2.5 times as much settles it, and this is said."""
     monkeypatch.setattr("fpirhc.probing.recording._NOISES", 1.0)
-    monkeypatch.setattr(Rule, "shortlist", lambda _: {})
+    monkeypatch.setattr(Choice, "shortlist", lambda _: {})
     problem = body_problem(0.3, 2, 0.05, 2.0)
     quiet, found = (fp.probe(problem, RHC, cycles=60, seed=1, amplitude=one) for one in (0.0, None))
     assert quiet.why.startswith("the sign of a gain is not certain")
