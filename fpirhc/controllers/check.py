@@ -13,7 +13,7 @@ from contextvars import ContextVar
 
 import numpy as np
 
-from fpirhc.contraction.delayed import delayed_limit
+from fpirhc.contraction.delayed import limit_behind_weights
 from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation, Iteration, against_wrappers, own_gain, with_its_gain
@@ -57,7 +57,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged. A
     map that changes its gain on line begins where it likes.
     """
-    gain, iteration = deformation.effective_gain(), deformation.iteration
+    gain, iteration, mirror = deformation.effective_gain(), deformation.iteration, deformation.mirror
     if gain == 0 or not iteration.limited or not iteration.constant or not _REFUSES.get():
         return
     spectrum = _at_start(problem, deformation)
@@ -68,7 +68,9 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
 
     def limit(pairing: float) -> float:
-        return min(_limit(deformation, w, pairing, complex(v)) for w in weights for v in eigenvalues)
+        return min(
+            limit_behind_weights(iteration, mirror, w, pairing, complex(v)) for w in weights for v in eigenvalues
+        )
 
     at_once = not (late or iteration.leak)
     largest = (
@@ -82,20 +84,14 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
     limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-    best = None if deformation.mirror.share else next((d for d, most in limits.items() if abs(gain) < most), None)
+    best = None if mirror.share else next((d for d, most in limits.items() if abs(gain) < most), None)
     raise _too_late(problem, deformation, largest, best)
 
 
 def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eigenvalue: float) -> float:
     """Return the largest effective gain for a response with these weights of past requests, late by some cycles."""
-    return _limit(deformation, _late(weights, late), _paired(deformation.iteration), eigenvalue)
-
-
-def _limit(deformation: Deformation, weights: np.ndarray, pairing: float, eigenvalue: complex) -> float:
-    iteration, share = deformation.iteration, deformation.mirror.share
-    return delayed_limit(
-        weights, pairing=pairing, leak=iteration.leak, pole=iteration.error_pole, eigenvalue=eigenvalue, modelled=share
-    )
+    iteration = deformation.iteration
+    return limit_behind_weights(iteration, deformation.mirror, _late(weights, late), _paired(iteration), eigenvalue)
 
 
 def _delayed_weights(problem: Problem, iteration: Iteration) -> list[np.ndarray]:

@@ -426,7 +426,7 @@ def _model(case: Case) -> Fact:
     spoils = (
         case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
     )  # more than it may cure
-    no = harms > 2 and numbers["added"] > 0.01 and spoils
+    no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
     return Fact(Verdict.NO if no else Verdict.CAUTION if harms > WORSE else Verdict.YES, numbers, name)
 
 

@@ -534,6 +534,12 @@ def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = 
             )
         elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
             weakest = plant.input.elements[int(np.argmin(np.linalg.norm(gain, axis=0)))]
+            if _switched(plant, weakest):
+                mistakes.add(
+                    f"input '{weakest}' is switched: the response depends on it by a step alone (if_else, floor, sign), which "
+                    "has no slope; write its mean, a number from 0 to 1, and switch in the reality: Reality(plant=...)"
+                )
+                return
             mistakes.add(
                 f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
                 f"independent effect there{_remedy(problem, gain_of, values, weakest)}"
@@ -545,6 +551,14 @@ def _gain(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     response = plant.equations.controlled_response(x, u, p)
     return ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
+
+
+def _switched(plant: Plant, name: str) -> bool:
+    """Whether the response depends on an input, and nowhere by a slope."""
+    x, u, p = plant.symbols()
+    response, place = plant.equations.controlled_response(x, u, p), plant.input.elements.index(name)
+    depends = np.asarray(ca.DM(ca.jacobian_sparsity(response, u), 1).full())[:, place]
+    return bool(depends.any()) and bool(ca.jacobian(response, u)[:, place].is_zero())
 
 
 def _remedy(problem: Problem, gain_of: ca.Function, values: np.ndarray, weakest: str) -> str:

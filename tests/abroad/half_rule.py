@@ -11,6 +11,8 @@ of the controllers has y and the command alone. Chosen here: the unit of time (s
 without prediction does not bear.
 """
 
+from dataclasses import replace
+
 import casadi as ca
 
 import fpirhc as fp
@@ -57,6 +59,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"y": 1.0}, deviation={"u": 1.0}),
     measure_from=60.0,  # s
 )
+swinging = replace(problem, cost=fp.Quadratic(states={"y": 1.0}, deviation={"u": 1e-2}))
 
 optimiser = fp.FixedPoint(iterations=5, tolerance=1e-3)
 plain = fp.RecedingHorizon(optimiser)

@@ -11,9 +11,9 @@ import tasks
 from test_dead_time import LAW, affine, iteration_radius
 
 import fpirhc as fp
-from fpirhc.contraction.delayed import delayed_limit, loop_polynomial
+from fpirhc.contraction.delayed import limit_behind_weights, loop_polynomial
 from fpirhc.deformation import Deformation
-from fpirhc.deformation.base import LastRequest, Mirror
+from fpirhc.deformation.base import Iteration, LastRequest, Mirror
 from fpirhc.deformation.leaky import leaky_pole
 from fpirhc.errors import InvalidValue, NotSupported
 
@@ -173,9 +173,8 @@ def test_limit_agrees_with_the_roots(mirror, leaks):
         weights /= weights.sum()
         cycles, leak = float(random.integers(0, 6)), float(random.uniform(0.2, 0.8)) * leaks
         pole, ratio = float(random.choice([0.0, 0.6])), float(random.uniform(0.4, 2.5))
-        limits.append(
-            delayed_limit(weights, pairing=cycles, leak=leak, pole=pole, eigenvalue=ratio, modelled=mirror.share)
-        )
+        iteration = Iteration(leak=leak, error_pole=pole)
+        limits.append(limit_behind_weights(iteration, mirror, weights, cycles, ratio))
         shares = ((0.98, True), (1.02, False)) if limits[-1] > 0 else ((1e-3, False),)
         for share, inside in shares if np.isfinite(limits[-1]) else ():
             row = loop_polynomial(weights, share * (limits[-1] or 1.0), cycles, leak, pole, ratio, mirror.share)

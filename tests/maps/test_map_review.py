@@ -76,5 +76,5 @@ def test_the_factor_is_the_decay_of_the_run(name: str) -> None:
     apart = np.abs(runs[0]["plant_state.a"] - runs[1]["plant_state.a"])
     decay = (apart[20:26].max() / apart[2:8].max()) ** (1 / 18)
     assert told["returns"].verdict == "yes"
-    assert told["returns"].numbers["factor"] == pytest.approx(decay, abs=0.1)
+    assert told["returns"].numbers["factor"] == pytest.approx(decay, abs=0.15)
     assert "no" not in {one.verdict for key, one in told.items() if key != "pays"}

@@ -1,0 +1,120 @@
+"""The null test of a review: with its own model as the plant a controller with adaptation must not do worse than without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+import reviewed
+
+import fpirhc as fp
+from fpirhc.controllers.base import Controller
+from fpirhc.deformation import Deformation
+
+POLE = 86.7  # 1/s
+MAP = fp.Affine(gain=-1.0)
+
+
+def drifting(*, exact: float = POLE) -> fp.Problem:
+    """Y' = -p y + p u behind a pole that is fast against the period, along a sine: .43 of it passes in a cycle."""
+    plant = fp.Plant(
+        coordinates={"y": "m"},
+        inputs={"u": "m"},
+        order=1,
+        parameters={"p": fp.Parameter(POLE, exact, "1/s")},
+        response=lambda y, u, p: {"y": p.p * (u.u - y.y)},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": ca.sin(8 * t)}),
+        start={"y": 0.0},
+        period=0.005,
+        duration=2.0,
+        horizon=fp.Horizon(stages=10, step=0.005),
+        cost=fp.Quadratic(states={"y": 1.0}, deviation={"u": 1e-3}),
+        measure_from=1.0,
+    )
+
+
+def planned(deformation: Deformation | None = None) -> Controller:
+    """A plan with a deformation."""
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-3)
+    return fp.RecedingHorizon(optimiser) if deformation is None else fp.RecedingHorizon(optimiser, deformation)
+
+
+def alone(problem: fp.Problem, controller: Controller) -> fp.Answer:
+    """The answer to the null test."""
+    return reviewed.answers(problem, controller)["model"]
+
+
+def rms(problem: fp.Problem, controller: Controller) -> float:
+    """Rms tracking error of a run."""
+    run = fp.simulate(problem, controller, seed=0, compiled=False)
+    assert run.stop is None
+    return float(np.sqrt(np.mean(run["error"][run.time >= problem.measure_from] ** 2)))
+
+
+def test_a_period_that_is_long_against_the_plant_fails():
+    """The plain form takes the drift within a cycle for an error. The answer has the errors that runs show."""
+    problem = drifting()
+    found = alone(problem, planned(MAP))
+    assert found.verdict == "no"
+    assert found.numbers["error_without"] == pytest.approx(rms(problem, planned()), rel=0.02)
+    assert found.numbers["error_with"] == pytest.approx(rms(problem, planned(MAP)), rel=0.02)
+    assert found.numbers["error_with"] > 5 * found.numbers["error_without"]
+
+
+def test_the_form_that_passes_passes():
+    """Equal to no adaptation to rounding. The wrong model is what the null test must not see."""
+    problem = drifting(exact=0.8 * POLE)
+    assert alone(problem, planned(fp.ModelReferenced(MAP))).verdict == "yes"
+    model = drifting()
+    assert rms(model, planned(fp.ModelReferenced(MAP))) == pytest.approx(rms(model, planned()), rel=1e-9)
+
+
+@pytest.mark.parametrize(("late", "verdict"), [(0.0, "yes"), (0.01, "no")])
+def test_masses_that_do_not_drift_pass_until_a_dead_time_is_not_paired(late, verdict):
+    """Without a spring there is no drift within a cycle: the plain form leaves a right model as it is."""
+    problem = reviewed.mass(dead_time=fp.DeadTime(inputs={"u": late})) if late else reviewed.mass()
+    controller = fp.ComputedTorque(fp.Exponential(rate=5.0), fp.Affine(gain=-0.4 if late else -1.0))
+    assert alone(problem, controller).verdict == verdict
+
+
+def test_errors_of_rounding_are_none():
+    """A motor held at its speed with a right model: 4e-15 without adaptation and 4e-14 with it are no errors."""
+    task = fp.load_problem("noisy_motor")
+    assert alone(task.problem, task.controllers["RHC+FPI"]).verdict == "yes"
+
+
+def test_commands_at_a_limit_show_nothing():
+    """A wrong map asks for more than the light lets in."""
+    task = fp.load_problem("problems/gallery/freeway.py")
+    found = alone(task.problem, task.controllers["static map+FPI"])
+    assert found.verdict == "unknown"
+    assert "at a limit" in found.change
+
+
+def test_a_null_test_goes_on_until_errors_count():
+    """The input is too weak for the start, so the first cycles show nothing; the plain form disturbs a right model later."""
+    plant = fp.Plant(
+        {"y": "m"}, {"u": "m/s"}, {"b": fp.Parameter(1.0, 1.5, "1")}, lambda y, u, p: {"y": p.b * u.u}, order=1
+    )
+    problem = fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"y": 0.1 * ca.sin(t)}),
+        start={"y": 1.0},
+        period=1e-3,
+        duration=10.0,
+        limits=fp.Limits(inputs={"u": (-0.4, 0.4)}),
+        measure_from=8.0,
+    )
+    law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False, bumpless=False), fp.Affine(gain=-0.05))
+    found = alone(problem, law)
+    right = replace(problem, plant=replace(plant, parameters={"b": fp.Parameter(1.0, 1.0, "1")}))
+    pair = [
+        fp.measure(right, fp.simulate(right, one, seed=0, compiled=False)).rms_error["y"]
+        for one in (fp.ComputedTorque(law.tracking), law)
+    ]
+    assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=1e-6)
