@@ -234,11 +234,12 @@ class Choice:
 
     def _bench(self, problem: Problem, one: Candidate | None, where: object) -> Bench:
         """The loop with a candidate, which those of one form share."""
-        key = where, one and one.form
-        if key not in self._benches:
-            first = one and one.form.deformation(self.estimates, _FIRST)
-            self._benches[key] = Bench.of(problem, self.bare if first is None else self.bare.with_deformation(first))
-        return self._benches[key] if one is None else self._benches[key].at_gain(one.share / _FIRST)
+        form = None if one is None else one.form
+        if (where, form) not in self._benches:
+            adapted = None if form is None else self.bare.with_deformation(form.deformation(self.estimates, _FIRST))
+            self._benches[where, form] = Bench.of(problem, adapted or self.bare)
+        bench = self._benches[where, form]
+        return bench if one is None else bench.at_gain(one.share / _FIRST)
 
     @cached_property
     def _middle(self) -> tuple[Case, ...]:

@@ -96,10 +96,8 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     without = "the estimated plant of a {} has no equations yet"
     require_rates(model, without.format("map"))
     direct = set(model.controlled_names) == set(model.coordinates)  # else what else the inputs move has to follow
-    if model.algebraic is not None or (model.equations.inverse_opaque and not direct):
-        raise NotSupported(
-            without.format("plant with algebraic states, or of outputs of a model that is not affine in its inputs,")
-        )
+    if model.equations.inverse_opaque and not direct:
+        raise NotSupported(without.format("plant of outputs of a model that is not affine in its inputs,"))
     count = len(model.controlled_names)
     signals = tuple(f"drift_{name}" for name in model.controlled_names) if drifts else ()
     known = {n: one if one.outside else replace(one, exact=one.approximate) for n, one in model.parameters.items()}
