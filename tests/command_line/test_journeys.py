@@ -173,14 +173,19 @@ def test_options_are_few_and_explained():
     assert all(getattr(one, "help", "") for command in COMMANDS.values() for one in command.params)
 
 
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+ON_PAGES = re.compile(r"^    (?:\$ )?(fpirhc .+)$", re.MULTILINE)
 EXAMPLES = {
     f"{name} {k}": line for name, one in COMMANDS.items() for k, line in enumerate((one.epilog or "").splitlines())
+}
+EXAMPLES |= {
+    f"{page.stem}: {line}": line for page in PAGES for line in ON_PAGES.findall(page.read_text(encoding="utf-8"))
 }
 
 
 @pytest.mark.parametrize("line", EXAMPLES.values(), ids=EXAMPLES)
-def test_examples_of_help_are_valid(line):
-    """They are parsed, and controllers that they name of shipped problems are there."""
+def test_command_lines_of_help_and_pages_are_valid(line):
+    """They are parsed, and controllers and cases that they name of shipped problems are there."""
     words = shlex.split(re.split(r"    +|  +#|\s&&\s", line.strip())[0], comments=True)
     assert words.pop(0) == "fpirhc"
     if not words or words[0].startswith("-") or words[0] == "help":
