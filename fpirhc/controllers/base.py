@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import reduce
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
@@ -233,7 +234,7 @@ def _limit_block(problem: Problem) -> Block:
         # Finiteness is checked before the clamp: fmin and fmax turn NaN into a full-scale command.
         finite = is_finite(s.command_unclipped)
         safe = ca.if_else(finite, s.command_unclipped, s._command_before)
-        command = clip(safe, lower, upper)
+        command = clip(_within_rates(problem, safe, s._command_before), lower, upper)
         clipped_request = meaning(s.state, command, safe, s._deformed_unclipped, s.parameters)
         return {
             "command": command,
@@ -244,6 +245,16 @@ def _limit_block(problem: Problem) -> Block:
         }
 
     return Block("limit", Layout(reads), Layout(writes), step)
+
+
+def _within_rates(problem: Problem, command: Expression, before: Expression) -> Expression:
+    """The command as far as hard limits of rates let it go in a cycle."""
+    entries = []
+    for k, ends in enumerate(np.transpose(nominal(problem.limits).rate_bounds(problem.plant))):
+        low, high = (before[k] + problem.period * float(end) if math.isfinite(end) else None for end in ends)
+        entry = command[k] if low is None else ca.fmax(command[k], low)
+        entries.append(entry if high is None else ca.fmin(entry, high))
+    return ca.vertcat(*entries)
 
 
 def _meaning(plant: Plant) -> ca.Function:

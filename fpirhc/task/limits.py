@@ -130,13 +130,15 @@ class _Rate(Limit):
 class Limits(Checked):
     """Limits of a problem.
 
-    The plant's actuator clips the inputs to their limits. All other limits bind an optimiser's plan, at the nodes between its
-    stages; where a stage is many steps of a map, hard limits of states and paths hold after each of them.
+    Every controller's command keeps the limits of inputs, and moves in a cycle by no more than hard limits of rates allow. All other
+    limits bind an optimiser's plan, at the nodes between its stages; where a stage is many steps of a map, hard limits of states
+    and paths hold after each of them.
 
     Args:
         inputs: intervals (lower, upper) by name of the input.
         states: intervals (lower, upper) by name of the state (q1, q1', ...).
-        rates: intervals of the change of inputs from stage to stage, per second, by name of the input.
+        rates: intervals of the change of inputs per second, from stage to stage of a plan and from cycle to cycle of the command, by
+            name of the input.
         paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, or a
             `Limit` of your own.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
@@ -212,6 +214,16 @@ class Limits(Checked):
     def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of every input, shape (nu,) each; infinite where free."""
         return _bounds(self.inputs, plant.input.elements)
+
+    def rate_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bound of the change of every input, shape (nu,) each; infinite where free, soft or priced."""
+        weighed = {*self.soft, *self.prices}
+        rates = {
+            name: ends
+            for name, ends in self.rates.items()
+            if (f"{name} rate" if name in plant.state.elements else name) not in weighed
+        }
+        return _bounds(rates, plant.input.elements)
 
     def state_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of every state, shape (nx,) each; infinite where free."""

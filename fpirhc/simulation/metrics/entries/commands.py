@@ -28,13 +28,17 @@ def total_variation(problem: Problem, run: Run) -> dict[str, float]:
 
 
 def at_limit(problem: Problem, run: Run) -> float:
-    """Return the share of the cycles in which a command stands at a limit, clipped or planned there."""
+    """Return the share of the cycles in which a command, or its change, stands at a limit, clipped or planned there."""
     measured = measured_cycles(problem, run)
     lower, upper = (end[measured] for end in _limits(problem, run))
     span = upper - lower
     near = _AT * np.where(np.isfinite(span), span, np.fmax(1.0, np.fmin(np.abs(lower), np.abs(upper))))
     near, commands = np.where(np.isfinite(near), near, 0.0), _measured(problem, run)
-    return float(_mean(((commands <= lower + near) | (commands >= upper - near)).any(axis=1)))
+    stands = (commands <= lower + near) | (commands >= upper - near)
+    slowest, fastest = problem.period * np.array(nominal(problem.limits).rate_bounds(problem.plant))
+    moves, slack = np.diff(commands, axis=0, prepend=commands[:1]), 1e-6 * np.fmin(fastest, -slowest)
+    stands |= (moves <= slowest + slack) | (moves >= fastest - slack)
+    return float(_mean(stands.any(axis=1)))
 
 
 def _measured(problem: Problem, run: Run) -> np.ndarray:
