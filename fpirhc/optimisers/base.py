@@ -35,7 +35,6 @@ class Optimiser(Checked, ABC):
     cannot_keep: ClassVar[tuple[str, ...]] = ()
     """Limits that it cannot keep: of "inputs", of "states", those of states with "prices"."""
 
-
     @property
     def unbounded(self) -> str:
         """Why a call may take any time, with a remedy; empty where its work is bounded."""

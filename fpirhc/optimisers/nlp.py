@@ -58,7 +58,6 @@ class MultipleShooting(Optimiser):
     def options(self, ocp: OptimalControl) -> Options:
         """CasADi's options of the solver."""
 
-
     def memory(self, ocp: OptimalControl) -> Layout:
         variables, constraints = sizes(ocp)
         plan = tuple(f"{i}@{k}" for k in range(ocp.stages) for i in ocp.input.elements)

@@ -14,21 +14,19 @@ from functools import cached_property
 from itertools import takewhile
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import with_optimiser, without_deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.cost import View
 from fpirhc.plant.chain import relative_order
 from fpirhc.review.experiments import LATENCY, PLACES, Bench
-from fpirhc.review.points import StateSlopes, each, needed_commands, state_slopes, whole_turns, zero_dynamics
+from fpirhc.review.points import StateSlopes, needed_commands, state_slopes, whole_turns, zero_dynamics
+from fpirhc.simulation.hard_limits import hard_limits
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
-from fpirhc.symbolic.layout import Named
 from fpirhc.task.problem import Problem
 
 MORE = 8  # times the optimiser's iterations, with a tenth of its tolerance
@@ -278,46 +276,13 @@ def _latency(case: Case) -> Fact | None:
 
 
 def _left(case: Case) -> Fact | None:
-    problem, run, plant = case.problem, case.bench.nominal, case.problem.plant
-    limits = {**problem.limits.boxes(plant), **problem.limits.written(plant, problem.period)}
-    hard = {n: one for n, one in limits.items() if n not in {**problem.limits.soft, **problem.limits.prices}}
-    if not hard or run["plant_state"].shape[1] != plant.state.size or run.cycles < 2:
+    followed = hard_limits(case.problem, case.bench.nominal)
+    if not followed:
         return None
-    x, u, p = (ca.SX.sym(one.name, one.size) for one in (plant.state, plant.input, plant.parameter))
-    before, t, none = ca.SX.sym("before", plant.input.size), ca.SX.sym("t"), Named((), ca.SX(0, 1), "outside")
-    named = lambda signal, value: Named(signal.elements, value, signal.name)  # noqa: E731
-    shown, unknown = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names))), ca.SX.nan
-    view = View(
-        state=named(plant.state, x),
-        reference=named(plant.output, unknown(plant.output.size)),
-        input=named(plant.input, u),
-        input_before=named(plant.input, before),
-        feedforward=named(plant.input, unknown(plant.input.size)),
-        parameters=named(plant.parameter, p),
-        time=t,
-        output=named(plant.output, shown),
-        outside=none,
-    )
-    value = ca.Function(
-        "fpirhc_limited", [x, u, before, p, t], [ca.vertcat(*(one.named_value(n, view) for n, one in hard.items()))]
-    )
-    sent = run["command"]
-    rows = (
-        run["plant_state"],
-        sent,
-        np.vstack([sent[:1], sent[:-1]]),
-        np.tile(plant.approximate, (run.cycles, 1)),
-        run["time"],
-    )
-    low, high = (np.array([getattr(one, end) for one in hard.values()]) for end in ("lower", "upper"))
-    room = np.where(
-        np.isfinite(high - low), high - low, np.maximum(np.abs(np.where(np.isfinite(high), high, low)), 1e-300)
-    )
-    beyond = np.maximum((values := each(value, *rows)) - high, low - values) / room
-    worst = int(beyond.max(axis=0).argmax())
-    share, most = float((beyond[:, worst] > SLIGHT).mean()), max(float(beyond[:, worst].max()), 0.0)
+    worst = max(followed, key=lambda one: float(one.beyond.max()))
+    share, most = float((worst.beyond > SLIGHT).mean()), float(worst.beyond.max())
     verdict = Verdict.YES if most <= SLIGHT else Verdict.NO if most > 0.05 and share > 0.01 else Verdict.CAUTION
-    return Fact(verdict, {"beyond": most, "share_of_cycles": share}, list(hard)[worst])
+    return Fact(verdict, {"beyond": most, "share_of_cycles": share}, worst.name)
 
 
 def _inner(case: Case) -> Fact | None:
@@ -464,7 +429,7 @@ QUESTIONS = (
     Question("latency", "Does it bear three cycles of latency?", _latency,
              "Measure the latency and state it: Problem(dead_time=...)."),
     Question("limits", "Do states, rates and paths keep their limits?", _left,
-             "Commands keep intervals of inputs alone: slow the reference, or leave room."),
+             "Commands keep intervals of inputs and rates: slow the reference, or leave room."),
     Question("inner", "Do states without a task stay?", _inner, "Weigh them in the cost, or control another output."),
     Question("noise", "Is the chatter from noise small?", _noise, "Lower the gain, or filter its error: Filtered(map, pole=...)."),
     Question("bias", "Does it bear a bias of the measured response?", _bias,

@@ -130,15 +130,15 @@ class _Rate(Limit):
 class Limits(Checked):
     """Limits of a problem.
 
-    Every controller's command keeps the limits of inputs, and moves in a cycle by no more than hard limits of rates allow. All other
-    limits bind an optimiser's plan, at the nodes between its stages; where a stage is many steps of a map, hard limits of states
-    and paths hold after each of them.
+    Every controller's command keeps the limits of inputs, and moves in a cycle by no more than hard limits of rates allow. All
+    other limits bind an optimiser's plan, at the nodes between its stages; where a stage is many steps of a map, hard limits of
+    states and paths hold after each of them.
 
     Args:
         inputs: intervals (lower, upper) by name of the input.
         states: intervals (lower, upper) by name of the state (q1, q1', ...).
-        rates: intervals of the change of inputs per second, from stage to stage of a plan and from cycle to cycle of the command, by
-            name of the input.
+        rates: intervals of the change of inputs per second, from stage to stage of a plan and from cycle to cycle of the command,
+            by name of the input.
         paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, or a
             `Limit` of your own.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or

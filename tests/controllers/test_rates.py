@@ -61,8 +61,10 @@ def test_a_rate_that_is_weighed_may_be_passed(weighed):
 
 
 def test_what_is_left_of_a_command_is_what_the_iteration_is_told():
-    """A request that the rate cuts off does not wind the iteration up: it comes back to the reference when the motion is slow enough."""
-    slow = replace(PROBLEM, reference=fp.Trajectory(lambda t: {"x": 0.5 + 0.2 * ca.sin(t)}), start={"x": 0.3}, duration=12.0)
+    """A request that the rate cuts off does not wind the iteration up: where the motion is slow enough it comes back."""
+    slow = replace(
+        PROBLEM, reference=fp.Trajectory(lambda t: {"x": 0.5 + 0.2 * ca.sin(t)}), start={"x": 0.3}, duration=12.0
+    )
     run = fp.simulate(slow, CONTROLLERS["CTC+FPI"], seed=0, compiled=False)
     assert fastest(run) <= 1 + 1e-9
     assert np.abs(np.asarray(run["true_error"])[-300:]).max() < 2e-2

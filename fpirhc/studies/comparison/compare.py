@@ -22,6 +22,7 @@ from fpirhc.problem_files.pairs import pair_of
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.changes import Changes
+from fpirhc.simulation.hard_limits import hard_limits
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant
@@ -64,6 +65,9 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()
+
+
+_SLIGHT = 1e-3  # of a limit's range
 
 
 @dataclass(frozen=True)
@@ -319,17 +323,13 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
 
 
 def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
-    """Return by how much the run leaves each hard limit of a state."""
-    limits, texts = problem.limits, []
-    for name, (low, high) in limits.states.items():
-        if name in {**limits.soft, **limits.prices} or not run.cycles:
-            continue
-        values = run[f"plant_state.{name}"]
-        unit = with_space(run.unit(f"plant_state.{name}"))
-        room = 1e-3 * (high - low if np.isfinite(high - low) else max(abs(values).max(), 1.0))
-        for value, limit in ((values.min(), low), (values.max(), high)):
-            if abs(value - min(max(value, low), high)) > room:
-                texts.append(f"{name} reaches {value:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
+    """Return by how much the run leaves each hard limit: of a state, a rate, an expression."""
+    texts = []
+    for one in hard_limits(problem, run):
+        unit = with_space(one.unit)
+        for value, limit in ((one.values.min(), one.lower), (one.values.max(), one.upper)):
+            if abs(value - min(max(value, one.lower), one.upper)) > 0 and one.beyond.max() > _SLIGHT:
+                texts.append(f"{one.name} reaches {value:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
     return tuple(texts)
 
 
