@@ -22,6 +22,7 @@ from fpirhc.symbolic.live import LiveNumber, Number
 
 GAP = 1e-9  # half width of the bounds of what the end must meet, in sizes of the state
 _LEAST = 1e-3  # of what inputs move a state by: a smaller spread of the reference is no measure of it
+_NOTHING = 1e-9  # of the same: a spread of rounding
 _POWER_STEPS = 50
 _RUNS_AWAY = 2e3  # times that a motion of the model grows over the horizon
 _MARGIN = 1.1  # a power iteration approaches the eigenvalue from below
@@ -302,10 +303,11 @@ def expand_along(
 def sizes_along(states: np.ndarray, moved: np.ndarray | float = 1.0) -> np.ndarray:
     """Return half the spread of every state along the reference and a tenth of its size, (ns,), at least a share of `moved`.
 
-    A state that stays zero has the size of what it is moved by; 1 where nothing is known to move it.
+    A state that rests at zero has the size of what it is moved by; 1 where nothing is known to move it.
     """
-    about = np.maximum(0.5 * np.ptp(states, axis=1) + 0.1 * np.abs(states).max(axis=1), _LEAST * np.asarray(moved))
-    return np.where(about > 0, about, 1.0)
+    about, moves = 0.5 * np.ptp(states, axis=1) + 0.1 * np.abs(states).max(axis=1), np.asarray(moved)
+    sizes = np.where(about > _NOTHING * moves, np.maximum(about, _LEAST * moves), moves)
+    return np.where(sizes > 0, sizes, 1.0)
 
 
 def input_curvature(along: _ReferenceExpansion, step: float) -> np.ndarray:
