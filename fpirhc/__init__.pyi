@@ -10,7 +10,7 @@ from .controllers.rivals.pid import PID
 from .controllers.slots.schedules import Periodic
 from .controllers.slots.slot import Slot
 from .controllers.slots.slotted import Slotted
-from .controllers.wrappers.cascade import Cascade, TargetUnit, ThroughModel
+from .controllers.wrappers.cascade import Cascade, ThroughModel
 from .controllers.wrappers.estimating import Estimating
 from .controllers.wrappers.exact_model import ExactModel
 from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
@@ -190,7 +190,6 @@ __all__ = [
     "StepDifference",
     "Stepper",
     "Table",
-    "TargetUnit",
     "ThroughModel",
     "Trajectory",
     "Tuned",

@@ -69,7 +69,7 @@ problem = fp.Problem(
 static = fp.FeedforwardOnly()
 controllers = {
     "static inverse": static,
-    "Cascade": fp.Cascade(static, fp.Affine(gain=-1.0)),
+    "Cascade": fp.Cascade(static, fp.Affine(gain=-1.0), fp.ThroughModel(lag=20.0)),  # s
     "Cascade, last target": fp.Cascade(static, fp.Affine(gain=-0.1), paired=None),
     "static inverse, exact map": fp.ExactModel(static),
 }

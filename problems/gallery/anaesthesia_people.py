@@ -31,13 +31,13 @@ induction, and then the mean share (`fpirhc study anaesthesia_people --cases all
     pump alone                         0    35.4   67.1    0    26.7   59.5    0    28.9   64.9    0    14.7   52.4
     PID                                92   39.8   99.1    95   39.6   98.9    93   38.9   98.9    100  42.3  100.0
     RHC offset-free                    89   39.3   98.4    93   38.9   98.1    82   36.1   98.1    98   40.0   99.7
-    cascade in mg/l, model-referenced  90   35.5   98.1    94   39.2   98.4    83   32.8   98.3    98   29.7   99.7
+    cascade in mg/l, model-referenced  87   32.9   97.8    94   39.2   98.3    87   30.3   98.4    98   28.0   99.9
     cascade                            90   39.6   97.9    94   39.4   97.8    88   38.7   98.1    96   41.5   99.3
-    cascade in mg/l                    91   39.9   98.6    95   40.0   98.9    91   38.5   98.8    98   41.6   99.9
+    cascade in mg/l                    90   40.0   98.4    94   39.9   98.5    92   39.3   98.9    100  41.9  100.0
 
 At least 90, 37 and 97 are wanted on those that nothing was tuned on. `cascade in mg/l` and the PID law have that on "A unseen", B
-and C, and with five seeds with each of them, see below; on "A tuned" the worst share of the first is 89 to 91. The offset-free plan
-has it on "A unseen" and C, and not on B.
+and C, the PID law with each of five seeds, the cascade but for one seed on B, see below; on "A tuned" its worst share is 88 to 91.
+The offset-free plan has it on "A unseen" and C, and not on B.
 
 Of the settings that were tried on "A tuned" those were taken with which nobody there is in the range for less than 90 % of the
 time, and of these the one with the highest lowest bis; with the best worst share where there are none. The first rule was the best
@@ -50,14 +50,15 @@ the time from 5 min on, `Problem(measure_from=5.0)`, is lower, and below 90 % in
 
     worst from 5 min on    A tuned    A unseen    B     C
     PID                    84         88          87    94
-    cascade in mg/l        82         92          89    96
+    cascade in mg/l        82         91          90    96
 
-Noise moves all of this. The least and the most of five seeds, worst share and lowest bis (`python benchmarks/patients.py`):
+Noise moves all of this. The least and the most of five seeds, worst share and lowest bis, by `fpirhc study
+anaesthesia_people --cases all --seed 1` and so on:
 
     seeds 0 to 4     A tuned                 A unseen                B                       C
     PID              90 to 92  39.2 to 40.0  94 to 95  39.0 to 40.0  93 to 95  38.5 to 39.2  98 to 100  41.6 to 42.3
     RHC offset-free  86 to 91  38.7 to 39.7  92 to 93  37.6 to 39.1  79 to 84  36.1 to 37.6  97 to 99   38.9 to 40.1
-    cascade in mg/l  89 to 91  39.1 to 40.1  93 to 95  39.2 to 40.1  90 to 94  38.5 to 39.4  98 to 100  40.8 to 41.6
+    cascade in mg/l  88 to 91  40.0 to 40.6  93 to 96  39.9 to 40.7  89 to 95  39.0 to 39.8  98 to 100  41.9 to 42.9
 
 On these people it is a draw of `cascade in mg/l` with a PID law on the pump's target, which needs no curve; on those of the blind
 test, `anaesthesia_drawn`, the PID law is safer. Both add up the error, and both begin
@@ -67,19 +68,21 @@ The form: a plain cascade begins at the target that is in force, and awake that 
 target that its model has for 50, as the pump alone does, and sensitive patients go low in the induction.
 
 The unit: the slope of the curve changes along it and from patient to patient, and with it the gain from a target to the bis. In
-mg/l, through the model's curve, the worst patient of every set is longer in the range.
+mg/l, through the model's curve, the worst patients of B and C are longer in the range.
 
 What is corrected: the offset-free plan adds its estimate to the bis, at a slope that is not the patient's. In set B, where the
 kinetics are not the pump's, its worst patient is outside the range for more than a sixth of the time.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import pandas as pd
 
 import fpirhc as fp
+from fpirhc.deformation.base import Wrapper
 
 CYCLE = 1 / 12  # min
 LARGEST = 400.0  # mg/min, of the pump
@@ -280,7 +283,23 @@ problem = fp.Problem(
 pump = fp.FeedforwardOnly()
 late, paired = 0.65, fp.ThroughModel(lag=1.2, dead_time=0.65, plain=True)  # min
 slow = fp.Filtered(fp.Affine(gain=-0.8), pole=0.85)
-unit = fp.TargetUnit(concentration, curve, bounds=(LEAST, MOST))
+MEDIAN = SimpleNamespace(**{name: one.approximate for name, one in model.parameters.items()})
+
+
+@dataclass(frozen=True)
+class InConcentration(Wrapper):
+    """A map on concentrations: all that it is given passes the model's curve backwards, and the next request forwards."""
+
+    def memory(self, elements):
+        return self.map.memory(elements)
+
+    def step(self, request, response, desired, memory):
+        """What the map returns, as a bis."""
+        seen = (concentration(bis, MEDIAN) for bis in (request, response, desired))
+        target, remembered = self.map.step(*seen, memory)
+        return curve(ca.fmin(ca.fmax(target, LEAST), MOST), MEDIAN), remembered
+
+
 plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2))
 filter = fp.DisturbanceKalman(drift={"bis": 1.0}, measured={"bis": 3.0})
 controllers = {
@@ -290,12 +309,12 @@ controllers = {
         fp.Estimating(plan, filter, dead_time=fp.DeadTime(inputs={"target": late})), inputs=late
     ),
     "cascade in mg/l, model-referenced": fp.Cascade(
-        pump, fp.Affine(gain=-0.08), fp.ThroughModel(lag=2.5, dead_time=late), units={"bis": unit}
+        pump, InConcentration(fp.Affine(gain=-0.08)), fp.ThroughModel(lag=2.5, dead_time=late)
     ),
     "cascade": fp.Cascade(
         pump, fp.Filtered(fp.Affine(gain=-0.6), pole=0.85), fp.ThroughModel(lag=1.3, dead_time=late, plain=True)
     ),
-    "cascade in mg/l": fp.Cascade(pump, slow, paired, units={"bis": unit}),
+    "cascade in mg/l": fp.Cascade(pump, InConcentration(slow), paired),
 }
 headline = ("pump alone", "cascade in mg/l")
 why = (

@@ -202,10 +202,7 @@ def changes(name):
     paths = {f"exact.{n}": own[n] for n in (*UNITS, "basal")}
     paths |= {f"approximate.{n}": model[n] for n in (*UNITS, "basal") if n not in OF_STOMACH}
     paths |= {f"start.{n}": value for n, value in at_rest(own, own["Gb"], own["basal"])[0].items()}
-    return paths | {
-        "group": group_of(name),
-        "limits.inputs.extra": (-own["basal"], PUMP * own["basal"]),
-    }
+    return paths | {"group": group_of(name), "limits.inputs.extra": (-own["basal"], PUMP * own["basal"])}
 
 
 def carbs(t):

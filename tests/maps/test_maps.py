@@ -287,9 +287,6 @@ def test_a_map_outside_is_the_map() -> None:
 
 
 def test_a_cascade_on_a_map_iterates_on_its_target() -> None:
-    """The pairing's lag is stated; one that is not stated is that of the map's slowest mode z, -T / log|z|."""
-    settling = fishery(next=lambda x, u, p: {"stock": 0.8 * x.stock - u.catch})
-    assert fp.ThroughModel().stated(task(settling)).lag == pytest.approx(-T / np.log(0.8))
     law = fp.Exponential(rate=0.04, integral=False)
     cascade = fp.Cascade(fp.ComputedTorque(law), fp.Affine(gain=-0.6), fp.ThroughModel(lag=2 * T))
     problem = task(duration=1500.0, measure_from=500.0)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -20,10 +19,9 @@ from test_cascade import affine, simulated
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
-from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.compare import compare
 
 STATIC = fp.FeedforwardOnly()
+AT_ONCE = fp.ThroughModel(lag=0.0)
 COLD, WARMER = 20.0, 4e-3  # Ohm, 1/K
 HEAT, LOSS = 50.0, 2.0  # J/K, W/K
 
@@ -103,7 +101,7 @@ def test_an_exact_model_leaves_the_drift_of_one_cycle() -> None:
 def test_the_shift_is_that_of_the_recursion_by_hand() -> None:
     """y_k belongs to reference_k + shift_{k-1}: shift_k = shift_{k-1} - a (y_k - reference_k)."""
     gain = 0.4
-    run = simulated(heated(element()), fp.Cascade(STATIC, affine(gain)))
+    run = simulated(heated(element()), fp.Cascade(STATIC, affine(gain), AT_ONCE))
     shift = 0.0
     for k in range(run.cycles):
         shift = shift - gain * (run["output.power"][k] - run["reference.power"][k]) if k else 0.0
@@ -116,7 +114,7 @@ def test_a_wrong_static_map_is_made_up_for() -> None:
     without = rms(problem, STATIC)
     assert without > 50
     for gain in (0.3, 0.6, 1.0):
-        assert rms(problem, fp.Cascade(STATIC, affine(gain))) < 0.06 * without, gain
+        assert rms(problem, fp.Cascade(STATIC, affine(gain), AT_ONCE)) < 0.06 * without, gain
         assert rms(problem, fp.Cascade(STATIC, affine(gain), paired=None)) < 0.06 * without, gain
 
 
@@ -128,7 +126,7 @@ def test_set_points_noise_and_dead_time() -> None:
         sensing=fp.Sensing({"power": fp.Sensor(noise=fp.Noise(0.5))}),
         dead_time=fp.DeadTime(inputs={"u": 0.2}, before={"u": 60.0}),
     )
-    run = simulated(problem, fp.Cascade(STATIC, affine(0.3)))
+    run = simulated(problem, fp.Cascade(STATIC, affine(0.3), AT_ONCE))
     assert np.std(run["output.power"] - run["plant_output.power"]) == pytest.approx(0.5, rel=0.2)
     assert np.array_equal(run["realised"], run["output"])
     assert not np.array_equal(run["plant_realised"], run["realised"])
@@ -139,7 +137,7 @@ def test_set_points_noise_and_dead_time() -> None:
 def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:
     """A lamp of 20 W on the same meter: measured, judged, and made up for by the target."""
     problem = heated(element(COLD, WARMER), disturbances={"power": fp.Step(at=20.0, size=20.0)})
-    run = simulated(problem, fp.Cascade(STATIC, affine(0.5)))
+    run = simulated(problem, fp.Cascade(STATIC, affine(0.5), AT_ONCE))
     lamp = np.where(run.time >= 20.0 - 1e-9, 20.0, 0.0)
     ohms = COLD * (1 + WARMER * run["state.theta"])
     drawn = run["command.u"][:-1] ** 2 / ohms[1:] + lamp[1:]
@@ -147,40 +145,6 @@ def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:
     assert np.array_equal(run["realised"], run["output"])
     assert np.abs(run["error.power"][run.time > 23]).max() < 2.0
     assert np.abs(run["error.power"]).max() > 19
-
-
-def test_a_review_asks_the_loop() -> None:
-    """A target r gives J r with J = R^ / R, so a settled error is multiplied by 1 - a J; theta moves by itself."""
-    gain, duration = 0.5, 20.0
-    answers = fp.review(
-        heated(element(), duration=duration), {"one": fp.Cascade(STATIC, affine(gain))}, mismatch=0.0, seed=0
-    )
-    by_question = {a.question: a for a in answers.answers}
-    assert by_question["Are the relative orders those of the plant?"].evidence.startswith("power 0")
-    assert str(by_question["Does the inverse exist along the reference?"].verdict) == "yes"
-    slopes = 14.0 / (COLD * (1 + WARMER * simulated(heated(element(), duration=duration), STATIC)["state.theta"]))
-    slowest = by_question["Does the deformation converge?"]
-    assert slowest.verdict == "yes"
-    assert slowest.numbers["radius"] == pytest.approx(1 - gain * slopes[-1], rel=0.05)
-    assert by_question["Are the zero dynamics stable?"].numbers["rate"] < 0
-    assert not any(a.verdict == "unknown" for a in answers.answers)
-
-
-@pytest.mark.parametrize(("gain", "verdict"), [(0.5, "yes"), (3.5, "no")])
-def test_a_review_judges_the_gain_by_the_settled_map(gain: float, verdict: str) -> None:
-    """P = R^ r / R for a request r: the slope is R^ / R along the way, and a run does what the verdict says.
-
-    Too large a gain asks for a negative power, for which the model has no command: such steps are skipped, until it gets warm.
-    """
-    problem, controller = heated(element(), duration=20.0), fp.Cascade(STATIC, affine(gain))
-    by_question = {
-        a.question: a for a in fp.review(problem, {"one": controller}, mismatch=0.0, seed=0).controllers["one"]
-    }
-    run = simulated(problem, controller)
-    limit = by_question["Is the map's gain admissible?"].numbers["limit"]
-    assert limit == pytest.approx(-2 * 2.0, rel=0.01)  # the model itself is in the box, where the slope is 1
-    assert str(by_question["Is the map's gain admissible?"].verdict) == verdict
-    assert (np.abs(run["error.power"][20:60]).max() > 100) == (verdict == "no")
 
 
 def test_a_static_map_has_no_error_once_it_is_right() -> None:
@@ -205,23 +169,9 @@ def test_a_static_map_has_no_error_once_it_is_right() -> None:
     )
     exact = simulated(problem, fp.ExactModel(STATIC))
     assert np.abs(exact["error"][1:]).max() < 1e-8  # Newton's tolerance
-    iterated = simulated(problem, fp.Cascade(STATIC, affine(0.8)))
+    iterated = simulated(problem, fp.Cascade(STATIC, affine(0.8), AT_ONCE))
     wrong = simulated(problem, STATIC)
     assert np.abs(iterated["error"][50:]).max() < 0.2 * np.abs(wrong["error"][50:]).max()
-
-
-def test_a_comparison_says_that_the_output_is_measured() -> None:
-    """And judges the iteration beside its inner controller, with the null test of the pair."""
-    problem = heated(element(), duration=10.0)
-    controllers: dict[str, Controller] = {"static": STATIC, "iterated": fp.Cascade(STATIC, affine(0.5))}
-    task = Task("element", Path("element.py"), "A heating element", "", problem, controllers)
-    compared = compare(task, seed=0, compiled=False)
-    assert "all controllers are given theta, power in every cycle of 0.1 s" in compared.information
-    assert [entry.information.uses for entry in compared.entries if entry.information] == [
-        ("theta",),
-        ("theta", "power"),
-    ]
-    assert "iterated lowers the rms error of power" in compared.verdict[0]
 
 
 def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
 from fpirhc.learning.rules.base import Evidence
 from fpirhc.learning.rules.projection import Projection
 
@@ -94,44 +93,3 @@ def test_a_projection_learns_as_much_from_a_response_in_another_unit(size):
     evidence = Evidence(lambda: (ca.SX(0), ca.SX(0)), lambda: (ca.SX(size), ca.SX(size * 0.5)), ca.SX(0))
     learned = float(ca.evalf(Projection(gain=1.0).change(evidence, {"p": (0.0, 1.0)}, 1e-3)))
     assert learned == pytest.approx(0.5 if size else 0.0)
-
-
-@pytest.mark.parametrize("level", [1.0, 1e-9])
-def test_a_wrong_pair_of_unit_functions_of_a_cascade_is_refused_in_any_unit(level):
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "m"},
-        order=1,
-        response=lambda q, u, p: {"y": p.a * (u.u - q.y)},
-        parameters={"a": fp.Parameter(1.0, 1.0, "1/s")},
-    )
-    problem = fp.Problem(
-        plant=plant, reference=fp.Trajectory(lambda t: {"y": level + 0 * t}), start={"y": 0.0}, period=0.1, duration=1.0
-    )
-
-    def check(factor: float) -> None:
-        unit = fp.TargetUnit(lambda y, _: y / level, lambda z, _: z * level * factor)
-        fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.6), fp.ThroughModel(lag=1.0), units={"y": unit}).check(
-            problem
-        )
-
-    check(1.0)
-    with pytest.raises(InvalidProblem, match="each other's inverse"):
-        check(1.1)
-
-
-def test_unit_functions_with_an_offset_agree_at_zero_but_for_rounding():
-    plant = fp.Plant(
-        coordinates={"T": "°C"},
-        inputs={"u": "K"},
-        order=1,
-        response=lambda q, u, p: {"T": p.a * (u.u - q.T)},
-        parameters={"a": fp.Parameter(1.0, 1.0, "1/s")},
-    )
-    problem = fp.Problem(
-        plant=plant, reference=fp.Trajectory(lambda t: {"T": 1e-9 + 0 * t}), start={"T": 0.0}, period=0.1, duration=1.0
-    )
-    kelvins = fp.TargetUnit(lambda y, _: y + 273.15, lambda z, _: z - 273.15)
-    fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.6), fp.ThroughModel(lag=1.0), units={"T": kelvins}).check(
-        problem
-    )
