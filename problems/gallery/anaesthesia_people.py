@@ -334,6 +334,4 @@ def lowest(problem, run):
 
 metrics = (fp.figures.InBand(BIS, 40.0, 60.0), fp.Metric("lowest", lowest, better="larger", headline=True, finite=True))
 headline_metric = "in_band"
-pictures = (
-    fp.OverTime("Depth and infusion", panels=(BIS, "reality_state.infusion"), levels={BIS: (40.0, 60.0)}),
-)
+pictures = (fp.OverTime("Depth and infusion", panels=(BIS, "reality_state.infusion"), levels={BIS: (40.0, 60.0)}),)
