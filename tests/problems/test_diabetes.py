@@ -113,3 +113,15 @@ def test_order_five_is_at_its_limits_and_unsafe():
         assert table[name] == pytest.approx([*(100 * share for share in shares), glucose.min()], abs=0.6)
         assert shares[1] > 0.04
         assert shares[2] > 0.95
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(f"child#{k:03d}", marks=[] if k == 4 else pytest.mark.slow) for k in range(1, 11)]
+)
+def test_children_eat_what_is_stated_and_are_safe_with_the_pid_law(name):
+    """Five meals of 220 g a day, minute by minute; the lowest glucose of every child is at least 94 mg/dl."""
+    cases = task().cases
+    assert cases is not None
+    run = fp.simulate(cases.problem(name, task().problem), task().controllers["PID"], seed=0, compiled=False)
+    assert run["signals.carbs"].sum() * task().problem.period == pytest.approx(2 * 220.0, rel=1e-12)
+    assert run["plant_output.glucose"].min() >= 94.0
