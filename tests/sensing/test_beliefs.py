@@ -16,6 +16,7 @@ from plants import linear, pendulum
 
 import fpirhc as fp
 from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.sensing.base import StateObserver, unobservable
 from fpirhc.simulation.step_arguments import raw_measurements
@@ -204,6 +205,22 @@ def test_motion_can_show_what_rest_hides():
     assert unobservable([first], [c]).shape[1] == 1
     assert unobservable([second], [c]).shape[1] == 1
     assert unobservable([first, second], [c, c]).shape[1] == 0
+
+
+def test_a_model_referenced_form_passes_the_null_test_on_believed_states():
+    """With an exact model it changes nothing: the twin's response passes the same estimator."""
+    problem = infusion(KALMAN, duration=10.0)
+    referenced = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+    first, second = (run(problem, fp.ExactModel(c)) for c in (CTC, referenced))
+    np.testing.assert_allclose(first["state"], second["state"], atol=1e-9)
+
+
+def test_errors_that_decay_are_allowed_and_known():
+    """The effect site follows the plasma and shows nowhere; its error decays with ke0 of the model, 0.26 / min."""
+    free = unobservable_errors(infusion(KALMAN))
+    assert free.states == ("Ce",)
+    assert free.decays
+    assert free.pole == pytest.approx(-0.26, rel=1e-9)
 
 
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():
