@@ -9,13 +9,12 @@ rest; `bend` and `curve` do the work of `hessian_stage`. Theory: docs/theory.md.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field, replace
-from weakref import WeakKeyDictionary
+from dataclasses import dataclass
 
 import casadi as ca
 
 from fpirhc.fields.checked import Checked
-from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
+from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.evaluate import Latest
 
 
@@ -27,10 +26,6 @@ class HessianModel(Checked, ABC):
         """Whether the model says nothing useful of a cost that does not bend upwards."""
         return True
 
-    def of(self, ocp: OptimalControl) -> OptimalControl:
-        """Return the problem whose second derivatives are the model's: itself, or one with another cost in their place."""
-        return ocp
-
     @abstractmethod
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:
         """Return the scalar whose Hessian with respect to (s, u) the sweep uses."""
@@ -38,18 +33,7 @@ class HessianModel(Checked, ABC):
 
 @dataclass(frozen=True)
 class GaussNewton(HessianModel):
-    """The Hessian of the stage cost alone.
-
-    Args:
-        linear_outputs: whether outputs of the plant count as linear in the state: the Hessian of a squared error of y = h(x) is
-            then 2 h' h'^T, which bends upwards, also where the curve h saturates. Without it a squared error of a curve may bend
-            downwards far from the reference, and is refused.
-    """
-
-    linear_outputs: bool = field(default=False, metadata={"setting": "where given"})
-
-    def of(self, ocp: OptimalControl) -> OptimalControl:
-        return _with_linear_outputs(ocp) if self.linear_outputs else ocp
+    """The Hessian of the stage cost alone."""
 
     def curved(self, cost: ca.SX, next_state: ca.SX, costate: ca.SX) -> ca.SX:  # noqa: ARG002
         return cost
@@ -82,11 +66,9 @@ def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
     """Function (s, u, theta, lambda of s+) -> (Q (ns, ns), S (nu, ns), R (nu, nu))."""
     s, u, theta = stage_symbols(ocp)
     costate = ca.SX.sym("lambda", ocp.state.size)
-    cost, at = _bending_cost(ocp, s, u, theta)
-    curved = hessian.curved(cost, ocp.dynamics(s, u, theta), costate)
+    curved = hessian.curved(ocp.stage_cost(s, u, theta)[0], ocp.dynamics(s, u, theta), costate)
     slope = ca.gradient(curved, u)
     results = [ca.hessian(curved, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
-    results = [ca.substitute(r, at, ca.vertcat(s, u)) for r in results] if ocp.frozen else results
     return _dense("fpirhc_hessian_stage", [s, u, theta, costate], results)
 
 
@@ -95,46 +77,12 @@ def hessian_end(ocp: OptimalControl) -> ca.Function:
     s, _, theta = stage_symbols(ocp)
     final = ocp.terminal_cost(s, theta)
     hessian, slope = ca.hessian(final, s)
-    if ocp.frozen:
-        at = ca.SX.sym("at", s.numel())
-        hessian = ca.substitute(ca.hessian(ocp.frozen[1](s, theta, at), s)[0], at, s)
     return _dense("fpirhc_hessian_end", [s, theta], [final, slope, hessian])
 
 
 def stage_symbols(ocp: OptimalControl) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Symbols (s, u, theta) of one stage."""
     return ca.SX.sym("s", ocp.state.size), ca.SX.sym("u", ocp.input.size), ca.SX.sym("theta", ocp.data.size)
-
-
-def _bending_cost(ocp: OptimalControl, s: ca.SX, u: ca.SX, theta: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """The stage cost whose second derivatives are used, and the symbols at which its outputs are linearised, if they are."""
-    if ocp.frozen is None:
-        return ocp.stage_cost(s, u, theta)[0], ca.SX(0, 1)
-    at = ca.SX.sym("at", s.numel() + u.numel())
-    return ocp.frozen[0](s, u, theta, at), at
-
-
-_linear: WeakKeyDictionary[OptimalControl, OptimalControl] = WeakKeyDictionary()
-
-
-def _with_linear_outputs(ocp: OptimalControl) -> OptimalControl:
-    """The problem with second derivatives of the cost on linearised outputs; scale and expansion are theirs too."""
-    if ocp.frozen is not None or ocp.linear_outputs is None:
-        return ocp
-    if ocp not in _linear:
-        changed = replace(ocp, frozen=ocp.linear_outputs())
-        s, u, theta = stage_symbols(ocp)
-        next_state = ocp.dynamics(s, u, theta)
-        second = hessian_stage(changed, GaussNewton())(s, u, theta, ca.SX.zeros(s.numel()))
-        slopes = [ca.densify(ca.jacobian(next_state, v)) for v in (s, u)]
-        functions: dict[object, ca.Function] = {
-            "linearised": ca.Function("fpirhc_linearised", [s, u, theta], [*slopes, *second]),
-            "final": ca.Function("fpirhc_final", [s, theta], [hessian_end(changed)(s, theta)[2]]),
-        }
-        along = expand_along(ocp.dynamics, ocp.stage_cost, ocp.terminal_cost, ocp.nodes, functions)
-        curvature = input_curvature(along, ocp.step)
-        _linear[ocp] = replace(changed, along=along, curvature=curvature, functions=functions)
-    return _linear[ocp]
 
 
 def _dense(name: str, arguments: list[ca.SX], results: list[ca.SX]) -> ca.Function:
@@ -158,8 +106,7 @@ def partial_count(ocp: OptimalControl) -> int:
 
 def split_hessian(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
     """Return the Functions bend and curve of a model of the second derivatives, built once for a stage."""
-    same = ocp.dynamics, ocp.stage_cost, ocp.frozen
-    return _HESSIANS.of(same, (hessian,), lambda: _bent(ocp, hessian))
+    return _HESSIANS.of((ocp.dynamics, ocp.stage_cost), (hessian,), lambda: _bent(ocp, hessian))
 
 
 def _kept(matrix: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
@@ -194,9 +141,8 @@ def _bent(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
     ns = ocp.state.size
     s, u, theta = stage_symbols(ocp)
     after, variables = ca.SX.sym("lambda", ns), ca.vertcat(s, u)
-    cost, at = _bending_cost(ocp, s, u, theta)
+    cost = ocp.stage_cost(s, u, theta)[0]
     curved = ca.hessian(hessian.curved(cost, ocp.dynamics(s, u, theta), after), variables)[0]
-    curved = ca.substitute(curved, at, variables) if ocp.frozen else curved
     values, symbols, lower = _kept(ca.tril(curved))
     whole = ca.tril2symm(lower)
     return {

@@ -62,9 +62,6 @@ class OptimalControl:
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
-        linear_outputs: function that returns the Functions (s, u, theta, at (ns + nu)) -> l and (s, theta, at (ns)) -> T, with the
-            plant's outputs linearised at `at`.
-        frozen: these Functions, where second derivatives are to be theirs.
         soft_end: (s, theta) -> what soft limits of states add to T, by term of the stage cost; None where nothing does.
     """
 
@@ -94,8 +91,6 @@ class OptimalControl:
     inner: tuple[tuple[int, float], ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
-    linear_outputs: Callable[[], tuple[ca.Function, ca.Function]] | None = None
-    frozen: tuple[ca.Function, ca.Function] | None = None
     soft_end: ca.Function | None = None
     met: int = 0
 

@@ -191,10 +191,7 @@ class Withheld:
     def refuse(self, *_: object) -> NoReturn:
         """Raise NotSupported with the names of the settings."""
         own = [path for path in self._paths if not path.startswith(DERIVED)]
-        why = (
-            "its code keeps numbers that follow; use FixedPoint() without limits of states and without linear_outputs, or leave "
-            "it out of live=[...]"
-        )
+        why = "its code keeps numbers that follow; use FixedPoint() without limits of states, or leave it out of live=[...]"
         raise not_live(own, why, " with this optimiser")
 
     __getitem__ = __iter__ = __len__ = __array__ = __float__ = __bool__ = refuse

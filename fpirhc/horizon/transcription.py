@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -141,7 +141,6 @@ def _transcribed(
         node_times=horizon.nodes,
         shares=horizon.share / horizon.relative_lengths,
         functions=functions,
-        linear_outputs=stage.linear_outputs,
     )
     return ocp.at(values)
 
@@ -165,7 +164,6 @@ class _Stage:
     binding: list[ConstraintState]
     settings: list[ca.SX]
     length: Expression | float
-    linear_outputs: Callable[[], tuple[ca.Function, ca.Function]]
 
 
 _STAGES: Latest[tuple[_Stage, tuple[ca.Function, ...]]] = Latest(8)  # whatever signals they meet
@@ -218,41 +216,9 @@ def _stage_expressions(
         live = live_signals(tuple(s.name() for s in settings), plant.input)
         theta = ca.vertcat(theta, *settings, ca.SX.sym("live", live.size - len(settings)))
 
-    def linear_outputs() -> tuple[ca.Function, ca.Function]:
-        s, at = ca.vertcat(x, before, ca.SX.sym("z", len(binding))), ca.SX.sym("at", x.numel() + before.numel())
-        at_z, at_u = ca.SX.sym("at_z", len(binding)), ca.SX.sym("at_u", u.numel())
-        whole, places = ca.vertcat(x, before, u), ca.vertcat(at, at_u)
-        shown = replace(view, output=_linearised(view.output, whole, places))
-        ended = replace(end, output=_linearised(end.output, x, at[: x.numel()]))
-        others = sum((v for n, v in terms.items() if n in soft or n == "held"), start=ca.SX(0))
-        rate = others + ca.sum1(ca.vertcat(*_scalar_terms(cost.stage(shown)).values()))
-        last = cost.terminal_cost(ended, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
-        places = ca.vertcat(at, at_z)
-        return (
-            ca.Function("fpirhc_linear_cost", [s, u, theta, ca.vertcat(places, at_u)], [horizon.step * length * rate]),
-            ca.Function("fpirhc_linear_end", [s, theta, places], [last + horizon.last * soft_states]),
-        )
-
     return _Stage(
-        x,
-        before,
-        u,
-        applied,
-        theta,
-        x_next,
-        terms,
-        final,
-        soft_end,
-        binding,
-        settings,
-        horizon.step * length,
-        linear_outputs,
+        x, before, u, applied, theta, x_next, terms, final, soft_end, binding, settings, horizon.step * length
     )
-
-
-def _linearised(output: Named, variables: Expression, at: Expression) -> Named:
-    values, slopes = (ca.substitute(e, variables, at) for e in (output.vector, ca.jacobian(output.vector, variables)))
-    return Named(tuple(output), values + slopes @ (variables - at), "output")
 
 
 def _stage_functions(stage: _Stage) -> tuple[ca.Function, ...]:

@@ -93,13 +93,12 @@ class FixedPoint(Optimiser):
             )
         # With limits of states a plan has states of its own and feedback between them, which holds a plant that runs away itself.
         _require_rollouts(ocp.runaway() if ocp.bounds_states else ocp.along.growth())
-        least = self._of(ocp).along.least_curvature()
+        least = ocp.along.least_curvature()
         if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
             raise NotSupported(
                 f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
                 f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()) for an "
-                f"economic cost, FixedPoint(hessian=GaussNewton(linear_outputs=True)) for an output that saturates, or add a "
-                f"convex term to the cost"
+                f"economic cost or an output that saturates, or add a convex term to the cost"
             )
 
     def memory(self, ocp: OptimalControl) -> Layout:
@@ -109,13 +108,11 @@ class FixedPoint(Optimiser):
         return shifted_limited(ocp, memory) if ocp.bounds_states else shifted_plain(ocp, memory)
 
     def step(self, ocp: OptimalControl) -> ca.Function:
-        ocp = self._of(ocp)
         if ocp.bounds_states:
             return self._begun(ocp, limited_step(ocp, self._limited(ocp, self.most_iterations)))
         return self._begun(ocp, plain_step(ocp, self._plain(ocp, converging=False)))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
-        ocp = self._of(ocp)
         if ocp.bounds_states:
             return self._begun(ocp, limited_step(ocp, self._limited(ocp, _MOST_LIMITED)))
         return self._begun(ocp, plain_step(ocp, self._plain(ocp, converging=True)))
@@ -127,17 +124,13 @@ class FixedPoint(Optimiser):
         if ocp.bounds_states:
             return None
         # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
-        own, ocp = settled(self, ocp.setting_numbers), self._of(ocp)
+        own = settled(self, ocp.setting_numbers)
         limited = limited_step(replace(ocp, settings=()), own._limited(ocp, _MOST_LIMITED))
         return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]
         return memory if np.isfinite(memory).all() else self.memory(ocp).start()
-
-    def _of(self, ocp: OptimalControl) -> OptimalControl:
-        """The problem with the second derivatives of the Hessian's model."""
-        return ocp if self.hessian is None else self.hessian.of(ocp)
 
     def _plain(self, ocp: OptimalControl, *, converging: bool) -> PlainSettings:
         hessian = self.hessian or GaussNewton()

@@ -108,13 +108,14 @@ def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, ra
     run = fp.simulate(problem, planning(), seed=0, compiled=None)
     every = cycles_per_plan(problem.horizon, PERIOD)
     assert every == {"stage": 4, "cycle": 1, 3: 3}[replan]
-    command, states = run["command"][:, 0], run["state"]
+    command, planned, states = run["command"][:, 0], run["planned"][:, 0], run["state"]
     for k in range(every, run.cycles, 2 * every):
         settings = {"rate": rate, "fastest": fastest, "between": every * PERIOD, "lengths": lengths or (1.0,) * STAGES}
         expected = own_plan(problem, run.time[k], states[k], command[k - 1], **settings)
-        assert command[k] == pytest.approx(expected, abs=2e-4)
-    changes = np.flatnonzero(np.abs(np.diff(command)) > 1e-9) + 1
+        assert planned[k] == pytest.approx(expected, abs=2e-4)
+    changes = np.flatnonzero(np.abs(np.diff(planned)) > 1e-9) + 1
     assert (changes % every == 0).all()
+    assert np.abs(np.diff(command)).max() <= (1 + 1e-9) * fastest * PERIOD  # what a plan wants at once takes its cycles
 
 
 def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
