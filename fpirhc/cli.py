@@ -376,7 +376,13 @@ def tune(
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     drawn = Draws(draws, mismatch, seed + 10**6) if draws else None  # never the plants of a comparison
     variants = CasesOf(tuple(cases), seed) if cases else drawn
-    facts: dict[str, Any] = {"trials": trials, "variants": variants, "seed": seed, "controllers": controllers, "metric": metric}
+    facts: dict[str, Any] = {
+        "trials": trials,
+        "variants": variants,
+        "seed": seed,
+        "controllers": controllers,
+        "metric": metric,
+    }
     with progress_bars() as progress:
         found = search(task, folder=_folder(out, task.name, "tuning"), progress=progress, **facts)
     for sentences in found.harm.values():

@@ -82,9 +82,9 @@ def written(facts: dict[str, Any]) -> str:
 
 def _numbers(rows: pd.DataFrame) -> dict[str, dict[str, list[float]]]:
     """By controller and metric, the values of all rows, the nominal one first."""
-    columns = [c for c in rows if c.partition(".")[0] in KEPT]
+    columns = [str(c) for c in rows if str(c).partition(".")[0] in KEPT]
     return {
-        n: {c: some[c].tolist() for c in columns if some[c].notna().all()}
+        str(n): {c: some[c].tolist() for c in columns if some[c].notna().all()}
         for n, some in rows.groupby("controller", sort=False)
     }
 
