@@ -146,7 +146,7 @@ def spectrum_over_box(
             raise InvalidValue(f"box: '{name}' is from {low!r} to {high!r}; expected finite ends with lower <= upper")
         ends[:, names.index(name)] = low, high
     generator = np.random.default_rng(seed)
-    parameters = generator.uniform(*ends, size=(samples, len(names)))
+    parameters = generator.uniform(ends[0], ends[1], size=(samples, len(names)))
     places = [names.index(name) for name in box]
     if 2 ** len(places) <= samples:
         for row, sides in enumerate(itertools.product((0, 1), repeat=len(places))):
