@@ -349,7 +349,7 @@ def probe(
     if not able:
         raise NotSupported("probe needs a controller with a deformation: choose another one by --controller")
     name, one = able[0], task.controllers[able[0]]
-    settings = {"cycles": cycles, "amplitude": amplitude, "recording": recording, "chatter": chatter}
+    settings: dict[str, Any] = {"cycles": cycles, "amplitude": amplitude, "recording": recording, "chatter": chatter}
     answer = ask(task.problem, one, trials=trials, seed=seed, **settings)
     print(to_json(answer.plain)) if json else show_probe(f"{task.name}: probe with {name}", answer)
     raise typer.Exit(0 if answer.deformation is not None else 1)
