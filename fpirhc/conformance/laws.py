@@ -117,9 +117,38 @@ def check_live(
         AssertionError: the first number that is lost, in one sentence.
     """
     short = replace(problem, duration=cycles * problem.period, measure_from=0.0)
-    plain = simulator(short, controller, compiled=compiled).run(seed=0)
-    tested = list(number_paths(problem, controller)) if paths is None else paths
-    return _searched(short, controller, tested, plain.log, compiled)
+    asked = list(number_paths(problem, controller)) if paths is None else list(paths)
+    opened, refused = list(asked), dict[str, str]()
+    while opened:
+        try:
+            ready = simulator(short, controller, compiled=compiled, live=opened)
+            break
+        except CompileError:
+            raise
+        except FpirhcError as error:
+            named = [path for path in opened if f"'{path}'" in str(error)]
+            hold(bool(named), f"one of the settings {opened} is refused without its name: {error}")
+            guilty = [path for path in named if len(named) == 1 or _refused_alone(short, controller, path)] or named
+            refused |= dict.fromkeys(guilty, str(error))
+            opened = [path for path in opened if path not in guilty]
+    factors: dict[str, float | None] = {}
+    if opened:
+        plain = simulator(short, controller, compiled=compiled).run(seed=0)
+        same = np.array_equal(ready.run(seed=0).log, plain.log, equal_nan=True)
+        hold(same, f"with live settings {opened} the loop runs differently although their numbers are the same")
+        for path in opened:
+            factors[path] = next(
+                (f for f in _FACTORS if _runs_as_rebuilt(ready, path, ready.live.start[path] * f)), None
+            )
+    return tuple(Tried(path, refused.get(path, ""), factors.get(path)) for path in asked)
+
+
+def _refused_alone(problem: Problem, controller: Controller, path: str) -> bool:
+    try:
+        simulator(problem, controller, compiled=False, live=[path])
+    except FpirhcError:
+        return True
+    return False
 
 
 def number_paths(problem: Problem, controller: Controller) -> Iterator[str]:
@@ -136,69 +165,6 @@ def _paths(value: Any, start: str) -> Iterator[str]:
         if isinstance(content, int | float) and not isinstance(content, bool):
             yield f"{start}{name}"
         yield from _paths(content, f"{start}{name}.")
-
-
-def _searched(
-    problem: Problem, controller: Controller, paths: Sequence[str], plain: np.ndarray, compiled: bool
-) -> tuple[Tried, ...]:
-    """Try all numbers at once, and halves of them where one is refused or lost, so that few loops are built."""
-    if len(paths) < 2:
-        return tuple(_tried(problem, controller, path, plain, compiled) for path in paths)
-    apart = paths[: len(paths) // 2]
-    try:
-        ready = simulator(problem, controller, compiled=compiled, live=paths)
-        together = _together(ready, paths, plain)
-        if together is not None:
-            return together
-    except CompileError:
-        raise
-    except FpirhcError as error:
-        named = [path for path in paths if f"'{path}'" in str(error)]
-        apart = named if 0 < len(named) < len(paths) else apart
-    rest = [path for path in paths if path not in apart]
-    tried = {t.path: t for part in (apart, rest) for t in _searched(problem, controller, part, plain, compiled)}
-    return tuple(tried[path] for path in paths)
-
-
-def _together(ready: Simulator, paths: Sequence[str], plain: np.ndarray) -> tuple[Tried, ...] | None:
-    """Change all numbers at once; None where the loop does not run as the one that is built with them."""
-    changes: dict[str, float] = {}
-    tried = []
-    for path in paths:
-        value = ready.live.start[path]
-        factor = next((f for f in _FACTORS if _accepted(ready, {**changes, path: value * f})), None)
-        if factor is not None:
-            changes[path] = value * factor
-        tried.append(Tried(path, factor=factor))
-    problem, controller, _ = ready.live.changed(changes)
-    rebuilt = simulator(problem, controller, compiled=ready.compiled).run(seed=0)
-    pairs = ((ready.run(seed=0).log, plain), (ready.run(seed=0, settings=changes).log, rebuilt.log))
-    return tuple(tried) if all(np.array_equal(one, other, equal_nan=True) for one, other in pairs) else None
-
-
-def _accepted(ready: Simulator, changes: dict[str, float]) -> bool:
-    try:
-        ready.live.changed(changes)
-    except FpirhcError:
-        return False
-    return True
-
-
-def _tried(problem: Problem, controller: Controller, path: str, plain: np.ndarray, compiled: bool) -> Tried:
-    try:
-        ready = simulator(problem, controller, compiled=compiled, live=[path])
-    except CompileError:
-        raise
-    except FpirhcError as error:
-        hold(f"'{path}'" in str(error), f"setting '{path}' is refused without its name: {error}")
-        return Tried(path, refused=str(error))
-    same = np.array_equal(ready.run(seed=0).log, plain, equal_nan=True)
-    hold(same, f"with the live setting '{path}' the loop runs differently although its number is the same")
-    value = ready.live.start[path]
-    for factor in _FACTORS:
-        if _runs_as_rebuilt(ready, path, value * factor):
-            return Tried(path, factor=factor)
-    return Tried(path)
 
 
 def _runs_as_rebuilt(ready: Simulator, path: str, value: float) -> bool:
