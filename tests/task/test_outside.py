@@ -325,16 +325,6 @@ def test_scenarios_do_not_draw_signals():
     assert ranges["loss"] == pytest.approx((0.24, 0.36))
 
 
-def test_a_review_says_for_which_weather_it_holds():
-    """It sees the nominal value of 283 K alone."""
-    question = "Do signals from outside stay where the review sees them?"
-    for course, verdict in ((fp.Unknown(NIGHT), "caution"), (fp.Known(283.0), "yes")):
-        answers = fp.review(task(room(OUTSIDE), {"ambient": course}), {}, mismatch=0.0, seed=1).problem
-        [answer] = [a for a in answers if a.question == question]
-        assert answer.verdict == verdict
-        assert ("274 to 285 in the run" if verdict == "caution" else "283 K here, 283 in the run") in answer.evidence
-
-
 def priced(cost: Any) -> fp.Problem:
     """The room with a price of heat, which is known ahead: ten times as high from 10 h to 14 h."""
     plant = room(fp.outside(276.5, "K"))
