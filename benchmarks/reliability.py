@@ -1,4 +1,4 @@
-"""Runs every attack and prints the figures: `python tests/attack/make_reliability.py`, with names of sections these alone."""
+"""Runs every attack and prints the figures: `python benchmarks/reliability.py`, with names of sections these alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]  # also for processes that are started
 FLIPS, KILLS, MISTAKES, LINES = 400, 30, 10_000, 1000
 
@@ -112,6 +112,8 @@ SECTIONS: dict[str, tuple[str, Callable[[], str]]] = {
 
 def main(names: Sequence[str]) -> None:
     """Run the named sections, or all, and print each."""
+    for unknown in set(names) - set(SECTIONS):
+        sys.exit(f"section '{unknown}' is unknown; there are {', '.join(SECTIONS)}")
     for name in names or SECTIONS:
         title, make = SECTIONS[name]
         print(f"## {title}\n\n{make()}\n", flush=True)
