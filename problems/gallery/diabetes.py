@@ -24,7 +24,7 @@ in the body. For the adult of this file, over two days:
     RHC+FPI on the target               43
 
 Nobody may be below 70 mg/dl for more than 4 % of the time; the time from 70 to 180 mg/dl is what is won. Over the ten children,
-who are the most sensitive (`fpirhc compare diabetes --cases 'child*'`), seed 0:
+who are the most sensitive (`fpirhc study diabetes --cases child`), seed 0:
 
     shares of the time [%]    from 70 to 180    worst child    below 70    lowest [mg/dl]
     PID                                   35             28           0                94
