@@ -137,7 +137,7 @@ class Draws(Variants):
         built = times[int(np.random.default_rng(late).integers(-1, 2))]
         return Variant(
             str(number),
-            built.with_exact(np.array(exact, dtype=float)),
+            built.with_exact(np.array(exact, dtype=float)) if self.percent else built,  # a body outside may have none
             id(built),
             seed=int(noise.generate_state(1)[0]),
             built=built,
