@@ -36,7 +36,8 @@ def at_limit(problem: Problem, run: Run) -> float:
     near, commands = np.where(np.isfinite(near), near, 0.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
     slowest, fastest = problem.period * np.array(nominal(problem.limits).rate_bounds(problem.plant))
-    moves, slack = np.diff(commands, axis=0, prepend=commands[:1]), 1e-6 * np.fmin(fastest, -slowest)
+    slack = 1e-6 * np.fmin(fastest, -slowest)
+    moves, slack = np.diff(commands, axis=0, prepend=commands[:1]), np.where(np.isfinite(slack), slack, 0.0)
     stands |= (moves <= slowest + slack) | (moves >= fastest - slack)
     return float(_mean(stands.any(axis=1)))
 
