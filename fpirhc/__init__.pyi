@@ -1,223 +1,133 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .baselines.baseline import check
-from .certificate.limits import certify_limits
-from .controllers import rivals
-from .controllers.computed_torque import ComputedTorque, FeedforwardOnly
-from .controllers.receding_horizon import RecedingHorizon
-from .controllers.replanning import FromMeasurement, FromPlan
-from .controllers.rivals.pid import PID
-from .controllers.slots.schedules import Periodic
-from .controllers.slots.slot import Slot
-from .controllers.slots.slotted import Slotted
-from .controllers.wrappers.cascade import Cascade, ThroughModel
-from .controllers.wrappers.estimating import Estimating
-from .controllers.wrappers.exact_model import ExactModel
-from .controllers.wrappers.predicted import ByDesired, ByModel, Predicted
-from .deformation.affine import Affine
-from .deformation.base import Identity
-from .deformation.model_referenced import ModelReferenced
-from .deformation.rfpt import RFPT, RFPTVector
-from .deformation.rotation import Rotation
-from .deformation.sigmoid import Sigmoid
-from .deformation.wrappers.delayed import Increment, Paired
-from .deformation.wrappers.filtered import Filtered
-from .deformation.wrappers.haar import Haar
-from .deformation.wrappers.tuned import Tuned
-from .errors import FpirhcError, HarmfulAdaptation
-from .horizon.cost import CustomCost, LQRTerminal, Quadratic
-from .horizon.hessian_models import ExactHessian, GaussNewton
-from .horizon.horizon import Horizon
-from .learning.estimators.base import Uncertain
-from .learning.estimators.disturbance_kalman import DisturbanceKalman
-from .learning.estimators.recursive_least_squares import RecursiveLeastSquares
-from .learning.rules.lyapunov_rule import LyapunovRule
-from .learning.rules.projection import Projection
-from .optimisers.fixed_point import FixedPoint
-from .optimisers.full_space import FullSpaceFixedPoint
-from .optimisers.gradient_fixed_point import GradientFixedPoint
-from .optimisers.nlp import Fatrop, Ipopt, SequentialQuadratic
-from .optimisers.plan import Plan, solve
-from .optimisers.reduced_gradient import ReducedGradient
-from .plant.integrators import Collocation, Cvodes, Euler, RungeKutta4
-from .plant.motion import Output
-from .plant.parameter import LogNormal, Normal, Spread, Uniform, outside
-from .plant.plant import Parameter, Plant
-from .probing.probe import probe
-from .problem_files.problem_file import load_problem
-from .problem_files.settings import LogSpan, Span, with_settings
-from .report.html import write_report
-from .review.review import Answer, review
-from .sensing import (
-    LowPassDifference,
-    Measured,
-    PositionDifference,
-    SavitzkyGolay,
-    Sensing,
-    Sensor,
-    StepDifference,
-    VelocityDifference,
-)
-from .sensing.observers.kalman_filter import KalmanFilter
-from .simulation.machine import RunMonitor
-from .simulation.metrics import Metric, figures, measure
-from .simulation.pictures.base import Quantity
-from .simulation.pictures.heat_map import HeatMap
-from .simulation.pictures.lines import OverTime, Portrait, Raster
-from .simulation.pictures.planar import Planar, Shape
-from .simulation.run import Run, load_run
-from .simulation.simulate import simulate, simulator
-from .simulation.stepper import Stepper
-from .status import Status
-from .studies.comparison.compare import compare
-from .studies.limits import limits
-from .studies.open_loop import certify
-from .studies.study import study
-from .studies.tune import tune
-from .symbolic.layout import Layout
-from .symbolic.live import signed_power
-from .task.cases import Cases
-from .task.dead_time import DeadTime
-from .task.disturbance import ColouredNoise, Formula, Noise, Pulse, Sine, Step
-from .task.exogenous import Believed, Known, Samples, Unknown
-from .task.external_plant import ExternalPlant
-from .task.limits import Limits, PathConstraint
-from .task.problem import Problem
-from .task.reality import Reality
-from .task.reference import Table, Trajectory
-from .task.set_point import Setpoint
-from .tracking.fractional import Fractional
-from .tracking.linear_law import Exponential, ShiftPolynomial
-
-__all__ = [
-    "PID",
-    "RFPT",
-    "Affine",
-    "Answer",
-    "Believed",
-    "ByDesired",
-    "ByModel",
-    "Cascade",
-    "Cases",
-    "Collocation",
-    "ColouredNoise",
-    "ComputedTorque",
-    "CustomCost",
-    "Cvodes",
-    "DeadTime",
-    "DisturbanceKalman",
-    "Estimating",
-    "Euler",
-    "ExactHessian",
-    "ExactModel",
-    "Exponential",
-    "ExternalPlant",
-    "Fatrop",
-    "FeedforwardOnly",
-    "Filtered",
-    "FixedPoint",
-    "Formula",
-    "FpirhcError",
-    "Fractional",
-    "FromMeasurement",
-    "FromPlan",
-    "FullSpaceFixedPoint",
-    "GaussNewton",
-    "GradientFixedPoint",
-    "Haar",
-    "HarmfulAdaptation",
-    "HeatMap",
-    "Horizon",
-    "Identity",
-    "Increment",
-    "Ipopt",
-    "KalmanFilter",
-    "Known",
-    "LQRTerminal",
-    "Limits",
-    "LogNormal",
-    "LogSpan",
-    "LowPassDifference",
-    "LyapunovRule",
-    "Measured",
-    "Metric",
-    "ModelReferenced",
-    "Noise",
-    "Normal",
-    "Output",
-    "OverTime",
-    "Paired",
-    "Parameter",
-    "PathConstraint",
-    "Periodic",
-    "Plan",
-    "Planar",
-    "Plant",
-    "Portrait",
-    "PositionDifference",
-    "Predicted",
-    "Problem",
-    "Projection",
-    "Pulse",
-    "Quadratic",
-    "Quantity",
-    "RFPTVector",
-    "Raster",
-    "Reality",
-    "RecedingHorizon",
-    "RecursiveLeastSquares",
-    "ReducedGradient",
-    "Rotation",
-    "Run",
-    "RunMonitor",
-    "RungeKutta4",
-    "Samples",
-    "SavitzkyGolay",
-    "Sensing",
-    "Sensor",
-    "SequentialQuadratic",
-    "Setpoint",
-    "Shape",
-    "ShiftPolynomial",
-    "Sigmoid",
-    "Sine",
-    "Slot",
-    "Slotted",
-    "Span",
-    "Spread",
-    "Status",
-    "Step",
-    "StepDifference",
-    "Stepper",
-    "Table",
-    "ThroughModel",
-    "Trajectory",
-    "Tuned",
-    "Uncertain",
-    "Uniform",
-    "Unknown",
-    "VelocityDifference",
-    "certify",
-    "certify_limits",
-    "check",
-    "compare",
-    "figures",
-    "limits",
-    "load_problem",
-    "load_run",
-    "measure",
-    "outside",
-    "probe",
-    "review",
-    "rivals",
-    "signed_power",
-    "simulate",
-    "simulator",
-    "solve",
-    "study",
-    "tune",
-    "with_settings",
-    "write_report",
-]
+from .baselines.baseline import check as check
+from .certificate.limits import certify_limits as certify_limits
+from .controllers import rivals as rivals
+from .controllers.computed_torque import ComputedTorque as ComputedTorque
+from .controllers.computed_torque import FeedforwardOnly as FeedforwardOnly
+from .controllers.receding_horizon import RecedingHorizon as RecedingHorizon
+from .controllers.replanning import FromMeasurement as FromMeasurement
+from .controllers.replanning import FromPlan as FromPlan
+from .controllers.rivals.pid import PID as PID
+from .controllers.slots.schedules import Periodic as Periodic
+from .controllers.slots.slot import Slot as Slot
+from .controllers.slots.slotted import Slotted as Slotted
+from .controllers.wrappers.cascade import Cascade as Cascade
+from .controllers.wrappers.cascade import ThroughModel as ThroughModel
+from .controllers.wrappers.estimating import Estimating as Estimating
+from .controllers.wrappers.exact_model import ExactModel as ExactModel
+from .controllers.wrappers.predicted import ByDesired as ByDesired
+from .controllers.wrappers.predicted import ByModel as ByModel
+from .controllers.wrappers.predicted import Predicted as Predicted
+from .deformation.affine import Affine as Affine
+from .deformation.base import Identity as Identity
+from .deformation.model_referenced import ModelReferenced as ModelReferenced
+from .deformation.rfpt import RFPT as RFPT
+from .deformation.rfpt import RFPTVector as RFPTVector
+from .deformation.rotation import Rotation as Rotation
+from .deformation.sigmoid import Sigmoid as Sigmoid
+from .deformation.wrappers.delayed import Increment as Increment
+from .deformation.wrappers.delayed import Paired as Paired
+from .deformation.wrappers.filtered import Filtered as Filtered
+from .deformation.wrappers.haar import Haar as Haar
+from .deformation.wrappers.tuned import Tuned as Tuned
+from .errors import FpirhcError as FpirhcError
+from .errors import HarmfulAdaptation as HarmfulAdaptation
+from .horizon.cost import CustomCost as CustomCost
+from .horizon.cost import LQRTerminal as LQRTerminal
+from .horizon.cost import Quadratic as Quadratic
+from .horizon.hessian_models import ExactHessian as ExactHessian
+from .horizon.hessian_models import GaussNewton as GaussNewton
+from .horizon.horizon import Horizon as Horizon
+from .learning.estimators.base import Uncertain as Uncertain
+from .learning.estimators.disturbance_kalman import DisturbanceKalman as DisturbanceKalman
+from .learning.estimators.recursive_least_squares import RecursiveLeastSquares as RecursiveLeastSquares
+from .learning.rules.lyapunov_rule import LyapunovRule as LyapunovRule
+from .learning.rules.projection import Projection as Projection
+from .optimisers.fixed_point import FixedPoint as FixedPoint
+from .optimisers.full_space import FullSpaceFixedPoint as FullSpaceFixedPoint
+from .optimisers.gradient_fixed_point import GradientFixedPoint as GradientFixedPoint
+from .optimisers.nlp import Fatrop as Fatrop
+from .optimisers.nlp import Ipopt as Ipopt
+from .optimisers.nlp import SequentialQuadratic as SequentialQuadratic
+from .optimisers.plan import Plan as Plan
+from .optimisers.plan import solve as solve
+from .optimisers.reduced_gradient import ReducedGradient as ReducedGradient
+from .plant.integrators import Collocation as Collocation
+from .plant.integrators import Cvodes as Cvodes
+from .plant.integrators import Euler as Euler
+from .plant.integrators import RungeKutta4 as RungeKutta4
+from .plant.motion import Output as Output
+from .plant.parameter import LogNormal as LogNormal
+from .plant.parameter import Normal as Normal
+from .plant.parameter import Spread as Spread
+from .plant.parameter import Uniform as Uniform
+from .plant.parameter import outside as outside
+from .plant.plant import Parameter as Parameter
+from .plant.plant import Plant as Plant
+from .probing.probe import probe as probe
+from .problem_files.problem_file import load_problem as load_problem
+from .problem_files.settings import LogSpan as LogSpan
+from .problem_files.settings import Span as Span
+from .problem_files.settings import with_settings as with_settings
+from .report.html import write_report as write_report
+from .review.review import Answer as Answer
+from .review.review import review as review
+from .sensing import LowPassDifference as LowPassDifference
+from .sensing import Measured as Measured
+from .sensing import PositionDifference as PositionDifference
+from .sensing import SavitzkyGolay as SavitzkyGolay
+from .sensing import Sensing as Sensing
+from .sensing import Sensor as Sensor
+from .sensing import StepDifference as StepDifference
+from .sensing import VelocityDifference as VelocityDifference
+from .sensing.observers.kalman_filter import KalmanFilter as KalmanFilter
+from .simulation.machine import RunMonitor as RunMonitor
+from .simulation.metrics import Metric as Metric
+from .simulation.metrics import figures as figures
+from .simulation.metrics import measure as measure
+from .simulation.pictures.base import Quantity as Quantity
+from .simulation.pictures.heat_map import HeatMap as HeatMap
+from .simulation.pictures.lines import OverTime as OverTime
+from .simulation.pictures.lines import Portrait as Portrait
+from .simulation.pictures.lines import Raster as Raster
+from .simulation.pictures.planar import Planar as Planar
+from .simulation.pictures.planar import Shape as Shape
+from .simulation.run import Run as Run
+from .simulation.run import load_run as load_run
+from .simulation.simulate import simulate as simulate
+from .simulation.simulate import simulator as simulator
+from .simulation.stepper import Stepper as Stepper
+from .status import Status as Status
+from .studies.comparison.compare import compare as compare
+from .studies.limits import limits as limits
+from .studies.open_loop import certify as certify
+from .studies.study import study as study
+from .studies.tune import tune as tune
+from .symbolic.layout import Layout as Layout
+from .symbolic.live import signed_power as signed_power
+from .task.cases import Cases as Cases
+from .task.dead_time import DeadTime as DeadTime
+from .task.disturbance import ColouredNoise as ColouredNoise
+from .task.disturbance import Formula as Formula
+from .task.disturbance import Noise as Noise
+from .task.disturbance import Pulse as Pulse
+from .task.disturbance import Sine as Sine
+from .task.disturbance import Step as Step
+from .task.exogenous import Believed as Believed
+from .task.exogenous import Known as Known
+from .task.exogenous import Samples as Samples
+from .task.exogenous import Unknown as Unknown
+from .task.external_plant import ExternalPlant as ExternalPlant
+from .task.limits import Limits as Limits
+from .task.limits import PathConstraint as PathConstraint
+from .task.problem import Problem as Problem
+from .task.reality import Reality as Reality
+from .task.reference import Table as Table
+from .task.reference import Trajectory as Trajectory
+from .task.set_point import Setpoint as Setpoint
+from .tracking.fractional import Fractional as Fractional
+from .tracking.linear_law import Exponential as Exponential
+from .tracking.linear_law import ShiftPolynomial as ShiftPolynomial
 
 __version__: str

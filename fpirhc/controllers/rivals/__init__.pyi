@@ -1,35 +1,17 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
-from .acceleration_feedback import AccelerationFeedback
-from .adaptive_inverse_dynamics import AdaptiveInverseDynamics
-from .adrc import ADRC
-from .backstepping_mrac import BacksteppingMRAC
-from .disturbance_observer import DisturbanceObserver
-from .force_mrac import ForceMRAC
-from .indi import INDI
-from .intelligent_pid import IntelligentPID
-from .l1_adaptive import L1Adaptive
-from .lyapunov_mrac import LyapunovMRAC
-from .pid import PID
-from .repetitive_control import RepetitiveControl
-from .resolved_rate import ResolvedAccelerationRate
-from .sliding_mode import SlidingMode
-from .slotine_li import SlotineLi
-
-__all__ = [
-    "ADRC",
-    "INDI",
-    "PID",
-    "AccelerationFeedback",
-    "AdaptiveInverseDynamics",
-    "BacksteppingMRAC",
-    "DisturbanceObserver",
-    "ForceMRAC",
-    "IntelligentPID",
-    "L1Adaptive",
-    "LyapunovMRAC",
-    "RepetitiveControl",
-    "ResolvedAccelerationRate",
-    "SlidingMode",
-    "SlotineLi",
-]
+from .acceleration_feedback import AccelerationFeedback as AccelerationFeedback
+from .adaptive_inverse_dynamics import AdaptiveInverseDynamics as AdaptiveInverseDynamics
+from .adrc import ADRC as ADRC
+from .backstepping_mrac import BacksteppingMRAC as BacksteppingMRAC
+from .disturbance_observer import DisturbanceObserver as DisturbanceObserver
+from .force_mrac import ForceMRAC as ForceMRAC
+from .indi import INDI as INDI
+from .intelligent_pid import IntelligentPID as IntelligentPID
+from .l1_adaptive import L1Adaptive as L1Adaptive
+from .lyapunov_mrac import LyapunovMRAC as LyapunovMRAC
+from .pid import PID as PID
+from .repetitive_control import RepetitiveControl as RepetitiveControl
+from .resolved_rate import ResolvedAccelerationRate as ResolvedAccelerationRate
+from .sliding_mode import SlidingMode as SlidingMode
+from .slotine_li import SlotineLi as SlotineLi
