@@ -218,7 +218,7 @@ class Gate:
         starts = {plant.output.name: tuple(map(float, self.problem.start_output)), TAKEN: (-FINITE,)}
         starts[plant.state.name] = tuple(map(float, self.problem.start_state))
         first = self.problem.inputs_before
-        held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)), holds=plant.input.name)
+        held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         failed = [] if "memory" in self.trusted else [scalar(FAILED)]
         counts = self.gap.memory if self.gap is not None else ()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Self, TypeAlias
 
 import casadi as ca
@@ -65,7 +65,6 @@ class Simulator:
         compiled: whether the loop is compiled C.
         why_not_compiled: reason where it is not; empty where it is.
         live: the settings that a run may change.
-        held: numbers of live settings that a run has where it is given none; problem and controller are those with them.
     """
 
     problem: Problem
@@ -75,12 +74,6 @@ class Simulator:
     compiled: bool
     why_not_compiled: str
     live: LiveSettings
-    held: Numbers = field(default_factory=dict)
-
-    def holding(self, settings: Numbers) -> Simulator:
-        """Return the loop whose runs have these numbers of its live settings, without another build."""
-        problem, controller, _ = self.live.changed(settings)
-        return replace(self, problem=problem, controller=controller, held=settings)
 
     def starting_at(self, start: Mapping[str, float]) -> Simulator:
         """Return the loop with other first values of some states; it is not compiled again where its code is the same.
@@ -94,7 +87,7 @@ class Simulator:
         if loop.function.serialize() == self.loop.function.serialize():
             return replace(self, problem=problem, controller=live.controller, loop=loop, live=live)
         anew = ComposedLoop.of(problem, self.live.unresolved, self.live.paths)
-        return replace(anew.simulator(self.compiled), held=self.held)
+        return anew.simulator(self.compiled)
 
     @property
     def remembers(self) -> bool:
@@ -110,7 +103,7 @@ class Simulator:
 
     def in_force(self, variant: Problem | None = None, settings: Numbers | None = None) -> InForce:
         """Return problem and controller of a run; arguments as in `run`."""
-        return in_force(self.live, self.loop, variant or self.problem, settings or self.held, {})
+        return in_force(self.live, self.loop, variant or self.problem, settings or {}, {})
 
     def run(
         self,
@@ -133,7 +126,7 @@ class Simulator:
             variant: the simulator's problem with other exact parameters or another duration; None: the problem itself.
             disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
-            settings: numbers of live settings by path; the others have the numbers of the build. None: those that are held.
+            settings: numbers of live settings by path; the others have the numbers of the build. None: all have them.
             changes: numbers of live settings from a time on, by time in s.
             deployed: whether a change is that of a device without Python: what is computed from the settings stays that of the
                 build, but for automatic settings.
@@ -150,7 +143,7 @@ class Simulator:
             self.live,
             self.loop,
             problem,
-            self.held if settings is None else settings,
+            {} if settings is None else settings,
             {} if changes is None else changes,
             deployed,
         )

@@ -278,8 +278,7 @@ def compose(
         InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
         InvalidShape: a reader and a writer disagree on a size.
     """
-    carried = [replace(d.now, holds=d.source) for d in delays]
-    memory = Layout((*carried, *[s for b in blocks for s in b.memory.signals]))
+    memory = Layout((*(d.now for d in delays), *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
     reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
     _require_wired(reads, memory, blocks, delays)

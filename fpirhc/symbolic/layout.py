@@ -47,7 +47,6 @@ class Signal:
         units: one per entry, or one for all; empty: '1'.
         start: first value; empty: zeros.
         kinds: of a memory: one per entry, or one for all; empty: `Kind.STATE`.
-        holds: of a memory: name of the signal whose last value it is; empty: of none.
     """
 
     name: str
@@ -55,7 +54,6 @@ class Signal:
     units: tuple[str, ...] = ()
     start: tuple[float, ...] = ()
     kinds: tuple[Kind, ...] = ()
-    holds: str = ""
 
     @cached_property
     def size(self) -> int:
@@ -206,10 +204,6 @@ class Layout:
             return self._slices[name]
         except (KeyError, TypeError):  # TypeError: a list or a range of numbers
             raise InvalidName(f"signal '{name}' is unknown.{nearest(name, self.names)}") from None
-
-    def holding(self, source: str) -> tuple[str, ...]:
-        """Return the names of all memories that are the last value of a signal."""
-        return tuple(s.name for s in self.signals if s.holds == source)
 
     def start(self) -> np.ndarray:
         """Start values, shape (size,)."""
