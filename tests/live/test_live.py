@@ -116,11 +116,11 @@ def test_tolerance_and_damping_of_the_plans_are_data(compiled):
     paths = ["optimiser.tolerance", "optimiser.damping", "cost.states.q1"]
     ready = simulator(short, damped, compiled=compiled, live=paths)
     plain = ready.run(seed=0)
-    numbers = {"optimiser.tolerance": 1e-9, "optimiser.damping": 0.5, "cost.states.q1": 400.0}
+    numbers = {"optimiser.tolerance": 0.5, "optimiser.damping": 0.5, "cost.states.q1": 400.0}
     for settings in ({}, dict([*numbers.items()][:1]), numbers):
         changed = ready.run(seed=0, settings=settings)
         assert np.array_equal(changed.log, rebuilt(ready, settings, compiled=compiled).log), settings
-        assert np.array_equal(changed["status"], plain["status"]) == (not settings)  # a tolerance of 1e-9 N is not met
+        assert np.array_equal(changed["status"], plain["status"]) == (not settings)  # a loose tolerance is met
     for wrong, words in (({"optimiser.tolerance": 1e-15}, "rounded"), ({"optimiser.damping": -1.0}, "at least 0")):
         with pytest.raises(InvalidValue, match=words):
             ready.run(seed=0, settings=wrong)
