@@ -214,13 +214,15 @@ def _horizon(case: Case) -> Fact | None:
     if horizon is None or bench.controller.planner is None:
         return None
     case.asks_more()
-    own = bench.share(bench.start)
+    short = bench.start.first(bench.cycles // 2)
+    own = bench.share(short)
     if own <= SLIGHT:  # nothing that a longer one could mend
         return Fact(Verdict.YES, {"error": own})
     lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
     longer = replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
     with compiled_plans(yes=False):  # a loop for one run
-        long = bench.share(Bench(replace(bench.problem, horizon=longer), bench.controller).run())
+        longer_one = Bench(replace(bench.problem, horizon=longer), bench.controller)
+        long = bench.share(longer_one.run(cycles=short.cycles))
     better = long < own / WORSE and own - long > SLIGHT
     verdict = Verdict.NO if own > BAD >= long else Verdict.CAUTION if better else Verdict.YES
     return Fact(verdict, {"error": own, "error_with_twice_the_horizon": long})
