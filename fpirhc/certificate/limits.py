@@ -127,8 +127,9 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     plant, planner, deformation = problem.plant, ready.planner, ready.deformation
     if plant.outputs or plant.step is not None or not plant.equations.affine:
         yield "the plant is a map, has outputs, or its response is not affine in the inputs"
-    if problem.disturbances or problem.reality is not None or problem.signals:
-        yield "there are disturbances, signals from outside, or a reality that is not the plant"
+    rated = problem.limits.rates.keys() - {*problem.limits.soft, *problem.limits.prices}
+    if problem.disturbances or problem.reality is not None or problem.signals or rated:
+        yield "there are disturbances, signals from outside, hard limits of rates, or a reality that is not the plant"
     if not problem.sensing.ideal or problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
         yield "state or response are estimated, noisy or late"
     if ready.learns or ready.feeds or ready.deforms != "response":
@@ -136,12 +137,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     if ready.plant_model(problem).exact:
         yield "its model has the exact parameters of every plant, so there is no box to be certified"
     plain = type(deformation) is ModelReferenced and type(deformation.map) is Affine and deformation.map.weights is None
-    if (
-        not plain
-        or np.any(deformation.mirror.cycles)
-        or deformation.mirror.measurement
-        or np.any(deformation.mirror.lags)
-    ):
+    if not plain or not deformation.mirror.bare:
         yield "the deformation must be ModelReferenced(Affine(gain=...)) without dead time, lag, weights or filter"
     if planner is None and tracking_law(ready) is None:
         yield "it has no tracking law"

@@ -52,7 +52,7 @@ def test_plans_with_room_do_not_depend_on_the_plant():
     assert np.abs(one["command"] - two["command"]).max() > 1e-3
     for name in ("planned", "target", "nominal"):
         assert np.array_equal(one[name], two[name])
-    assert np.abs(one["planned.Q1"]).max() <= 4.0 - 0.4 + 1e-9
+    assert np.abs(one["planned.Q1"]).max() <= 4.0 - 0.8 + 1e-9
     without = replace(controller, replanning=replace(controller.replanning, room=None))
     one, two = (fp.simulate(p, without, seed=0) for p in (problem, other))
     assert not np.array_equal(one["planned"], two["planned"])
@@ -166,6 +166,9 @@ def test_what_else_the_theorem_does_not_cover_is_refused():
         fp.certify_limits(replace(problem, disturbances={"q": fp.Noise(0.1)}), controller, mismatch=5)
     with pytest.raises(NotSupported, match="exact parameters of every plant"):
         fp.certify_limits(problem, fp.ExactModel(controller), mismatch=5)
+    rated = replace(problem, limits=fp.Limits(inputs={"F": (-10.0, 10.0)}, rates={"F": (-50.0, 50.0)}))
+    with pytest.raises(NotSupported, match="hard limits of rates"):
+        fp.certify_limits(rated, controller, mismatch=5)
     for ways, words in (
         (fp.FromMeasurement(), "FromPlan"),
         (replace(planned.replanning, room=None), "depend on the plant"),
