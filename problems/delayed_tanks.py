@@ -71,7 +71,7 @@ problem = fp.Problem(
 
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=0.05)  # scale in m/s^2
 increment = fp.Increment(sigmoid, cycles=DEAD_TIME / PERIOD)
-plain = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-2))  # ml/s
+plain = fp.RecedingHorizon(fp.FixedPoint())
 adaptive = fp.RecedingHorizon(plain.optimiser, increment)
 corrected = fp.ByModel(residual_time=5.0)  # s
 
