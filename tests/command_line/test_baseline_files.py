@@ -78,7 +78,7 @@ CHANGES: dict[str, tuple[str, Callable[[dict[str, Any]], object] | tuple[str, st
     "the reference": ("line", ("ca.sin(2 * t)", "ca.sin(3 * t)"), 5, "the problem file is another one"),
     "a comment": ("line", ("import casadi", "# said\nimport casadi"), 0, "metrics hold"),
     "a run that ends": ("line", ("p.k * q.y", "p.k * q.y + 1e-9 * ca.sqrt(0.5001 - q.y)"), 5, "ended early"),
-    "a controller gone": ("line", lambda f: f["controllers"].pop("CTC"), 6, "measure it again: fpirhc accept"),
+    "a controller gone": ("line", lambda f: f["controllers"].pop("CTC"), 6, "has no row of 'CTC'; measure it again"),
     "a list of settings": ("line", lambda f: f.update(controllers=[]), 6, "measure it again: fpirhc accept"),
     "a number of text": (
         "line",
