@@ -236,12 +236,16 @@ class _ReferenceExpansion:
         return slopes
 
     def moved_by(self, inputs: np.ndarray) -> np.ndarray:
-        """Return the most by which finite inputs of this size (nu,) in the first stage move every state, (ns,)."""
-        slope, most = self.b[0] * np.where(np.isfinite(inputs), inputs, 0.0), np.zeros(self.b.shape[1])
+        """Return the most by which finite inputs of this size (nu,) in the first stage move every state, (ns,).
+
+        So many stages count as there are states: then an input has reached what it reaches, and a plant that runs away has not run.
+        """
+        slope = self.b[0] * np.where(np.isfinite(inputs), inputs, 0.0)
+        most = np.abs(slope).max(axis=1, initial=0.0)
         with np.errstate(all="ignore"):
-            for a in (*self.a[1:], None):
+            for a in self.a[1 : self.b.shape[1]]:
+                slope = a @ slope
                 most = np.fmax(most, np.abs(slope).max(axis=1, initial=0.0))
-                slope = slope if a is None else a @ slope
         return np.where(np.isfinite(most), most, 0.0)
 
     def hessian(self) -> np.ndarray:

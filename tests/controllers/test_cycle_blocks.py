@@ -481,7 +481,10 @@ def test_a_form_believes_the_dead_times_that_it_leaves_open(cycles, late, believ
 def test_a_plan_has_its_own_cost_margins_and_share_of_a_stage():
     """Plans every 2 of the 5 cycles of a stage; without a horizon there is the cost alone."""
     cost, margins = fp.Quadratic(states={"a": 3.0}), {"a'": 0.1}
-    own, free = replace(PLANNER, cost=cost, margins=margins), masses(cost=fp.Quadratic(states={"a": 1.0}))
+    own, free = (
+        replace(PLANNER, cost=cost, margins=margins),
+        masses(cost=fp.Quadratic(states={"a": 1.0}), limits=fp.Limits(states={"a'": (-9.0, 9.0)})),
+    )
     assert PLANNER.planned(free) is free
     assert (own.planned(free).cost, own.planned(free).horizon) == (cost, None)
     often, stage = (replace(free, horizon=fp.Horizon(stages=4, step=0.5, replan=r)) for r in (2, "stage"))

@@ -219,6 +219,6 @@ def test_a_box_of_a_plant_has_both():
 
 def test_a_review_is_that_of_other_names():
     shared, other = (fp.review(one, {"FPI": CONTROLLER}, mismatch=10.0, seed=0) for one in (SHARED, OTHER))
-    for ours, theirs in ((shared.problem, other.problem), (shared.controllers["FPI"], other.controllers["FPI"])):
+    for ours, theirs in ((shared.answers[n], other.answers[n]) for n in ("problem", "FPI")):
         assert [one.verdict for one in ours] == [one.verdict for one in theirs]
         assert [list(one.numbers.values()) for one in ours] == [list(one.numbers.values()) for one in theirs]
