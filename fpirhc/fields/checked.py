@@ -181,7 +181,7 @@ class _Arguments:
             yield f"{name}: the values of '{one}' and '{other}' are swapped; write {name}({one}=..., {other}=...)"
             return
         for name in wrong:
-            yield from _mistakes_in(self.expected[name], f"{self.owner.__name__}.{name}", every[name])
+            yield from mistakes_in(self.expected[name], f"{self.owner.__name__}.{name}", every[name])
 
     def _swapped(self, wrong: Sequence[str], values: Mapping[str, object]) -> bool:
         """Whether two values are wrong, and each is what is expected of the other."""
@@ -237,7 +237,8 @@ def _read_annotation(annotation: object, names: Mapping[str, object], own: Mappi
     return expected_by(annotation)
 
 
-def _mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
+def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
+    """Yield what is wrong with a value and its parts; `where` names it."""
     if not expected.fits(value):
         comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
         mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else ""
@@ -245,7 +246,7 @@ def _mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]
         yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
         return
     for place, inner, part in expected.parts(value):
-        yield from _mistakes_in(inner, f"{where}{place}", part)
+        yield from mistakes_in(inner, f"{where}{place}", part)
 
 
 def _mended(expected: Expected, value: object) -> str:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 import contextlib
-import importlib.util
-import linecache
 import sys
 import textwrap
 import traceback
@@ -16,27 +14,18 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import named_in_task
-from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, ProblemFileError, nearest
-from fpirhc.fields.checked import FoundByName, checked_call
-from fpirhc.fields.kinds import call_of, described
+from fpirhc.controllers.contract import named_in_task, without_deformation
+from fpirhc.describe import describe, identity
+from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, NotSupported, ProblemFileError
+from fpirhc.fields.checked import FoundByName, checked_call, mistakes_in
+from fpirhc.fields.kinds import accepts, expected_by
 from fpirhc.fields.user_code import explained
-from fpirhc.problem_files.pairs import not_a_pair
-from fpirhc.problem_files.settings import (
-    TuningSpans,
-    as_declared,
-    check_tuning,
-    current_setting,
-    is_own,
-    of_problem,
-    with_numbers,
-    with_settings,
-)
+from fpirhc.problem_files.settings import TuningSpans, current_setting, is_own, of_problem, with_numbers, with_settings
 from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.summary import line, table
-from fpirhc.task.cases import Cases
+from fpirhc.task.cases import Cases, as_declared
 from fpirhc.task.problem import Problem, problem_facts
 
 
@@ -121,48 +110,82 @@ def load_problem(name_or_path: str | Path) -> Task:
     """
     path = find_problem(str(name_or_path))
     module = _imported(path)
-    mistakes = Mistakes(f"problem file '{path.name}'")
-    problem, controllers = _problem(module, mistakes), _controllers(module, mistakes)
-    headline = _headline(module, controllers, mistakes)
-    tuning, own = getattr(module, "tuning", {}), getattr(module, "metrics", ())
-    if not isinstance(own, Sequence) or not all(isinstance(metric, Metric) for metric in own):
-        mistakes.add(
-            f"{_line_of(module, 'metrics')}metrics must be a sequence of fpirhc.Metric, metrics = (fpirhc.Metric(...),)"
-        )
-    main = getattr(module, "headline_metric", None)
-    if main is not None and not isinstance(main, str):
-        mistakes.add(f"{_line_of(module, 'headline_metric')}expected the name of a metric, got {described(main)}")
-    cases = getattr(module, "cases", None)
-    if cases is not None and not isinstance(cases, Cases):
-        form = "cases = fpirhc.Cases({'heavy': {'exact.mass': 2.0}})"
-        mistakes.add(f"{_line_of(module, 'cases')}expected {form}, got {described(cases)}")
-    pictures = getattr(module, "pictures", ())
-    if not isinstance(pictures, Sequence):
-        mistakes.add(f"{_line_of(module, 'pictures')}expected a sequence of pictures, got {described(pictures)}")
-        pictures = ()
-    _check_pictures(tuple(pictures), controllers, mistakes)
-    if not isinstance(tuning, Mapping):
-        expected = "{'controller': {'deformation.gain': Span(low, high)}}"
-        mistakes.add(f"{_line_of(module, 'tuning')}expected {expected}, got {described(tuning)}")
     try:
+        mistakes = Mistakes(f"problem file '{path.name}'")
+        facts = _defined(module, mistakes)
         mistakes.raise_if_any()
-        check_tuning(tuning, controllers)
-        metrics = with_own_metrics(own)
-        if (
-            main is not None
-            and main != RELATIVE_ERROR
-            and not any(f"{main}.".startswith(f"{m.name}.") for m in metrics)
-        ):
-            known = nearest(main, [RELATIVE_ERROR, *(m.name for m in metrics)])
-            raise InvalidName(f"{_line_of(module, 'headline_metric')}metric '{main}' is unknown.{known}")
-        assert problem is not None
-        if cases is not None:
-            cases.check(problem)
+        _check_together(module, facts, mistakes)
+        mistakes.raise_if_any()
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    facts = (problem, controllers, headline, tuning, metrics, tuple(pictures), cases, main)
-    return Task(path.stem, path, title, description.strip(), *facts)
+    return Task(path.stem, path, title, description.strip(), **facts)
+
+
+_NEEDED = {"problem": "fpirhc.Problem(...)", "controllers": "{'name': fpirhc.ComputedTorque(...), ...}"}
+_KINDS = {
+    "problem": expected_by(Problem),
+    "controllers": expected_by(Mapping[str, Controller]),
+    "headline": expected_by(tuple[str, str]),
+    "tuning": expected_by(Mapping[str, TuningSpans]),
+    "metrics": expected_by(Sequence[Metric]),
+    "pictures": expected_by(Sequence[Picture]),
+    "cases": expected_by(Cases),
+    "headline_metric": expected_by(str),
+}
+
+
+def _defined(module: ModuleType, mistakes: Mistakes) -> dict[str, Any]:
+    """What a file defines for its task, by name, with the mistakes in each value by itself."""
+    facts = {name: value for name in _KINDS if (value := getattr(module, name, None)) is not None}
+    for name, form in _NEEDED.items():
+        if name not in facts or (isinstance(facts[name], Mapping) and not facts[name]):
+            others = [other for other, value in vars(module).items() if accepts(_KINDS[name], value) and value]
+            mend = f"; '{others[0]}' is one, so call it '{name}'" if others else ", outside every function"
+            mistakes.add(f"it must define {name} = {form}{mend}")
+    for name, value in facts.items():
+        for mistake in mistakes_in(_KINDS[name], name, value):
+            mistakes.add(f"{_line_of(module, name)}{mistake}")
+    return {n: tuple(value) if n in ("headline", "pictures") else value for n, value in facts.items()}
+
+
+def _check_together(module: ModuleType, facts: dict[str, Any], mistakes: Mistakes) -> None:
+    """Add the mistakes of values that do not fit each other; the metrics become all those of the problem."""
+    controllers, headline = facts["controllers"], facts.get("headline", ())
+    where = _line_of(module, "headline") if headline else ""
+    mistakes.unknown(f"{where}headline: controller", headline, controllers)
+    pairs = [(pair_of(controllers, name), name) for name, one in controllers.items() if one.deformation.adapts]
+    if headline and mistakes.none and headline not in pairs:
+        known = ", ".join(str(pair) for pair in pairs if pair[0]) or "none is here, so leave headline out"
+        mistakes.add(f"{where}headline {headline} is no pair of a controller and the same one with adaptation: {known}")
+    for picture in facts.get("pictures", ()):
+        mistakes.unknown(f"picture '{picture.title}': controller", picture.controllers, controllers)
+    spans = facts.get("tuning", {})
+    mistakes.unknown("tuning: controller", spans, controllers)
+    for owner in (name for name in spans if name in controllers):
+        for path in spans[owner]:
+            with mistakes.caught(f"tuning: controller '{owner}': "):
+                current_setting(controllers[owner], path)
+    with mistakes.caught():
+        facts["metrics"] = with_own_metrics(facts.get("metrics", ()))
+        names = [RELATIVE_ERROR, *(metric.name for metric in facts["metrics"])]
+        main = facts.get("headline_metric", RELATIVE_ERROR)
+        if not any(f"{main}.".startswith(f"{name}.") for name in names):
+            mistakes.unknown(f"{_line_of(module, 'headline_metric')}metric", [main], names)
+    if "cases" in facts:
+        with mistakes.caught():
+            facts["cases"].check(facts["problem"])
+
+
+def pair_of(controllers: Mapping[str, Controller], name: str) -> str | None:
+    """Return the controller with the same settings and no adaptation; None without one."""
+    try:
+        wanted = without_deformation(controllers[name])
+    except NotSupported:
+        return None
+    plain = {n: c for n, c in controllers.items() if not c.deformation.adapts}
+    # One whose formulas are the same too comes before one whose settings are.
+    return next((n for said in (identity, describe) for n, c in plain.items() if said(c) == said(wanted)), None)
 
 
 def in_case(task: Task, name: str) -> Task:
@@ -182,92 +205,33 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
     """
     chosen = {name: one for name, one in task.controllers.items() if not names or name in names}
     shared = {path for path in values if of_problem(task.problem, path)}
-    read = {path for path in shared if not chosen or not all(is_own(one, path) for one in chosen.values())}
-    problem, controllers = with_numbers(task.problem, {path: values[path] for path in values if path in read}), {}
-    lacking: dict[str, list[InvalidName]] = {path: [] for path in values if path not in shared}
+    read = {path: values[path] for path in shared if not chosen or not all(is_own(c, path) for c in chosen.values())}
+    problem, controllers = with_numbers(task.problem, read), dict(task.controllers)
+    lacked: dict[str, list[InvalidName]] = {path: [] for path in values}
     for name, controller in chosen.items():
-        has = {path: values[path] for path in shared if is_own(controller, path)}
-        for path, lacked in lacking.items():
+        own: dict[str, Any] = {}
+        for path in (path for path in values if path not in shared or is_own(controller, path)):
             try:
                 current_setting(controller, path)
-                has[path] = values[path]
+                own[path] = as_declared(controller, path, values[path])
             except InvalidName as error:
-                lacked.append(error)
-        controllers[name] = with_settings(controller, as_declared(controller, has))
-    for path, lacked in lacking.items():
-        if chosen and len(lacked) == len(chosen):
+                lacked[path].append(error)
+        controllers[name] = with_settings(controller, own)
+    for path, errors in lacked.items():
+        if chosen and len(errors) == len(chosen):
             if path in task.problem.moved.parameters:
                 raise InvalidName(
                     f"setting '{path}': write exact.{path} for the plant, approximate.{path} for the model"
                 )
-            raise max(lacked, key=lambda error: "Did you mean" in str(error))
-    return replace(task, problem=problem, controllers={**task.controllers, **controllers})
-
-
-def _problem(module: ModuleType, mistakes: Mistakes) -> Problem | None:
-    problem = getattr(module, "problem", None)
-    if isinstance(problem, Problem):
-        return problem
-    others = [name for name, value in vars(module).items() if isinstance(value, Problem)]
-    named = f"; '{others[0]}' is one, so call it 'problem'" if others else ""
-    outside = ", outside every function"
-    got = f", got {described(problem)}" if hasattr(module, "problem") else "" if others else outside
-    mistakes.add(f"{_line_of(module, 'problem')}it must define problem = fpirhc.Problem(...){got}{named}")
-    return None
-
-
-def _controllers(module: ModuleType, mistakes: Mistakes) -> Mapping[str, Controller]:
-    controllers = getattr(module, "controllers", None)
-    where = _line_of(module, "controllers")
-    if not isinstance(controllers, Mapping) or not controllers:
-        got = f", got {described(controllers)}" if hasattr(module, "controllers") else _called_otherwise(module)
-        mistakes.add(f"{where}it must define controllers = {{'name': fpirhc.ComputedTorque(...), ...}}{got}")
-        return {}
-    for name, controller in controllers.items():
-        if not isinstance(name, str) or not name:
-            mistakes.add(f"{where}the name of a controller must be a text, got {described(name)}")
-        if not isinstance(controller, Controller):
-            mend = f"; write {call_of(controller)}" if isinstance(controller, type) else ""
-            mistakes.add(f"{where}controllers['{name}'] must be a controller, got {described(controller)}{mend}")
-    return controllers
-
-
-def _called_otherwise(module: ModuleType) -> str:
-    """A mapping of controllers under another name."""
-    for name, value in vars(module).items():
-        if isinstance(value, Mapping) and value and all(isinstance(one, Controller) for one in value.values()):
-            return f"; '{name}' is such a mapping, so call it 'controllers'"
-    return ""
-
-
-def _headline(module: ModuleType, controllers: Mapping[str, Controller], mistakes: Mistakes) -> tuple[str, str] | None:
-    headline = getattr(module, "headline", None)
-    if headline is None:
-        return None
-    if not isinstance(headline, Sequence) or isinstance(headline, str) or len(headline) != 2:
-        mistakes.add(
-            f"{_line_of(module, 'headline')}headline must be a pair of names (without adaptation, with), got {described(headline)}"
-        )
-        return None
-    pair, line = (headline[0], headline[1]), _line_of(module, "headline")
-    if controllers:  # else that there are none is the mistake
-        mistakes.unknown(f"{line}headline: controller", pair, controllers)
-    if mistakes.none and (wrong := not_a_pair(controllers, pair)):
-        mistakes.add(f"{line}{wrong}")
-    return pair
-
-
-def _check_pictures(pictures: tuple[object, ...], controllers: Mapping[str, object], mistakes: Mistakes) -> None:
-    for picture in pictures:
-        if not isinstance(picture, Picture):
-            mistakes.add(f"pictures must hold pictures such as Portrait(...), got {picture!r}")
-        else:
-            mistakes.unknown(f"picture '{picture.title}': controller", picture.controllers, controllers)
+            raise max(errors, key=lambda error: "Did you mean" in str(error))
+    return replace(task, problem=problem, controllers=controllers)
 
 
 def _imported(path: Path) -> ModuleType:
     """Return the module of a problem file."""
-    module = _empty(path)
+    module = ModuleType(f"fpirhc_problem_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module
     try:
         with _neighbours(path):
             # Bytecode would be that of the last second: it is told apart by the file's size and whole seconds.
@@ -276,35 +240,22 @@ def _imported(path: Path) -> ModuleType:
         source, name = (error.text or "").strip(), Path(error.filename or path).name
         raise ProblemFileError(f"{name}, line {error.lineno}: {error.msg}\n    {source}") from None
     except SystemExit as error:
-        raise ProblemFileError(_message(path, error, "the file ends the program; leave the exit out")) from None
+        raise _at_its_line(path, error, "the file ends the program; leave the exit out") from None
     except Exception as error:  # noqa: BLE001 -- every error of a user's file is shown with its line
-        raise ProblemFileError(_message(path, error, _cause_of(error))) from None
+        raise _at_its_line(path, error, _cause_of(error)) from None
     return module
 
 
 def _line_of(module: ModuleType, name: str) -> str:
     """Return "line 12: " of the last assignment of a name in a module's file; empty where there is none."""
-    try:
-        tree = ast.parse(Path(module.__file__ or "").read_text(encoding="utf-8"))
-    except (OSError, SyntaxError, ValueError):
-        return ""
+    tree = ast.parse(Path(module.__file__ or "").read_bytes())
+    assigned = (one for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) for one in ast.walk(node))
     lines = [
-        target.lineno
-        for node in tree.body
-        for target in (node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)])
-        if isinstance(target, ast.Name) and target.id == name
+        one.lineno
+        for one in assigned
+        if isinstance(one, ast.Name) and one.id == name and isinstance(one.ctx, ast.Store)
     ]
     return f"line {lines[-1]}: " if lines else ""
-
-
-def _empty(path: Path) -> ModuleType:
-    """The module of a file before its first line."""
-    spec = importlib.util.spec_from_file_location(f"fpirhc_problem_{path.stem}", path)
-    if spec is None:
-        raise ProblemFileError(f"'{path}' is not a Python file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    return module
 
 
 @contextlib.contextmanager
@@ -325,14 +276,11 @@ def _neighbours(path: Path) -> Iterator[None]:
                 del sys.modules[name]
 
 
-def _message(path: Path, error: BaseException, cause: str) -> str:
-    """Return "file.py, line 12: source" of the innermost line of the file in the traceback, and the cause below it."""
-    line = _line(path, error)
-    return f"{_place(path, line) if line else path.name}\n{_indented(cause)}"
-
-
-def _indented(cause: str) -> str:
-    return textwrap.indent(cause, "    ")
+def _at_its_line(path: Path, error: BaseException, cause: str) -> ProblemFileError:
+    """Return the error "file.py, line 12: source" of the innermost line of the file, with the cause below it."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
+    place = f"{path.name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else path.name
+    return ProblemFileError(f"{place}\n{textwrap.indent(cause, '    ')}")
 
 
 def _cause_of(error: Exception) -> str:
@@ -346,13 +294,3 @@ def _cause_of(error: Exception) -> str:
         return cause
     # Python's own last line also has the nearest name that it knows.
     return "".join(traceback.TracebackException.from_exception(error).format_exception_only()).strip()
-
-
-def _line(path: Path, error: BaseException) -> int | None:
-    """The innermost line of the file in the traceback."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if Path(f.filename).resolve() == path.resolve()]
-    return frames[-1].lineno if frames else None
-
-
-def _place(path: Path, line: int) -> str:
-    return f"{path.name}, line {line}: {linecache.getline(str(path), line).strip()}"

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.fields.checked import expects_whole_number
-from fpirhc.fields.kinds import finite_number
-from fpirhc.symbolic.layout import Signal
+from fpirhc.fields.checked import Checked
+from fpirhc.fields.kinds import Finite
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
-from fpirhc.task.cases import PARAMETERS, START, Cases
+from fpirhc.task.cases import PARAMETERS, START, Cases, check_change
 from fpirhc.task.problem import Problem
 
 Values = Mapping[str, float]
@@ -38,10 +37,6 @@ def with_settings(owner: Owner, values: Values) -> Owner:
     changed = owner
     for path, value in values.items():
         current_setting(owner, path)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InvalidValue(f"setting '{path}': expected a number, got {value!r}")
-        if is_whole(owner, path) and not isinstance(value, int):
-            raise InvalidValue(f"setting '{path}': expected a whole number, got {value!r}")
         changed = changed_at(changed, path, value)
     return changed
 
@@ -56,11 +51,16 @@ def of_problem(problem: Problem, path: str) -> str | None:
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
     """Return a problem with other numbers at paths of a case, see `Cases`, or as `of_problem` takes them."""
-    changes = {of_problem(problem, path) or path: value for path, value in values.items()}
-    return Cases({_SET: changes}).problem(_SET, problem) if values else problem
-
-
-_SET = "--set"
+    if not values:
+        return problem
+    written = {of_problem(problem, path) or path: path for path in values}
+    changes = {path: values[own] for path, own in written.items()}
+    case, mistakes = Cases({"--set": changes}), Mistakes("--set")
+    for path, own in written.items():  # a mistake names a path as it was written
+        with mistakes.caught(f"'{own}': "):
+            check_change(problem, changes, path)
+    mistakes.raise_if_any()
+    return case.problem("--set", problem)
 
 
 def is_own(controller: Controller, path: str) -> bool:
@@ -68,31 +68,17 @@ def is_own(controller: Controller, path: str) -> bool:
     return getattr(controller, path.partition(".")[0], None) is not None
 
 
-def as_declared(controller: Controller, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return numbers of settings, as whole numbers where the controller has such."""
-    plain = {p for p, v in values.items() if isinstance(v, tuple) or v % 1 or not is_whole(controller, p)}
-    return {p: v if p in plain else int(v) for p, v in values.items()}
-
-
 def unit_of_setting(path: str, problem: Problem) -> str:
     """Return the unit of a setting of a controller or of the problem, '' where its kind does not say it."""
     word, _, name = path.partition(".")
     if word in PARAMETERS:
         return (problem.moved if word == "exact" else problem.plant).parameters[name].unit
-    if word == START:
-        return _units(problem.plant.state)[name]
-    if word == "limits":
-        kind, _, name = name.partition(".")
-        units = _units(problem.plant.input if kind == "inputs" else problem.plant.state)
-        return units.get(name) or units.get(name.rpartition(".")[0], "")
-    return problem.time_unit if word in _TIMES else ""
-
-
-_TIMES = ("dead_time", "duration", "measure_from", "period")  # fields of a problem
-
-
-def _units(signal: Signal) -> dict[str, str]:
-    return dict(zip(signal.elements, signal.entry_units, strict=True))
+    if word in ("dead_time", "duration", "measure_from", "period"):
+        return problem.time_unit
+    name = name.removeprefix("inputs.").removeprefix("states.") if word == "limits" else name
+    signals = (problem.plant.state, problem.plant.input) if word in (START, "limits") else ()
+    units = {n: u for one in signals for n, u in zip(one.elements, one.entry_units, strict=True)}
+    return units.get(name) or units.get(name.rpartition(".")[0], "")  # 'Q1.1' is an end of Q1
 
 
 def current_setting(owner: Controller | Problem, path: str) -> float:
@@ -108,15 +94,8 @@ def current_setting(owner: Controller | Problem, path: str) -> float:
     return value
 
 
-def is_whole(owner: Controller | Problem, path: str) -> bool:
-    """Whether the setting at a path is declared as a whole number."""
-    parent, _, name = path.rpartition(".")
-    part: Any = content_at(owner, parent) if parent else owner
-    return is_dataclass(part) and expects_whole_number(type(part), name)
-
-
 @dataclass(frozen=True)
-class Span:
+class Span(Checked):
     """Numbers from `low` to `high`, all equally likely at first.
 
     Args:
@@ -127,19 +106,24 @@ class Span:
         InvalidValue: an end that is not finite, or a low end that is not below the high end.
     """
 
-    low: float
-    high: float
+    low: Finite
+    high: Finite
 
     def __post_init__(self) -> None:
-        _check(self, "Span")
+        if not self.low < self.high:
+            raise InvalidValue(f"{self}: expected the smaller number first")
 
     def number(self, share: float) -> float:
         """Return the number at `share` (0 to 1) of the way from low to high."""
-        return _rounded(self.low + share * (self.high - self.low), self.low, self.high)
+        value = self._between(share)
+        return min(max(float(f"{value:.{_DIGITS}g}"), self.low), self.high)
+
+    def _between(self, share: float) -> float:
+        return self.low + share * (self.high - self.low)
 
 
 @dataclass(frozen=True)
-class LogSpan:
+class LogSpan(Span):
     """Numbers of one sign whose logarithms are equally likely at first, for settings such as 0.01, 0.1 or 1.
 
     Args:
@@ -150,50 +134,13 @@ class LogSpan:
         InvalidValue: an end that is not finite, a low end that is not below the high end, or ends of different sign.
     """
 
-    low: float
-    high: float
-
     def __post_init__(self) -> None:
-        _check(self, "LogSpan")
+        super().__post_init__()
         if self.low * self.high <= 0:
-            raise InvalidValue(
-                f"LogSpan({self.low!r}, {self.high!r}): both ends must have the same sign; use Span across zero"
-            )
+            raise InvalidValue(f"{self}: both ends must have the same sign; use Span across zero")
 
-    def number(self, share: float) -> float:
-        """Return the number at `share` (0 to 1) of the way from low to high."""
-        value = math.copysign(
-            math.exp(math.log(abs(self.low)) * (1 - share) + math.log(abs(self.high)) * share), self.low
-        )
-        return _rounded(value, self.low, self.high)
+    def _between(self, share: float) -> float:
+        return math.copysign(abs(self.low) ** (1 - share) * abs(self.high) ** share, self.low)
 
 
-TuningSpans = Mapping[str, Span | LogSpan]
-
-
-def check_tuning(tuning: Any, controllers: Mapping[str, Controller]) -> None:
-    """Raise if a problem file's `tuning` is not {controller: {path: Span or LogSpan}} of controllers and settings that exist."""
-    mistakes = Mistakes("tuning")
-    if not isinstance(tuning, Mapping) or not all(isinstance(spans, Mapping) for spans in tuning.values()):
-        mistakes.add("expected {'controller': {'deformation.gain': fpirhc.Span(low, high)}}")
-        mistakes.raise_if_any()
-    mistakes.unknown("controller", tuning, controllers)
-    for name in (n for n in tuning if n in controllers):
-        for path, span in tuning[name].items():
-            if not isinstance(span, Span | LogSpan):
-                mistakes.add(
-                    f"controller '{name}', '{path}': expected Span(low, high) or LogSpan(low, high), got {span!r}"
-                )
-            with mistakes.caught(f"controller '{name}': "):
-                current_setting(controllers[name], str(path))
-    mistakes.raise_if_any()
-
-
-def _check(span: Span | LogSpan, kind: str) -> None:
-    numbers = all(finite_number(v) for v in (span.low, span.high))
-    if not numbers or not span.low < span.high:
-        raise InvalidValue(f"{kind}({span.low!r}, {span.high!r}): expected two finite numbers, the smaller one first")
-
-
-def _rounded(value: float, low: float, high: float) -> float:
-    return min(max(float(f"{value:.{_DIGITS}g}"), low), high)
+TuningSpans = Mapping[str, Span]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from difflib import get_close_matches
 from importlib.util import find_spec
+from os.path import exists, isdir, isfile
 from pathlib import Path
 from typing import Any
 
@@ -22,20 +23,16 @@ def shipped_folders() -> list[Path]:
 
 def shipped_groups() -> dict[str, dict[str, Path]]:
     """Return the shipped problems by group, name -> path: first examples, the gallery, and those of other packages' plants."""
-    return {title: _problems_in(subfolder) for title, subfolder in GROUPS.items()}
+    groups: dict[str, dict[str, Path]] = {title: {} for title in GROUPS}
+    for title, subfolder in GROUPS.items():
+        for path in (path for folder in shipped_folders() for path in sorted((folder / subfolder).glob("[!_]*.py"))):
+            groups[title].setdefault(path.stem, path)
+    return groups
 
 
 def shipped_problems() -> dict[str, Path]:
     """Return the shipped problems that need no other package: name -> path."""
     return {name: path for group in shipped_groups().values() for name, path in group.items() if not needed(path)}
-
-
-def _problems_in(subfolder: str) -> dict[str, Path]:
-    paths: dict[str, Path] = {}
-    for path in (path for folder in shipped_folders() for path in sorted((folder / subfolder).glob("*.py"))):
-        if not path.name.startswith("_"):
-            paths.setdefault(path.stem, path)
-    return paths
 
 
 def needed(path: Path) -> tuple[str, ...]:
@@ -61,42 +58,31 @@ def missing(path: Path) -> str:
 
 
 def title_of(path: Path) -> str:
-    """First line of a problem file's docstring, without running the file."""
-    try:
-        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-    except (OSError, SyntaxError, ValueError):
-        return ""
-    return (text or "").strip().partition("\n")[0]
+    """First line of a shipped problem's docstring, without running the file."""
+    return (ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or "").partition("\n")[0]
 
 
 def find_problem(name_or_path: str) -> Path:
     """Return the path of a shipped problem or of a user's file."""
     path = Path(name_or_path)
-    try:
-        path.exists()
-    except OSError as error:  # such as a name that is too long
-        raise ProblemFileError(f"no file at '{name_or_path}': {error.strerror}") from None
     shipped = {name: path for group in shipped_groups().values() for name, path in group.items()}
-    if path.suffix == ".py" and path.is_file():
+    if path.suffix == ".py" and isfile(path):  # not the path's own method, which raises for a name that is too long
         return path
     if name_or_path in shipped:
         return shipped[name_or_path]
-    if path.exists():
-        what = "a folder" if path.is_dir() else "not a Python file"
-        raise ProblemFileError(f"'{name_or_path}' is {what}; a problem file ends in .py{_files_in(path)}")
-    if path.with_suffix(".py").is_file():
-        raise ProblemFileError(f"problem '{name_or_path}' is unknown; for the file write '{path.with_suffix('.py')}'")
-    beside = [str(one) for one in sorted(path.parent.glob("*.py"))] if path.suffix == ".py" else []
-    what = (
+    beside = [str(one) for one in sorted((path if isdir(path) else path.parent).glob("*.py")) if isfile(one)]
+    if exists(path):
+        what = "a folder" if isdir(path) else "not a Python file"
+        such = f", such as {', '.join(beside[:_OFFERED])}" if isdir(path) and beside else ""
+        raise ProblemFileError(f"'{name_or_path}' is {what}; a problem file ends in .py{such}")
+    named = (
         f"no file at '{name_or_path}'"
         if path.suffix or path.parent != Path()
         else f"problem '{name_or_path}' is unknown"
     )
-    near = get_close_matches(name_or_path, beside, n=1) or get_close_matches(path.stem, shipped, n=1, cutoff=0.5)
+    near = (
+        get_close_matches(name_or_path, beside, n=1) if path.suffix else [one for one in beside if one == f"{path}.py"]
+    )
+    near = near or get_close_matches(path.stem, shipped, n=1, cutoff=0.5)
     hint = f" Did you mean '{near[0]}'?" if near else ""
-    raise ProblemFileError(f"{what}.{hint} Give the path of a problem file, or a name from 'fpirhc list'")
-
-
-def _files_in(folder: Path) -> str:
-    files = [str(one) for one in sorted(folder.glob("*.py")) if one.is_file()][:_OFFERED] if folder.is_dir() else []
-    return f", such as {', '.join(files)}" if files else ""
+    raise ProblemFileError(f"{named}.{hint} Give the path of a problem file, or a name from 'fpirhc list'")

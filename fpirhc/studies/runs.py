@@ -23,7 +23,7 @@ from fpirhc.controllers.contract import believing, resolved
 from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
 from fpirhc.problem_files.problem_file import Task, load_problem
-from fpirhc.problem_files.settings import as_declared, current_setting, unit_of_setting, with_settings
+from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
 from fpirhc.simulation.metrics.base import Metric, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator, with_judgements
@@ -32,6 +32,7 @@ from fpirhc.studies.comparison.verdict import left_alone
 from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.view import Progress, versions
 from fpirhc.summary import in_units
+from fpirhc.task.cases import as_declared
 from fpirhc.task.problem import Problem
 
 BLOCK = 64  # runs of a job at most
@@ -62,13 +63,13 @@ class Runner:
         for one in variants:
             yield self._row(one, self._own(one.settings))
 
-    def _own(self, settings: Mapping[str, float]) -> dict[str, float]:
+    def _own(self, settings: Mapping[str, float]) -> dict[str, Any]:
         own = {}
         for path, value in settings.items():
             with contextlib.suppress(FpirhcError):
                 current_setting(self._controller, path)
-                own[path] = value
-        return as_declared(self._controller, own)
+                own[path] = as_declared(self._controller, path, value)
+        return own
 
     def _row(self, one: Variant, own: Mapping[str, float]) -> Row:
         row: Row = {"controller": self._name, "variant": one.name, "group": one.group, "seed": one.seed, **one.numbers}

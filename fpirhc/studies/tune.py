@@ -17,13 +17,14 @@ from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting, is_whole, with_settings
+from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting, with_settings
 from fpirhc.studies.comparison.compare import check_gains, harm_of_adaptation, select
 from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.runs import Runner
 from fpirhc.studies.variants import Draws, Variant, Variants
 from fpirhc.studies.view import Progress
 from fpirhc.summary import written_out
+from fpirhc.task.cases import is_whole
 
 _STARTS = 10  # first trials, which are random
 

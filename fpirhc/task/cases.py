@@ -143,7 +143,7 @@ class Cases(Checked):
         for name, changes in self.changes.items():
             for path in (p for p in changes if p not in (*unknown, _GROUP, _SEED)):
                 try:
-                    _check_change(problem, changes, path)
+                    check_change(problem, changes, path)
                 except FpirhcError as error:
                     if isinstance(error, InvalidName):
                         unknown.add(path)
@@ -158,7 +158,7 @@ def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     """The problem with all changes but those of exact parameters."""
     for path, value in changes.items():
         if _word(path) not in (*_WORDS, _GROUP, _SEED):
-            problem = changed_at(problem, path, _as_declared(problem, path, value))
+            problem = changed_at(problem, path, as_declared(problem, path, value))
     model = {name: value for word in (_APPROXIMATE, _KNOWN) for name, value in _named(changes, word).items()}
     start = _named(changes, START)
     if model:
@@ -170,12 +170,16 @@ def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     return replace(problem, start={**problem.start, **start}) if start else problem
 
 
-def _as_declared(problem: Problem, path: str, value: object) -> object:
-    """A number of a table as the field declares it."""
+def is_whole(owner: object, path: str) -> bool:
+    """Whether the number at a path of a problem or a controller is declared as a whole one."""
     parent, _, name = path.rpartition(".")
-    owner = content_at(problem, parent, "the problem") if parent else problem
-    whole = is_dataclass(owner) and expects_whole_number(type(owner), name)
-    return int(value) if whole and isinstance(value, float) and value.is_integer() else value
+    part = content_at(owner, parent) if parent else owner
+    return is_dataclass(part) and expects_whole_number(type(part), name)
+
+
+def as_declared(owner: object, path: str, value: object) -> object:
+    """Return a number of a table or a command as the field at its path declares it."""
+    return int(value) if isinstance(value, float) and value.is_integer() and is_whole(owner, path) else value
 
 
 def _word(path: str) -> str:
@@ -212,7 +216,7 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
             yield f"'{other}' and '{path}' set the same number; leave one of them out"
 
 
-def _check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
+def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
     """Raise where one change does not fit."""
     word, _, name = path.partition(".")
     if word in _WORDS and not name:

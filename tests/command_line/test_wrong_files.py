@@ -195,10 +195,11 @@ class of another tool
     fpirhc has no name 'MPC'. Did you mean 'RecedingHorizon'? ... more.
 one controller
   {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> fp.RecedingHorizon(optimiser)
-    line 36: it must define controllers = {'name': fpirhc.ComputedTorque(...), ...}, got a value of the class RecedingHorizon
+    line 36: controllers: expected {name: a Controller}, got a value of the class RecedingHorizon; write {'NAME':
+    RecedingHorizon(...)}
 controllers under another name
   controllers = { -> controller = {
-    'controller' is such a mapping, so call it 'controllers'
+    'controller' is one, so call it 'controllers'
 parenthesis that stays open
   reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}), ->
       reference=fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)},
@@ -234,7 +235,7 @@ weights of states behind an output
 WRONG_TANKS = """
 start outside the limits
   start={"h1": 1.0 -> start={"h1": 3.0
-    no Do states, rates and paths keep their limits? ... h1 beyond its limit
+    no Do states, rates and paths keep their limits? ... (h1, beyond 0.50
 limits reversed
   "pump1": (0.0, 2.0) -> "pump1": (2.0, 0.0)
   {"h1": (0.0, 2.0)} -> {"h1": (2.0, 0.0)}
@@ -283,7 +284,7 @@ OTHERS = {
         PENDULUM,
         "controllers = {",
         'headline = ("RHC+FPI", "RHC")\ncontrollers = {',
-        "headline ('RHC+FPI', 'RHC') is no pair: expected a controller and the same one with adaptation; write ('RHC', 'RHC+FPI')",
+        "headline ('RHC+FPI', 'RHC') is no pair of a controller and the same one with adaptation: ('RHC', 'RHC+FPI')",
     ),
     "mistakes all over the file": Wrong(
         PENDULUM,
@@ -342,7 +343,7 @@ FILES = changed(PENDULUM, WRONG_PENDULUM) | changed(REACTOR, WRONG_REACTOR) | ch
 REFUSED = """
 compare nofile => problem 'nofile' is unknown. Give the path of a problem file, or a name from 'fpirhc list'
 compare mien.py => no file at 'mien.py'. Did you mean 'mine.py'?
-compare mine => problem 'mine' is unknown; for the file write 'mine.py'
+compare mine => problem 'mine' is unknown. Did you mean 'mine.py'?
 compare Two_Mass => Did you mean 'two_mass'?
 compare . => '.' is a folder; a problem file ends in .py, such as mine.py, two_mess.py
 compare notes.txt => 'notes.txt' is not a Python file; a problem file ends in .py

@@ -107,7 +107,7 @@ pictures = (%s,)
 @pytest.mark.parametrize(
     ("written", "message"),
     [
-        ("'phase'", r"pictures must hold pictures such as Portrait\(\.\.\.\), got 'phase'"),
+        ("'phase'", r"line 6: pictures\[0\]: expected a Picture, got the text 'phase'"),
         ("fp.Portrait('p', x='state.q', y='state.q', controllers=('CTX',))", r"picture 'p': controller 'CTX'.*CTC"),
     ],
 )

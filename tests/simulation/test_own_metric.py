@@ -12,7 +12,7 @@ from fpirhc.simulation.metrics import base, entries
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("metrics = ('overshoot',)", r"metrics must be a sequence of fpirhc\.Metric"),
+        ("metrics = ('overshoot',)", r"line \d+: metrics\[0\]: expected a Metric, got the text 'overshoot'"),
         ("headline_metric = 'rms_eror.y'", r"line \d+: metric 'rms_eror.y' is unknown\. Did you mean 'rms_error'"),
     ],
 )

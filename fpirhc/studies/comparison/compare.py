@@ -18,8 +18,7 @@ from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, ne
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.motion import with_space
-from fpirhc.problem_files.pairs import pair_of
-from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.hard_limits import hard_limits
