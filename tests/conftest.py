@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 
 import pytest
 
 os.environ.setdefault("FPIRHC_CFLAGS", "-O0")
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in the background of a shell; tests interrupt processes
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 AS_SHIPPED = (
     "tests/export/",
     "tests/symbolic/",

@@ -63,6 +63,7 @@ class Run(FoundByName):
 
     def __post_init__(self) -> None:
         """A log that is not finite is no finished run, whoever made it."""
+        super().__post_init__()
         if self.stop is None and not np.isfinite(self.log).all():
             row, column = (int(k) for k in np.argwhere(~np.isfinite(self.log))[0])
             where = f"'{self.layout.columns[column]}' is not finite in cycle {row}"

@@ -498,9 +498,10 @@ class Road:
         return self.measured()
 
     def step(self, time: float, command: np.ndarray) -> list[float]:
-        """Hold the rate for a minute."""
-        middle = time + self.problem.period / 2
-        for _ in range(6):
+        """Hold the rate for a minute; the demand is that of each of its steps."""
+        steps = 6
+        for j in range(steps):
+            middle = time + (j + 0.5) / steps * self.problem.period
             demands = 2500 + 80 * np.sin(2 * np.pi * middle / 1.7), 1100.0
             self.state = by_hand(self.state, float(command[0]), demands)
         return self.measured()

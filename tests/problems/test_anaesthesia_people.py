@@ -94,21 +94,21 @@ def own_loop(name: str, law: Any, cycles: int) -> np.ndarray:
 
 
 class InConcentrations:
-    """The plain cascade in mg/l: z = target in force - gain (filtered z(bis) - z(50)), kept from 0.5 to 12 mg/l."""
+    """The plain cascade: the map takes .4 of the filtered error off the target in force, in mg/l; shifts of the target are of bis."""
 
     def __init__(self) -> None:
-        self.shifts, self.error, self.begun, self.wanted = [0.0] * 12, 0.0, False, self.converted(50.0)
-        self.in_force = self.converted(92.0) - self.wanted
+        self.shifts, self.error, self.begun = [0.0] * 12, 0.0, False
+        self.in_force = 92.0 - 50.0
 
     def converted(self, bis: float) -> float:
         return 4.53 * (92 / np.clip(bis, 2.0, 91.5) - 1) ** (1 / 1.57)
 
     def __call__(self, bis: float) -> float:
         if self.begun:  # the first cycle has no response to a command
-            self.error = 0.85 * self.error + 0.15 * (self.converted(bis) - self.wanted)
+            self.error = 0.85 * self.error + 0.15 * (self.converted(bis) - self.converted(50.0))
+        z = np.clip(self.converted(50.0 + self.in_force) - 0.4 * self.error, 0.5, 12.0)
+        self.shifts.insert(0, 92 / (1 + (z / 4.53) ** 1.57) - 50.0 if self.begun else self.in_force)
         self.begun = True
-        z = np.clip(self.wanted + self.in_force - 0.4 * self.error, 0.5, 12.0)
-        self.shifts.insert(0, z - self.wanted)
         late, share = divmod(0.65 / CYCLE, 1)
         passed = (1 - share) * self.shifts[int(late)] + share * self.shifts[int(late) + 1]
         decay = np.exp(-CYCLE / 1.2)

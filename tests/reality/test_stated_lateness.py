@@ -110,34 +110,6 @@ def test_a_form_inside_wrappers_is_told_too():
     assert mirror.lag == LAG
 
 
-@pytest.mark.slow
-def test_review_judges_the_stated_lag():
-    """A rate that leaves no room for the lag is called so, for a form that does not pair through it."""
-    one, plain = problem(lag={"u": LAG}), fp.Affine(gain=-1.0)
-    text = "Does the tracking law leave room for the lag of the reality?"
-    answers = {
-        rate: next(
-            a
-            for a in fp.review(
-                one, {"c": fp.ComputedTorque(fp.Exponential(rate=rate, integral=False), plain)}, mismatch=0.0, seed=0
-            ).answers
-            if a.question == text
-        )
-        for rate in (1.0, 12.0)
-    }
-    assert answers[12.0].verdict == "no"
-    assert answers[12.0].numbers["room"] == pytest.approx(2 * 12 * LAG)
-    assert answers[1.0].verdict != "no"
-
-
-def test_a_review_does_not_say_that_a_stated_latency_is_unknown():
-    one = problem(dead_time={"u": 2 * PERIOD})
-    answers = fp.review(one, {"c": law(fp.ModelReferenced(fp.Affine(gain=-0.3)))}, mismatch=0.0, seed=0).answers
-    (gain,) = (a for a in answers if a.question == "Is the map's gain admissible?")
-    assert gain.evidence.endswith("because the model knows no lag of the plant outside")
-    assert gain.change == "fpirhc probe measures it and recommends a gain."
-
-
 @pytest.mark.parametrize(
     ("facts", "words"),
     [
