@@ -141,7 +141,8 @@ def policy(inputs: int, rounds: int = 12) -> Any:
     constants = defined(
         NS=2, NU=inputs, N=3, NT=1, NM=1, MEMORY=1, WORK=1, INTEGERS=1, SCALE=[1.0] * inputs, FIRST_GAMMA=1.0,
         ITERATIONS=1, STOP_EARLY=0, TOLERANCE=1e-6, DAMPING=0.0, SHARE=SHARE, ARMIJO=ARMIJO, SHORTER=0.3, SHORTEST=0.03,
-        DRAWN_IN=0.1, FLAT=1e-9, CONVERGING=0, ROUNDING=1e-12, PLAIN=3, UNTRIED=1e299, PIVOT=PIVOT, ROUNDS=rounds, CONVERGED=0, NOT_CONVERGED=1,
+        DRAWN_IN=0.1, FLAT=1e-9, CONVERGING=0, ROUNDING=1e-12, PLAIN=3, UNTRIED=1e299,
+        PIVOT=PIVOT, ROUNDS=rounds, CONVERGED=0, NOT_CONVERGED=1,
         INFEASIBLE=2, NON_FINITE=4, COSTATES=3, ROOM="(sizeof(Search) / sizeof(casadi_real))",
     )  # fmt: skip
     return library(("kernels", "fixed_point"), constants, POLICY)

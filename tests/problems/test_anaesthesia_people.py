@@ -94,7 +94,7 @@ def own_loop(name: str, law: Any, cycles: int) -> np.ndarray:
 
 
 class InConcentrations:
-    """The plain cascade: the map takes .4 of the filtered error off the target in force, in mg/l; shifts of the target are of bis."""
+    """The plain cascade: .4 of the filtered error in mg/l is taken off the target in force, and shifts of the target are of bis."""
 
     def __init__(self) -> None:
         self.shifts, self.error, self.begun = [0.0] * 12, 0.0, False
