@@ -14,7 +14,6 @@ import fpirhc as fp
 from fpirhc.simulation.metrics import known_metrics
 from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
-from fpirhc.simulation.metrics.entries.solve import iterations, residual
 from fpirhc.simulation.trials import errors_of
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Signal
@@ -71,51 +70,6 @@ def test_columns_of_a_report(adaptive):
         "at limit",
         "factor",
     ]
-
-
-def test_order_of_a_file():
-    assert list(BY_NAME)[:4] == ["cycles", "rms_error", "max_error", "iae"]
-    assert list(BY_NAME)[-6:] == [
-        "solve.median_iterations",
-        "solve.worst_iterations",
-        "solve.median_stationarity",
-        "solve.worst_stationarity",
-        "solve.worst_feasibility",
-        "plans",
-    ]
-    assert list(BY_NAME).index("settling") < list(BY_NAME).index("effort") < list(BY_NAME).index("status")
-
-
-def test_which_numbers_a_finished_run_must_have():
-    """A run may end unsettled, have no factor, or an optimiser without residuals; everything else is a fault of the run."""
-    assert {name for name, m in BY_NAME.items() if not m.finite} == {
-        "settling",
-        "contraction.predicted",
-        "contraction.growing",
-        "contraction.measured",
-        "solve.median_stationarity",
-        "solve.worst_stationarity",
-        "solve.worst_feasibility",
-    }
-
-
-def test_smallest_steps():
-    """A share counts cycles, a settling time counts periods; a factor below 1e-4 is rounding."""
-    share, settling = (BY_NAME[name].step for name in ("at_limit", "settling"))
-    assert share is not None
-    assert settling is not None
-    assert (share(0.5, 200), settling(0.5, 200)) == (0.005, 0.5)
-    assert {n for n, m in BY_NAME.items() if m.floor == 1e-4} == {"contraction.predicted", "contraction.measured"}
-    assert {m.floor for m in BY_NAME.values()} == {1e-4, 1e-12}
-
-
-def test_numbers_as_texts():
-    """An optimiser that counts nothing logs -1; a residual has one digit; a share is in percent."""
-    assert [iterations(v) for v in (-1.0, 0.0, 0.4, 1.0, 12.0)] == ["-", "0", "0", "1", "12"]
-    assert [residual(v) for v in (1.23e-3, 1.23e-5, 0.0)] == ["0.001", "1e-5", "0"]
-    assert BY_NAME["solve.median_iterations"].text is BY_NAME["solve.worst_iterations"].text is iterations
-    assert BY_NAME["solve.median_stationarity"].text is residual
-    assert BY_NAME["at_limit"].text(0.125) == "12.5 %"
 
 
 # The ends of definitions
