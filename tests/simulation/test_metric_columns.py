@@ -12,7 +12,6 @@ from plants import linear
 
 import fpirhc as fp
 from fpirhc.simulation.metrics import known_metrics
-from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.trials import errors_of
 from fpirhc.status import Status
@@ -42,34 +41,6 @@ def adaptive():
 
 
 # What stands where
-
-
-def test_columns_of_a_report(adaptive):
-    """Errors, settling, effort, movement, limits, cost, contraction, solves: from what users ask first to what explains it."""
-    task, result = adaptive
-    solve = np.column_stack([np.arange(CYCLES)] * 5)
-    made = run(0.0, cost=(Signal("cost", ("states",)), 1.0), solve=(Signal("solve", SOLVE), solve))
-    metrics = [fp.measure(problem(), made), fp.measure(task, result)]
-    assert [c.heading for c in columns(metrics)] == [
-        "rms error y [m]",
-        "max error y [m]",
-        "settled y [s]",
-        "rms u [N]",
-        "moves u [N/s]",
-        "at limit",
-        "cost",
-        "contraction predicted",
-        "contraction above 1",
-        "contraction measured",
-        "iterations",
-        "worst residual",
-    ]
-    assert [c.short for c in columns(metrics, lambda m: m.headline)] == [
-        "rms y [m]",
-        "moves u [N/s]",
-        "at limit",
-        "factor",
-    ]
 
 
 # The ends of definitions
