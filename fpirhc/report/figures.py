@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import OutputError
-from fpirhc.simulation.drawing import PALETTE, caption_axes, draw_legend, literal, new_figure, row_of_axes
+from fpirhc.simulation.drawing import PALETTE, caption_axes, draw_legend, literal, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,11 +18,10 @@ if TYPE_CHECKING:
 
     from fpirhc.contraction.spectrum import ContractionReport
     from fpirhc.simulation.picture import Drawing
-    from fpirhc.studies.comparison.compare import Comparison, Contraction, Entry
+    from fpirhc.studies.comparison.compare import Comparison, Contraction
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
 
-_WIDE = 16.5  # inches, of a picture as wide as the page
 _CYCLES = 150  # of the decay of a response error
 _BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
 _GOLDEN = 0.618034  # of a turn, from hue to hue
@@ -67,11 +66,6 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
     return figure
 
 
-def _positive(values: np.ndarray | float) -> Any:
-    """Values that have a place on a logarithmic axis; the others are left out."""
-    return np.where((np.asarray(values) > 0) & np.isfinite(values), values, np.nan)
-
-
 def colours_of(comparison: Comparison) -> dict[str, str]:
     """Return the colour of every controller that ran, by name: the same one in all pictures of a report, the pair's first."""
     names = sorted(
@@ -85,36 +79,29 @@ def colours_of(comparison: Comparison) -> dict[str, str]:
 
 def contraction_figure(comparison: Comparison) -> Drawing | None:
     """Return a panel for every gain by its own name and scale, and one with the response errors; None where nothing contracts."""
+    from fpirhc.simulation.picture import Drawing
+
     entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
     if not entries:
         return None
-    colours, groups = colours_of(comparison), _by_gain(entries)
-    figure, [*panels, last] = row_of_axes(_WIDE, 4.0, len(groups) + 1)
+    colours, groups = colours_of(comparison), dict[tuple[str, float], list[Any]]()
+    for entry in entries:
+        if entry.contraction is not None:
+            groups.setdefault(_own_gain(entry.contraction.report), []).append((entry.name, entry.contraction))
+    figure = Drawing(figsize=(16.5, 4.0))  # places that are fixed: to fit them takes two thirds of a picture's time
+    figure.subplots_adjust(left=0.06, right=0.99, bottom=0.15, top=0.91, wspace=0.25)
+    [*panels, last] = figure.subplots(1, len(groups) + 1, squeeze=False)[0]
     for axis, ((name, scale), same) in zip(panels, groups.items(), strict=True):
         _draw_factor(axis, name, scale, same, colours)
     for entry in entries:
         apart = (entry.run["realised"][1:] - entry.run["desired"][:-1])[:_CYCLES]
         size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
-        cycles = np.arange(1, size.size + 1)
-        last.semilogy(cycles, _positive(size), color=colours[entry.name], label=literal(entry.name), lw=1)
-    last.set_xlabel("control cycle")
-    last.set_ylabel("|realised - desired|, response units")
+        shown = np.where((size > 0) & np.isfinite(size), size, np.nan)
+        last.semilogy(np.arange(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1)
+    caption_axes(last, "control cycle", "|realised - desired|, response units")
     last.set_title("The response error in the first cycles", fontsize=10, y=1.0)
     draw_legend(last)
     return figure
-
-
-def _by_gain(entries: Sequence[Entry]) -> dict[tuple[str, float], list[Entry]]:
-    """Entries by the name of their gain and its size per unit of the effective gain, in their order."""
-    groups: dict[tuple[str, float], list[Entry]] = {}
-    for entry in entries:
-        groups.setdefault(_own_gain(_of(entry).report), []).append(entry)
-    return groups
-
-
-def _of(entry: Entry) -> Contraction:
-    assert entry.contraction is not None
-    return entry.contraction
 
 
 def _own_gain(report: ContractionReport) -> tuple[str, float]:
@@ -124,31 +111,22 @@ def _own_gain(report: ContractionReport) -> tuple[str, float]:
     return (report.gain_name, float(f"{own / effective:.9g}")) if effective else ("effective gain", 1.0)
 
 
-def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], colours: dict[str, str]) -> None:
-    first = _of(entries[0])
+def _draw_factor(
+    axis: Axes, gain: str, scale: float, entries: Sequence[tuple[str, Contraction]], colours: dict[str, str]
+) -> None:
+    first = entries[0][1]
     limit = max(first.report.linear_limit, key=abs) or 1.0
     gains = np.linspace(0, _BEYOND * limit, 300)
-    eigenvalues = first.spectrum.eigenvalues.ravel()
-    factors = np.abs(1 - gains[:, None] * eigenvalues[None, :]).max(axis=1)
+    factors = np.abs(1 - gains[:, None] * first.spectrum.eigenvalues.ravel()).max(axis=1)
     axis.plot(scale * gains, factors, color="#444444", lw=1.2)
     axis.axhline(1.0, color="#aa0000", lw=0.8)
     axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit")
     sectors: dict[float, str] = {}
-    for entry in entries:
-        one, colour = _of(entry), colours[entry.name]
-        own = scale * one.report.effective_gain
-        axis.plot(
-            own,
-            one.report.predicted,
-            "o",
-            color=colour,
-            ms=9,
-            mfc="none",
-            mew=1.5,
-            label=literal(f"{entry.name}, predicted"),
-        )
-        if np.isfinite(one.measured):
-            axis.plot(own, one.measured, "x", color=colour, ms=7, mew=1.5, zorder=5)
+    for name, one in entries:
+        own, colour = scale * one.report.effective_gain, colours[name]
+        label = literal(f"{name}, predicted")
+        axis.plot(own, one.report.predicted, "o", ms=9, mfc="none", mew=1.5, color=colour, label=label)
+        axis.plot(own, one.measured, "x", ms=7, mew=1.5, color=colour, zorder=5)
         sector: float = max(one.report.sector_limit, key=abs)
         sectors.setdefault(round(sector, 3), colour)
     for sector, colour in sectors.items():
@@ -157,6 +135,6 @@ def _draw_factor(axis: Axes, name: str, scale: float, entries: Sequence[Entry], 
     axis.set_ylim(0, 1.6)
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
-    caption_axes(axis, literal(name), "contraction factor max|1 - a lambda|")
+    caption_axes(axis, literal(gain), "contraction factor max|1 - a lambda|")
     axis.set_title("Predicted factor; o predicted, x measured", fontsize=10, y=1.0)
     draw_legend(axis)

@@ -11,9 +11,9 @@ import json
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
     from fpirhc.simulation.picture import Drawing
-    from fpirhc.simulation.pictures.base import Picture
-    from fpirhc.simulation.run import Run
-    from fpirhc.studies.comparison.compare import Comparison, Entry
+    from fpirhc.studies.comparison.compare import Comparison
     from fpirhc.studies.view import View
 
 
@@ -62,7 +60,7 @@ def render(comparison: Comparison) -> str:
     own, motions = own_pictures(comparison)
     begin = [*(comparison.findings[0].pair or ())]
     series = {**chart_data(comparison), "bands": BANDS, "begin": begin, "motions": motions}
-    data = _in_script(json.dumps(series, separators=(",", ":")))
+    data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")  # no text ends the script
     scripts = asset("uPlot.iife.min.js"), asset("axes.js"), *([planar.script()] if motions else [])
     factors = contraction_figure(comparison)
     caption = "Predicted contraction factor against the gain, and the response error's decay"
@@ -90,31 +88,18 @@ def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, An
     runs, images, motions = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}, [], []
     for wanted in comparison.pictures:
         shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
+        if not shown:
+            continue
         try:
-            motion = dict(wanted.motion(shown))
-        except FpirhcError:
-            motion = {}  # `draw` says why
-        image = None if motion else _drawn(wanted, list(shown), partial(wanted.draw, runs=shown))
-        motions += [motion] if motion else []
-        images += [image] if image else []
+            if motion := dict(wanted.motion(shown)):
+                motions.append(motion)
+                continue
+            wanted.draw(figure := new_figure(*wanted.size(len(shown))), runs=shown)
+            caption = f"{wanted.title}. {wanted.caption}".strip()
+            images.append(Image(figure.address, f"{wanted.title}: {', '.join(shown)}", caption))
+        except FpirhcError as error:
+            images.append(Image("", "", f"{wanted.title} is not drawn: {error}"))
     return images, motions
-
-
-def _drawn(wanted: Picture, names: Sequence[str], draw: Callable[[Drawing], None]) -> Image | None:
-    """A picture of the problem, or why it is not drawn; None without a controller to show."""
-    if not names:
-        return None
-    figure = new_figure(*wanted.size(len(names)))
-    try:
-        draw(figure)
-    except FpirhcError as error:
-        return Image("", "", f"{wanted.title} is not drawn: {error}")
-    return Image(figure.address, f"{wanted.title}: {', '.join(names)}", f"{wanted.title}. {wanted.caption}".strip())
-
-
-def _in_script(data: str) -> str:
-    """JSON as a page's script has it: no text ends the script."""
-    return data.replace("<", "\\u003c")
 
 
 def render_charted(
@@ -141,9 +126,13 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     template = _environment().get_template(name)
     others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome is not None)
     said = ", ".join(f"{count} {outcome}" for outcome, count in others.items())
-    return template.render(
-        view=view, others=said, policy=Markup(_policy(every)), styles=styles, scripts=every, **context
+    digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in scripts)
+    hashes = " ".join(f"'sha256-{one}'" for one in digests)
+    policy = (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
     )
+    return template.render(view=view, others=said, policy=Markup(policy), styles=styles, scripts=every, **context)
 
 
 @cache
@@ -167,34 +156,20 @@ def _environment() -> Environment:
     return environment
 
 
-# With its unit, or the word behind it.
-_NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.]*(?:e[-+]?\d+)?(?: \d{3})*(?: [^\s,;.()]{1,12})?")
+# With its unit, or the word behind it; none inside an escaped character, &#39;.
+_NUMBER = re.compile(r"(?<![\w.#])[-+]?\d[\d.]*(?:e[-+]?\d+)?(?: \d{3})*(?: (?:[^\s,;.()&]|&[#\w]+;){1,12})?")
 
 
 def whole_numbers(text: str) -> Markup:
     """Return a sentence as HTML whose lines do not end inside a number, or between a number and its unit."""
     from markupsafe import Markup, escape
 
-    parts, end = [], 0
-    for number in _NUMBER.finditer(text):
-        parts += [escape(text[end : number.start()]), Markup("<span class='number'>{}</span>").format(number.group())]
-        end = number.end()
-    return Markup("").join([*parts, escape(text[end:])])
+    return Markup(_NUMBER.sub(r"<span class='number'>\g<0></span>", str(escape(text))))
 
 
 def css_class(outcome: Outcome | None) -> str:
     """Return the class of a sentence: green is better, red worse, amber mixed or doubtful."""
     return "remark" if outcome is None else f"outcome-{outcome.value.replace(' ', '-')}"
-
-
-def _policy(scripts: Sequence[str]) -> str:
-    """Content security policy that allows these scripts, the styles inside the page, and pictures inside the page."""
-    hashes = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in scripts)
-    code = " ".join(f"'sha256-{one}'" for one in hashes)
-    return (
-        f"default-src 'none'; script-src {code}; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
-        "form-action 'none'"
-    )
 
 
 def asset(name: str) -> str:
@@ -212,7 +187,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
     if not entries:
         return {"controllers": [], "charts": [], "time": [], "timeUnit": comparison.time_unit}
     longest = max(entries, key=lambda e: e.run.cycles).run
-    edges = _edges(longest.cycles)
+    edges = np.unique(np.linspace(0, longest.cycles, min(INTERVALS, longest.cycles) + 1).astype(int))
     first, colours = entries[0].run, colours_of(comparison)
     names = first.layout["error"].elements
     charts = [
@@ -232,56 +207,29 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
             lines = [(what, e.run[f"{signal}.{c}"]) for what, signal in responses_of(e.run.layout).items()]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
-    charts += _reality_charts(entries, edges)
+    real = [e for e in entries if _REALITY in e.run.layout]  # with states that the model does not have
+    more = [n for e in real[:1] for n in e.run.layout[_REALITY].elements if n not in e.run.layout["state"].elements]
+    for column in (f"{_REALITY}.{name}" for name in more):
+        lines = [(e.name, e.run[column]) for e in real]
+        charts.append(_chart(f"reality: {column.partition('.')[2]}", real[0].run.unit(column), lines, edges))
+    middles = 0.5 * np.diff(edges) * longest.period
     return {
         "controllers": [
             {
                 "name": e.name,
                 "color": colours[e.name],
-                "slots": _slots_of_run(e.run),
-                "changes": _changes(e.run),
+                "slots": [[*_round(span[:2]), span[2]] for span in spans] if len(spans) <= INTERVALS else [],
+                "changes": _round([time for time, _ in e.run.in_force[1:]]),
                 "ended": bool(e.run.stop),
             }
             for e in entries
+            for spans in [e.run.spans()]  # too many are not seen
         ],
         "timeUnit": comparison.time_unit,
         "steps": comparison.steps,
-        "time": _round(np.repeat(longest.time[edges[:-1]], 2) + _halves(longest, edges)),
+        "time": _round(np.repeat(longest.time[edges[:-1]], 2) + np.outer(middles, (0, 1)).ravel()),
         "charts": charts,
     }
-
-
-def _reality_charts(entries: Sequence[Entry], edges: np.ndarray) -> list[dict[str, Any]]:
-    """Charts of states of realities that the model does not have."""
-    real = [e for e in entries if _REALITY in e.run.layout]
-    if not real:
-        return []
-    first, charts = real[0].run, []
-    for name in (n for n in first.layout[_REALITY].elements if n not in first.layout["state"].elements):
-        column = f"{_REALITY}.{name}"
-        charts.append(_chart(f"reality: {name}", first.unit(column), [(e.name, e.run[column]) for e in real], edges))
-    return charts
-
-
-def _changes(run: Run) -> list[float]:
-    """Times at which live settings changed."""
-    return [float(f"{time:.6g}") for time, _ in run.in_force[1:]]
-
-
-def _slots_of_run(run: Run) -> list[list[float]]:
-    """Time slots as [start, end, number]; none where there are too many to be seen."""
-    spans = run.spans()
-    return [[float(f"{a:.6g}"), float(f"{b:.6g}"), slot] for a, b, slot in spans] if len(spans) <= INTERVALS else []
-
-
-def _edges(cycles: int) -> np.ndarray:
-    return np.unique(np.linspace(0, cycles, min(INTERVALS, cycles) + 1).astype(int))
-
-
-def _halves(run: Run, edges: np.ndarray) -> np.ndarray:
-    """Offsets of the two points of every interval: its start and its middle."""
-    middle = 0.5 * np.diff(edges) * run.period
-    return np.column_stack([np.zeros_like(middle), middle]).ravel()
 
 
 def _chart(title: str, unit: str, lines: Sequence[tuple[str, np.ndarray]], edges: np.ndarray) -> dict[str, Any]:
@@ -301,5 +249,5 @@ def _extremes(values: np.ndarray, edges: np.ndarray) -> list[float | None]:
     return [*_round(extremes), *[None] * (2 * (len(edges) - 1 - len(begins)))]
 
 
-def _round(values: np.ndarray) -> list[float]:
-    return [float(f"{v:.5g}") for v in values.tolist()]
+def _round(values: Sequence[float] | np.ndarray) -> list[float]:
+    return [float(f"{v:.5g}") for v in np.asarray(values).tolist()]

@@ -134,7 +134,7 @@ def show_table(table: Table, console: Console | None = None) -> None:
     for k, part in enumerate(parts):  # what stands above and below may be wider than a part
         if table.title:
             console.print(Text(printable(table.title) + (" (continued)" if k else ""), "italic"))
-        console.print(_grid(table, part, console.width))
+        console.print(_grid(table, part))
     if table.caption:
         console.print(Text(printable(table.caption), "dim italic"))
 
@@ -167,30 +167,18 @@ def _whole_units(head: str) -> str:
     return re.sub(r"\[[^]]*\]", lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), printable(head))
 
 
-def _grid(table: Table, part: Sequence[int], width: int) -> Grid:
-    heads = [_whole_units(table.columns[k].head) for k in range(len(table.columns))]
+def _grid(table: Table, part: Sequence[int]) -> Grid:
     grid = Grid(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     places = [*range(table.names), *part]
-    for k, own in zip(places, _widths(table, places, width), strict=True):
+    for k in places:
         justify: JustifyMethod = "left" if k < table.names or table.columns[k].left else "right"
-        grid.add_column(Text(heads[k]), justify=justify, width=own, overflow="fold")
+        head = Text(_whole_units(table.columns[k].head))
+        width = None if k < table.names else _least(table, k)  # names have what the numbers leave
+        grid.add_column(head, justify=justify, width=width, overflow="fold")
     for row in table.rows:
         cells = (Text(printable(row.cells[k]), "bold" if k in row.best else "") for k in places)
         grid.add_row(*cells, style=row.style)
     return grid
-
-
-def _widths(table: Table, places: Sequence[int], width: int) -> list[int]:
-    """Widths of columns: the least, and then as much as names and headings need on one line, from left to right."""
-    widths = [_least(table, k) for k in places]
-    rest = width - _EDGES - sum(widths) - _BETWEEN * len(widths)
-    for k, place in enumerate(places):
-        names = [cell_len(printable(row.cells[place])) for row in table.rows] if place < table.names else []
-        wanted = max([cell_len(printable(table.columns[place].head)), *names])
-        more = min(max(wanted - widths[k], 0), max(rest, 0))
-        widths[k] += more
-        rest -= more
-    return widths
 
 
 @contextmanager

@@ -2,52 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fpirhc.summary import printable
-from fpirhc.symbolic.layout import Layout
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from fpirhc.simulation.picture import Drawing
+    from fpirhc.simulation.run import Run
+    from fpirhc.symbolic.layout import Layout
 
 
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
 _POINTS = 2000  # drawn per line
-_LEFT, _RIGHT, _BOTTOM, _TOP = 0.95, 0.15, 0.6, 0.35  # margins of a row of axes, inches
-_BESIDE, _BELOW = 0.75, 0.33  # labels of a row's axes, inches from the axes
 _SHORTEST = 12  # characters of a name that was cut
-_TITLE, _LABEL, _NAME = 60, 28, 48  # characters of a line of a title, a label of an axis, a name in a legend
+_LABEL, _NAME = 28, 48  # characters of a label of an axis, a name in a legend
 _TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
-
-
-class _Recorded(Protocol):
-    """What figures read of a `Run`, which draws itself and so stands above them."""
-
-    @property
-    def controller(self) -> str: ...
-    @property
-    def stop(self) -> str | None: ...
-    @property
-    def layout(self) -> Layout: ...
-    @property
-    def cycles(self) -> int: ...
-    @property
-    def time(self) -> np.ndarray: ...
-    @property
-    def time_unit(self) -> str: ...
-    @property
-    def in_force(self) -> Sequence[tuple[float, Mapping[str, float]]]: ...
-    def __getitem__(self, name: str) -> np.ndarray: ...
-    def unit(self, column: str) -> str: ...
-    def spans(self) -> Sequence[tuple[float, float, int]]: ...
 
 
 def new_figure(width: float, height: float, title: str = "") -> Drawing:
@@ -60,36 +37,17 @@ def new_figure(width: float, height: float, title: str = "") -> Drawing:
     return figure
 
 
-def row_of_axes(width: float, height: float, count: int) -> tuple[Drawing, list[Axes]]:
-    """Return a figure of this size in inches and its axes side by side.
-
-    Its margins and the places of labels and titles are fixed: to fit them, matplotlib would lay out every number of the scales
-    again, which takes two thirds of a picture's time.
-    """
-    from fpirhc.simulation.picture import Drawing
-
-    figure = Drawing(figsize=(width, height))
-    each = (width - _RIGHT) / count  # inches of one panel with its margin
-    axes = figure.subplots(1, count, squeeze=False)[0]
-    places = {"left": _LEFT / width, "right": 1 - _RIGHT / width, "bottom": _BOTTOM / height, "top": 1 - _TOP / height}
-    figure.subplots_adjust(**places, wspace=_LEFT / (each - _LEFT))
-    for axis in axes:
-        axis.yaxis.set_label_coords(-_BESIDE / (each - _LEFT), 0.5)
-        axis.xaxis.set_label_coords(0.5, -_BELOW / (height - _BOTTOM - _TOP))
-    return figure, list(axes)
-
-
 def literal(text: str) -> str:
     """Return a name or unit as matplotlib shows it literally: a pair of dollar signs would be read as a formula."""
     return printable(text).replace("$", r"\$")
 
 
-def time_label(run: _Recorded) -> str:
+def time_label(run: Run) -> str:
     """Return the label of a time axis: 'time [s]'."""
     return literal(f"time [{run.time_unit}]")
 
 
-def quantity_label(run: _Recorded, signal: str, names: Sequence[str], what: str = "") -> str:
+def quantity_label(run: Run, signal: str, names: Sequence[str], what: str = "") -> str:
     """Return the label of an axis that shows these entries of a signal, with their unit where they have one in common.
 
     `what` they are of the names, such as 'error of '. Where the names are too long for a label, it says that there are several.
@@ -101,7 +59,7 @@ def quantity_label(run: _Recorded, signal: str, names: Sequence[str], what: str 
     return literal(what + shown + unit)
 
 
-def by_unit(run: _Recorded, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
+def by_unit(run: Run, signal: str, names: Sequence[str]) -> dict[str, list[str]]:
     """Return these entries of a signal by their unit, in their order: a chart has one unit."""
     groups: dict[str, list[str]] = {}
     for name in names:
@@ -109,26 +67,11 @@ def by_unit(run: _Recorded, signal: str, names: Sequence[str]) -> dict[str, list
     return groups
 
 
-def draw_bands(axis: Axes, run: _Recorded) -> None:
+def draw_bands(axis: Axes, run: Run) -> None:
     """Draw time slots as shaded bands, named in the legend."""
-    named: set[int] = set()
     for start, end, slot in run.spans():
         name = run.layout["desired"].elements[slot]
-        axis.axvspan(
-            start,
-            end,
-            color=BANDS[slot % len(BANDS)],
-            alpha=0.12,
-            lw=0,
-            label=None if slot in named else f"slot {name}",
-        )
-        named.add(slot)
-
-
-def draw_changes(axis: Axes, run: _Recorded) -> None:
-    """Draw the times at which live settings changed as vertical lines, named in the legend."""
-    for k, (time, _) in enumerate(run.in_force[1:]):
-        axis.axvline(time, color="#777777", lw=0.8, ls=":", label=None if k else "change of settings")
+        axis.axvspan(start, end, color=BANDS[slot % len(BANDS)], alpha=0.12, lw=0, label=f"slot {name}")
 
 
 def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
@@ -136,24 +79,19 @@ def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
     return values[:: max(1, values.shape[0] // points)]
 
 
-def draw_line(axis: Axes, run: _Recorded, column: str, label: str, color: str, style: str = "-") -> None:
+def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
-    axis.plot(
-        thinned(run.time),
-        thinned(run[column]),
-        style,
-        color=color,
-        lw=1,
-        label=literal(f"{label} [{run.unit(column)}]"),
-    )
+    name = literal(f"{label} [{run.unit(column)}]")
+    axis.plot(thinned(run.time), thinned(run[column]), style, color=color, lw=1, label=name)
     axis.grid(visible=True, alpha=0.25)
 
 
 def draw_legend(axis: Axes) -> None:
-    """Add a legend where something has a label."""
+    """Add a legend where something has a label, each label once."""
     handles, labels = axis.get_legend_handles_labels()
-    if handles:
-        axis.legend(handles, [_cut(one, _NAME) for one in labels], fontsize=7, loc="best", framealpha=0.8)
+    named = {_cut(label, _NAME): handle for handle, label in zip(handles, labels, strict=True)}
+    if named:
+        axis.legend(named.values(), named, fontsize=7, loc="best", framealpha=0.8)
 
 
 def _cut(name: str, length: int) -> str:
@@ -162,11 +100,11 @@ def _cut(name: str, length: int) -> str:
     return name if len(name) <= length else f"{name[:side]}...{name[-side:]}"
 
 
-def draw_responses(axis: Axes, run: _Recorded, name: str) -> None:
-    """Draw the nominal, desired, deformed and realised response of one coordinate; a spike does not hide the rest."""
-    columns = {what: f"{signal}.{name}" for what, signal in responses_of(run.layout).items()}
+def draw_responses(axis: Axes, run: Run, names: Sequence[str], _: str) -> None:
+    """Draw the nominal, desired, deformed and realised response of the first coordinate; a spike does not hide the rest."""
+    columns = {what: f"{signal}.{names[0]}" for what, signal in responses_of(run.layout).items()}
     for what, column in columns.items():
-        draw_line(axis, run, column, f"{name} {what}", _RESPONSES[what], ":" if what == "realised" else "-")
+        draw_line(axis, run, column, f"{names[0]} {what}", _RESPONSES[what], ":" if what == "realised" else "-")
     values = np.abs(np.concatenate([run[column] for column in columns.values()])) if run.cycles else np.zeros(1)
     usual = float(np.quantile(values, 0.99))
     if usual > 0 and values.max() > _TALL * usual:
@@ -174,7 +112,7 @@ def draw_responses(axis: Axes, run: _Recorded, name: str) -> None:
     show_usual(axis.set_ylim, run, columns.values())
 
 
-def show_usual(limit: Callable[[float, float], object], run: _Recorded, columns: Iterable[str]) -> None:
+def show_usual(limit: Callable[[float, float], object], run: Run, columns: Iterable[str]) -> None:
     """Limit the range of an axis where the run ended early: what it reached at last does not hide the rest."""
     values = np.concatenate([run[column] for column in columns])
     most = _TALL * float(np.median(np.abs(values))) if run.stop and values.size else 0.0
@@ -184,7 +122,7 @@ def show_usual(limit: Callable[[float, float], object], run: _Recorded, columns:
         limit(low - edge, high + edge)
 
 
-def draw_signal(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) -> None:
+def draw_signal(axis: Axes, run: Run, names: Sequence[str], signal: str) -> None:
     """Draw entries of a signal of a run over time, each in its colour."""
     for k, name in enumerate(names):
         draw_line(axis, run, f"{signal}.{name}", name, PALETTE[k % len(PALETTE)])
@@ -209,18 +147,14 @@ def responses_of(layout: Layout) -> dict[str, str]:
     return {n: n for n in ("nominal", "desired", "deformed")} | {"realised": "realised_of_slots" if own else "realised"}
 
 
-def run_figure(run: _Recorded) -> Figure:
+def run_figure(run: Run) -> Figure:
     """Return a figure with errors, coordinates, commands and responses of one run over time, one chart per unit."""
-    judged, inputs, first = (
-        run.layout["error"].elements,
-        run.layout["command"].elements,
-        run.layout["desired"].elements[:1],
-    )
+    judged, inputs = (by_unit(run, signal, run.layout[signal].elements).values() for signal in ("error", "command"))
     panels = [
-        *(("error", "error of ", draw_signal, names) for names in by_unit(run, "error", judged).values()),
-        *((shown_motion(run.layout), "", _draw_motion, names) for names in by_unit(run, "error", judged).values()),
-        *(("command", "", draw_signal, names) for names in by_unit(run, "command", inputs).values()),
-        ("desired", "responses of ", _draw_first_response, first),
+        *(("error", "error of ", draw_signal, names) for names in judged),
+        *((shown_motion(run.layout), "", _draw_motion, names) for names in judged),
+        *(("command", "", draw_signal, names) for names in inputs),
+        ("desired", "responses of ", draw_responses, run.layout["desired"].elements[:1]),
     ]
     figure = new_figure(10, 2.25 * len(panels), f"{run.controller}" + (f" ({run.stop})" if run.stop else ""))
     axes = figure.subplots(len(panels), 1, sharex=True)
@@ -228,13 +162,14 @@ def run_figure(run: _Recorded) -> Figure:
         draw(axis, run, names, signal)
         axis.set_ylabel(quantity_label(run, signal, names, what))
         draw_bands(axis, run)
-        draw_changes(axis, run)
+        for time, _ in run.in_force[1:]:
+            axis.axvline(time, color="#777777", lw=0.8, ls=":", label="change of settings")
         draw_legend(axis)
     axes[-1].set_xlabel(time_label(run))
     return figure
 
 
-def _draw_motion(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) -> None:
+def _draw_motion(axis: Axes, run: Run, names: Sequence[str], signal: str) -> None:
     for k, name in enumerate(names):
         color = PALETTE[k % len(PALETTE)]
         draw_line(axis, run, f"{signal}.{name}", name, color)
@@ -242,7 +177,3 @@ def _draw_motion(axis: Axes, run: _Recorded, names: Sequence[str], signal: str) 
         if "setpoint" in run.layout:
             draw_line(axis, run, f"setpoint.{name}", f"{name} set-point", color, ":")
     show_usual(axis.set_ylim, run, [f"{one}.{name}" for one in (signal, "reference") for name in names])
-
-
-def _draw_first_response(axis: Axes, run: _Recorded, names: Sequence[str], _: str) -> None:
-    draw_responses(axis, run, names[0])

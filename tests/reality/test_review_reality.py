@@ -34,7 +34,7 @@ def test_comparison_shows_belief_beside_reality():
 
 
 def test_comparison_shows_the_responses_of_slots_that_a_reality_has():
-    """Behind encoders the response of the slot on q1 is found from samples, and the log has that of the controlled q2 alone."""
+    """Behind encoders the response of the slot on q1 is found from samples; it is drawn beside that of the controlled q2."""
     file = fp.load_problem("mass_spring_slots")
     sensing, real = fp.Sensing(estimator=fp.PositionDifference()), fp.Reality(file.problem.plant)
     problem = replace(
