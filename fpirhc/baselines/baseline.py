@@ -187,8 +187,8 @@ def check(
     try:
         facts = json.loads(path.read_text(encoding="utf-8"))
         asked, seed = list(select(task, controllers)), int(facts["seed"])
-        if new := [name for name in asked if name not in facts["controllers"]]:
-            text = f"'{path.name}' has no row of {', '.join(map(repr, new))}; measure it again: fpirhc accept PROBLEM --reason ..."
+        if unknown := [name for name in asked if name not in facts["controllers"]]:
+            text = f"'{path.name}' has no row of {', '.join(map(repr, unknown))}; measure it again: fpirhc accept PROBLEM --reason ..."
             return Judgement(task.name, none, unusable=text)
         known = {name: facts["controllers"][name] for name in asked}
         expected = {n: {m: (float(v), float(b)) for m, (v, b) in one["metrics"].items()} for n, one in known.items()}
