@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from fpirhc.probing.estimated import estimated_problem, gain_name
 from fpirhc.probing.identification import End, Estimates
 from fpirhc.review.experiments import PLACES, Bench
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.trials import errors_of, weighed
+from fpirhc.simulation.trials import ErrorPair, errors_of, weighed
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.task.problem import Problem
 
@@ -46,28 +45,20 @@ _STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the co
 _WORTH = 0.95  # error that is worth an adaptation
 _FINE = 1.05  # ratio of two shares, between which no other is tried
 _LEFT, _CALM = 0.5, 2.0  # of a push at an end; steps there over the largest that are allowed
-_TRIED = 8  # candidates of a form that are asked at the ends
+Case = tuple[End, float]
+"""An end of the likelihood, and the factor of its gains."""
 
 
 @dataclass(frozen=True)
 class Form:
-    """What candidates share that differ in their gain alone.
+    """What candidates share that differ in their gain alone."""
 
-    Args:
-        referenced: whether it is model-referenced; else the plain one.
-        cycles: believed dead time of every input.
-        lags: believed lag of every input.
-        wrong: cycles by which the dead time may be wrong.
-        pole: of the filter; 0: none.
-        weighted: whether the gain is a matrix, a share of the inverse of Lambda.
-    """
-
-    referenced: bool
-    cycles: tuple[float, ...]
-    lags: tuple[float, ...]
-    wrong: float = 0.0
-    pole: float = 0.0
-    weighted: bool = False
+    referenced: bool  # whether it is model-referenced; else the plain one
+    cycles: tuple[float, ...]  # believed dead time of every input
+    lags: tuple[float, ...]  # believed lag of every input
+    wrong: float = 0.0  # cycles by which the dead time may be wrong
+    pole: float = 0.0  # of the filter; 0: none
+    weighted: bool = False  # whether the gain is a matrix, a share of the inverse of Lambda
 
     def deformation(self, estimates: Estimates, share: float) -> Deformation:
         """Return the deformation with A_c = -2 share / (largest eigenvalue); gains are rounded to three digits."""
@@ -87,48 +78,20 @@ class Form:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A form and a share on the estimated plant.
-
-    Args:
-        error: rms tracking error over that of the controller alone, in the mean over the coordinates.
-        steps: rms step of the command over the largest that is allowed.
-    """
+    """A form and a share on the estimated plant."""
 
     form: Form
     share: float
     deformation: Deformation
-    error: float = math.inf
-    steps: float = math.inf
-
-    def is_larger(self, other: Candidate) -> bool:
-        """Whether it differs from the other one by a larger share alone."""
-        return self.form == other.form and self.share > other.share
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """An end of the likelihood, commands that are later still, and gains that are larger by a factor."""
-
-    end: End
-    factor: float
-    later: float = 0.0
-    slower: float = 1.0
-
-    @property
-    def place(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Dead time in cycles and lag of every input."""
-        return tuple(c + self.later for c in self.end.cycles), tuple(self.slower * tau for tau in self.end.lags)
+    error: float = math.inf  # rms tracking error over that of the controller alone, in the mean over the coordinates
+    steps: float = math.inf  # rms step of the command over the largest that is allowed
 
 
 class Choice:
     """The choice for one problem and controller."""
 
     def __init__(
-        self,
-        problem: Problem,
-        controller: Controller,
-        estimates: Estimates,
-        chatter: float | Mapping[str, float] | None,
+        self, problem: Problem, controller: Controller, estimates: Estimates, chatter: Mapping[str, float] | None
     ) -> None:
         """Build the estimated plant and run the controller alone on it."""
         self.bare, self.estimates = without_deformation(controller), estimates
@@ -138,19 +101,32 @@ class Choice:
         noise = [one.noise for one in estimates.channels]
         middle = estimates.dead[1], estimates.lag[1]
         self.problem = estimated_problem(problem, estimates.gains, *middle, estimates.drift, noise)
-        self._alone = self._bench(self.problem, None, "alone").nominal
+        self._alone = self._bench(None).nominal
         self._room = self.allowed(self._alone)
 
     def shortlist(self) -> dict[str, Candidate]:
-        """Return the candidates by name, cautious first; none where nothing safe makes the error clearly less."""
+        """Return the candidates by name, cautious first; none where nothing safe makes the error clearly less.
+
+        All come back with a command that is a cycle later and gains of 0.6 and 1.4 times those at every end of the likelihood: a
+        longer lag with a larger gain says much the same of a record as a shorter one with a smaller. The cautious one also bears
+        twice the gain on a plant that is slower by half, because a lag is only a picture of what is slow.
+        """
+        ends, most = self.estimates.ends, np.maximum(self.estimates.lag[2], 0.25 * self._given.period)
+        later, dead = ends[0].later(), tuple(self.estimates.dead[2].tolist())
+        slow = replace(ends[0], cycles=dead, lags=tuple((1.5 * most).tolist()))
+        middle: list[Case] = [(ends[0], 1.4), (ends[0], 0.6), (later, 1.0)]
+        near: list[Case] = [(later, 1.0), *((one, factor) for factor in (1.4, 0.6) for one in ends)]
+        far: list[Case] = [(slow, 2.0), (slow.later(), 1.4)]
+        forms = self.forms()
         with compiled_plans():
-            calm = {name: self._calm(form) for name, form in self._forms().items()}
-            chosen = {name: self._first(some, self._near) for name, some in calm.items()}
+            calm = {name: self._calm(form) for name, form in forms.items()}
             every = sorted((one for some in calm.values() for one in some), key=lambda one: one.error)
-            chosen = {"cautious": self._first(every, (*self._far, *self._near)), **chosen}
+            chosen = {"cautious": self._first(every, far + near)}
+            chosen |= {name: self._first(some, near) for name, some in calm.items()}
             for name in DARING:
-                if chosen.get(name) is None and name in calm:
-                    chosen[name] = self._first(calm[name], self._middle) or self._least(self._forms()[name])
+                if name in forms and chosen[name] is None:
+                    least = self._candidate(forms[name], SHARES[0])
+                    chosen[name] = self._first(calm[name], middle) or self._first([least], [])
         different: dict[str, Candidate] = {}
         for name, one in chosen.items():
             if one is not None and all(one.deformation != other.deformation for other in different.values()):
@@ -181,23 +157,18 @@ class Choice:
         for pole in _POLES:
             filtered = replace(form, pole=pole)
             for share in SHARES:
-                one = self._candidate(filtered, share)
                 with any_gain():  # a run judges it
-                    run = self._bench(self.problem, one, "middle").nominal
+                    run = self._bench(filtered).at_gain(share / _FIRST).nominal
                 if run.stop is not None:
                     break  # larger ones are lost too
-                error, steps = mean_ratio(self.problem, self._alone, run, self._names), steps_of(run)
-                found.append(replace(one, error=error, steps=float((steps / self._room).max())))
+                error = mean_ratio(errors_of(self.problem, (self._alone, run), self._names))
+                steps = float((steps_of(run) / self._room).max())
+                found.append(replace(self._candidate(filtered, share), error=error, steps=steps))
         return sorted((one for one in found if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
 
     def _first(self, some: Iterable[Candidate], cases: Iterable[Case]) -> Candidate | None:
         """The first one that comes back in every case."""
-        accepted = [one for one in some if self._accepted(one)][:_TRIED]
-        return next((one for one in accepted if all(self._returns(one, case) for case in cases)), None)
-
-    def _least(self, form: Form) -> Candidate | None:
-        one = self._candidate(form, SHARES[0])
-        return one if self._accepted(one) else None
+        return next((one for one in some if self._accepted(one) and all(self._returns(one, *c) for c in cases)), None)
 
     def _accepted(self, one: Candidate) -> bool:
         """Whether the loop of the problem takes its gain, which it judges by the model."""
@@ -207,24 +178,23 @@ class Choice:
             return False
         return True
 
-    def _returns(self, one: Candidate | None, case: Case) -> bool:
+    def _returns(self, one: Candidate | None, end: End, factor: float) -> bool:
         """Whether the loop comes back from a push, calmly; true where the controller alone does not."""
-        key = one and (one.form, one.share), case.place, case.factor
+        key = one and (one.form, one.share), end.cycles, end.lags, factor
         if key not in self._known:
-            self._known[key] = self._pushed(one, case) or (one is not None and not self._returns(None, case))
+            back = self._pushed(one, end, factor)
+            self._known[key] = back or (one is not None and not self._returns(None, end, factor))
         return self._known[key]
 
-    def _pushed(self, one: Candidate | None, case: Case) -> bool:
-        if case.place not in self._benches:
-            problem = estimated_problem(self._given, self.estimates.gains, *case.place)
-            self._benches[case.place] = Bench(problem, self.bare)
-        problem = self._benches[case.place].problem
-        names, exact = list(problem.real_plant.parameters), problem.real_plant.exact.copy()
-        for (i, j), gain in np.ndenumerate(case.factor * case.end.gains):
-            exact[names.index(gain_name(i, j))] = gain
+    def _pushed(self, one: Candidate | None, end: End, factor: float) -> bool:
         try:
             with any_gain():
-                bench = self._bench(problem, one, case.place)
+                bench = self._bench(one.form if one else None, (end.cycles, end.lags))
+                plant = bench.problem.real_plant
+                names, exact = list(plant.parameters), plant.exact.copy()
+                for (i, j), gain in np.ndenumerate(factor * end.gains):
+                    exact[names.index(gain_name(i, j))] = gain
+                bench = bench if one is None else bench.at_gain(one.share / _FIRST)
                 base = bench.run(exact=exact)
                 if base.stop is not None or (steps_of(base) > _CALM * self._room).any():
                     return False
@@ -232,40 +202,21 @@ class Choice:
         except FpirhcError:  # it cannot be composed
             return False
 
-    def _bench(self, problem: Problem, one: Candidate | None, where: object) -> Bench:
-        """The loop with a candidate, which those of one form share."""
-        form = None if one is None else one.form
-        if (where, form) not in self._benches:
-            adapted = None if form is None else self.bare.with_deformation(form.deformation(self.estimates, _FIRST))
-            self._benches[where, form] = Bench.of(problem, adapted or self.bare)
-        bench = self._benches[where, form]
-        return bench if one is None else bench.at_gain(one.share / _FIRST)
+    def _bench(self, form: Form | None, place: tuple[tuple[float, ...], tuple[float, ...]] | None = None) -> Bench:
+        """The loop with the first share of a form, at dead times and lags; None: those of the estimate, with drift and noise."""
+        if (form, place) not in self._benches:
+            if form is not None:
+                adapted = self.bare.with_deformation(form.deformation(self.estimates, _FIRST))
+                bench = Bench.of(self._bench(None, place).problem, adapted)
+            elif place is not None:
+                bench = Bench(estimated_problem(self._given, self.estimates.gains, *place), self.bare)
+            else:
+                bench = Bench(self.problem, self.bare)
+            self._benches[form, place] = bench
+        return self._benches[form, place]
 
-    @cached_property
-    def _middle(self) -> tuple[Case, ...]:
-        """A gain margin of 1.4 to both sides of the estimate alone, and a command that is a cycle later."""
-        best = self.estimates.ends[0]
-        return Case(best, 1.4), Case(best, 0.6), Case(best, 1.0, later=1)
-
-    @cached_property
-    def _near(self) -> tuple[Case, ...]:
-        """A gain margin of 1.4 to both sides at every end of the likelihood, and a command a cycle later.
-
-        An end has its own gains: a longer lag with a larger gain says much the same of a record as a shorter one with a smaller.
-        """
-        ends = {(one.cycles, one.lags): one for one in reversed(self.estimates.ends)}.values()
-        return *self._middle[2:], *(Case(one, factor) for factor in (1.4, 0.6) for one in ends)
-
-    @cached_property
-    def _far(self) -> tuple[Case, ...]:
-        """Twice the gain, and a plant slower by half, because a lag is only a picture of what is slow; a command a cycle later."""
-        best, dead, lag = self.estimates.ends[0], self.estimates.dead[2], self.estimates.lag[2]
-        slow = np.maximum(lag, 0.25 * self._given.period)
-        wide = replace(best, cycles=tuple(dead.tolist()), lags=tuple(slow.tolist()))
-        return Case(wide, 2.0, slower=1.5), Case(wide, 1.4, later=1, slower=1.5)
-
-    def _forms(self) -> dict[str, Form]:
-        """Forms by name, each once."""
+    def forms(self) -> dict[str, Form]:
+        """Return the forms by name, each once."""
         low, value, high = self.estimates.dead
         likely = np.where(high > low, np.ceil((low + high) / 2), value)
         wrong = float(max((high - likely).max(), (likely - low).max(), 1.0)) if likely.any() else 0.0
@@ -291,15 +242,12 @@ class Choice:
         lower, upper = self._given.limits.input_bounds(plant)
         width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
         usual = np.maximum(_STEPS * steps_of(alone), _OF_RANGE * width)
-        if chatter is None:
-            return np.asarray(np.maximum(usual, 1e-300))
-        limits = chatter if isinstance(chatter, Mapping) else dict.fromkeys(plant.inputs, chatter)
-        return np.array([float(limits.get(name, own)) for name, own in zip(plant.inputs, usual, strict=True)])
+        limits = chatter or {}
+        return np.array([limits.get(n, max(own, 1e-300)) for n, own in zip(plant.inputs, usual, strict=True)])
 
 
-def mean_ratio(problem: Problem, alone: Run, run: Run, names: frozenset[str] | None) -> float:
+def mean_ratio(pair: ErrorPair) -> float:
     """Return the rms over the coordinates of their errors over those of the controller alone."""
-    pair = errors_of(problem, (alone, run), names)
     return float(np.sqrt(np.mean([pair.ratio(name) ** 2 for name in pair.without])))
 
 

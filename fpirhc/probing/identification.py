@@ -8,9 +8,9 @@ For every d, tau and share of the drift w the differences are whitened, and lamb
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache
 
 import numpy as np
 from scipy.signal import lfilter
@@ -34,11 +34,6 @@ class Interval:
     value: float
     low: float
     high: float
-
-    @property
-    def certain(self) -> bool:
-        """Whether it is one number."""
-        return self.low == self.high
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,19 +77,20 @@ def identify(
         usable: which cycles count; None: all.
 
     Raises:
-        InvalidValue: fewer than 40 cycles, or a model response that does not move.
+        InvalidValue: fewer than 40 cycles.
     """
     cycles = len(measured)
-    if cycles < LEAST_CYCLES:
-        raise InvalidValue(f"probe: {cycles} cycles of record; at least {LEAST_CYCLES} are needed, 50 to 500 are usual")
-    still = np.ptp(modelled, axis=0) <= 1e-12 * (1 + np.abs(modelled).max(axis=0))
-    if still.any():
-        raise InvalidValue(
-            f"probe: the model's response {int(np.argmax(still)) + 1} does not move in the record, so its gain is not known; "
-            "excite it, or record a run in which the commands move"
-        )
+    require_cycles(cycles)
     good = np.ones(cycles, dtype=bool) if usable is None else usable
     return tuple(_channel(measured[:, i], modelled, period, good) for i in range(measured.shape[1]))
+
+
+def require_cycles(cycles: int) -> None:
+    """Raise if these are too few."""
+    if cycles < LEAST_CYCLES:
+        raise InvalidValue(
+            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {LEAST_CYCLES}, 300 are usual"
+        )
 
 
 def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> Channel:
@@ -102,7 +98,7 @@ def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> C
     while True:  # an estimate at the edge of the search widens it
         lags = np.r_[0.0, np.geomspace(0.4 * period, 0.2 * cycles * period, _COARSE_LAGS)]
         fits = _profile(f, m, period, good, range(most + 1), lags, _COARSE)
-        best = max(fits, key=lambda one: one.likelihood)
+        best = _likeliest(fits)
         if best.dead < most - 1 or 2 * most > cycles // 4:
             break
         most *= 2
@@ -112,31 +108,24 @@ def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> C
     high = min((tau for tau in lags if tau > max(one.lag for one in near)), default=float(lags[-1]))
     fine = np.linspace(low, high, _FINE_LAGS) if low < 0.4 * period else np.geomspace(low, high, _FINE_LAGS)
     fits += _profile(f, m, period, good, list(deads)[:_MOST_DEAD], fine, _FINE)
-    return _answer(f, m, period, fits, (most, float(lags[-1])))
 
-
-def _answer(f: np.ndarray, m: np.ndarray, period: float, fits: list[Fit], searched: tuple[int, float]) -> Channel:
-    best, near = max(fits, key=lambda one: one.likelihood), _near(fits, _ENOUGH * _WIDER**2)
-    nearest = _near(fits, _ENOUGH)
-    beside = [
-        max((one for one in fits if one.lag == tau), key=lambda one: one.likelihood) for tau in _around(fits, nearest)
-    ]
+    best, near, nearest = _likeliest(fits), _near(fits, _ENOUGH * _WIDER**2), _near(fits, _ENOUGH)
+    beside = [_likeliest(one for one in fits if one.lag == tau) for tau in _around(fits, nearest)]
     within = np.array([one.gains for one in (*nearest, *beside)])
     half = _WIDER * np.hypot(2 * best.deviation, 0.5 * np.ptp(within, axis=0))
     gains = tuple(Interval(float(g), float(g - h), float(g + h)) for g, h in zip(best.gains, half, strict=True))
     dead = Interval(best.dead, min(one.dead for one in near), max(one.dead for one in near))
     lag = Interval(best.lag, *_around(fits, near))
-    differences = best.noise[1]
     root = abs(_whitener(sum(best.noise), best.ratio)[-1])
-    noise = math.sqrt(best.innovation * root * (2 if differences else 1))
-    rest = f - delayed(m, best.dead, best.lag, period) @ best.gains
-    drift = _smoothed(rest, *best.noise, 10.0**best.ratio)
+    noise = math.sqrt(best.innovation * root * (2 if best.noise[1] else 1))
+    drift = _smoothed(f - delayed(m, best.dead, best.lag, period) @ best.gains, *best.noise, 10.0**best.ratio)
     moved = float(np.sqrt(np.mean(np.diff(drift[_SETTLED:]) ** 2) / period))
-    ends = [best]
-    for fixed, interval in (("dead", dead), ("lag", lag)):
-        for end in (interval.low, interval.high):
-            ends.append(max((one for one in fits if getattr(one, fixed) == end), key=lambda one: one.likelihood))
-    edge = "dead time" if dead.high >= searched[0] else "lag" if lag.high >= searched[1] else ""
+    ends = [
+        best,
+        *(_likeliest(one for one in fits if one.dead == end) for end in (dead.low, dead.high)),
+        *(_likeliest(one for one in fits if one.lag == end) for end in (lag.low, lag.high)),
+    ]
+    edge = "dead time" if dead.high >= most else "lag" if lag.high >= lags[-1] else ""
     return Channel(gains, dead, lag, noise, drift, moved, edge, tuple(ends))
 
 
@@ -185,9 +174,13 @@ def _profile(
     return channels
 
 
+def _likeliest(fits: Iterable[Fit]) -> Fit:
+    return max(fits, key=lambda one: one.likelihood)
+
+
 def _near(fits: Sequence[Fit], distance: float) -> list[Fit]:
     """The points whose 2 log L is that near to the best."""
-    best = max(one.likelihood for one in fits)
+    best = _likeliest(fits).likelihood
     return [one for one in fits if 2 * (best - one.likelihood) < distance]
 
 
@@ -201,10 +194,7 @@ def _around(fits: Sequence[Fit], near: Sequence[Fit]) -> tuple[float, float]:
 @cache
 def _whitener(order: int, ratio: float) -> np.ndarray:
     """The stable factor of r z^n + (-1)^n (1 - z)^2n: the moving average that drift and noise are together."""
-    difference = np.array([1.0])
-    for _ in range(2 * order):
-        difference = np.convolve(difference, [1.0, -1.0])
-    spectrum = (-1) ** order * difference
+    spectrum = (-1) ** order * np.poly(np.ones(2 * order))
     spectrum[order] += 10.0**ratio
     roots = np.roots(spectrum)
     return np.real(np.poly(roots[np.argsort(np.abs(roots))][:order]))
@@ -216,10 +206,7 @@ def _smoothed(rest: np.ndarray, integrations: int, differences: int, ratio: floa
     from scipy.sparse.linalg import spsolve
 
     size = len(rest)
-    jumps = sparse.eye(size, format="csc")
-    for _ in range(integrations):
-        rows = jumps.shape[0] - 1
-        jumps = sparse.diags([-np.ones(rows), np.ones(rows)], [0, 1], shape=(rows, rows + 1)) @ jumps
+    jumps = sparse.diags(np.poly(np.ones(integrations)), range(integrations + 1), shape=(size - integrations, size))
     summed = sparse.csc_matrix(np.tril(np.ones((size, size)))) if differences else sparse.eye(size, format="csc")
     normal = summed.T @ summed + (jumps.T @ jumps) / max(ratio, 1e-9)
     return np.asarray(spsolve(sparse.csc_matrix(normal), summed.T @ (summed @ rest)))
@@ -231,61 +218,51 @@ _COUPLED = 1.2  # ratio of the eigenvalues' sizes from which one gain for all di
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """A plant that the likelihood allows: the gains that go with its dead times and lags, and a draw about them."""
+    """A plant that the likelihood allows: dead times, lags, and the gains that go with them."""
 
     cycles: tuple[float, ...]
     lags: tuple[float, ...]
     gains: np.ndarray
-    drawn: np.ndarray
+
+    def later(self) -> End:
+        """Return it with commands that come a cycle later still."""
+        return replace(self, cycles=tuple(c + 1 for c in self.cycles))
 
 
 class Estimates:
-    """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them."""
+    """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them.
+
+    `ends` are the best estimate, then the likeliest plants at both ends of the dead times, and of the lags, of all inputs.
+    `dead` and `lag` have the least, the estimated and the greatest of every input, shape (3, n).
+    """
 
     def __init__(self, channels: Sequence[Channel], seed: int) -> None:
         """Take the channels and the seed of the draws."""
-        self.channels, self._seed = tuple(channels), seed
+        self.channels = tuple(channels)
         self.gains = np.array([[g.value for g in one.gains] for one in channels])
-        self._deviations = np.array([[(g.high - g.low) / 4 for g in one.gains] for one in channels])
+        deviations = np.array([[(g.high - g.low) / 4 for g in one.gains] for one in channels])
         random = np.random.default_rng(seed)
-        self.draws = self.gains + self._deviations * random.standard_normal((_DRAWS, *self.gains.shape))
-        values = np.linalg.eigvals(self.draws)
-        real, size = values.real.min(axis=1), np.abs(values) ** 2 / np.maximum(np.abs(values.real), 1e-300)
-        self.smallest = float(np.quantile(real, _QUANTILE))
-        self.largest_real = float(np.quantile(values.real.max(axis=1), 1 - _QUANTILE))
-        self.largest = float(np.quantile(size.max(axis=1), 1 - _QUANTILE))
-
-    @cached_property
-    def ends(self) -> tuple[End, ...]:
-        """The best estimate, then the likeliest plants at both ends of the dead times, and of the lags, of all inputs."""
-        random, found = np.random.default_rng(self._seed), []
-        for fits in zip(*(one.ends for one in self.channels), strict=True):
-            gains, deviations = (np.array([getattr(one, what) for one in fits]) for what in ("gains", "deviation"))
-            drawn = gains + _WIDER * deviations * random.standard_normal(gains.shape)
-            found.append(End(tuple(float(f.dead) for f in fits), tuple(f.lag for f in fits), gains, drawn))
-        return tuple(found)
-
-    @cached_property
-    def wide(self) -> End:
-        """The best estimate, with a draw from the intervals of the gains, whatever the lag is."""
-        return replace(self.ends[0], drawn=self.draws[0])
-
-    @cached_property
-    def weights(self) -> tuple[tuple[float, ...], ...] | None:
-        """The inverse of Lambda by rows, in three digits: all directions then have one gain. None where they have it anyway."""
-        if len(self.gains) == 1 or self.refused:
-            return None
+        draws = self.gains + deviations * random.standard_normal((_DRAWS, *self.gains.shape))
+        real = np.linalg.eigvals(draws).real
+        self.smallest = float(np.quantile(real.min(axis=1), _QUANTILE))
+        self.largest_real = float(np.quantile(real.max(axis=1), 1 - _QUANTILE))
+        self.largest = _largest(draws)
+        self.dead, self.lag = (
+            np.array([(one.low, one.value, one.high) for one in some]).T
+            for some in zip(*((one.dead_time, one.lag) for one in channels), strict=True)
+        )
+        self.drift = np.column_stack([one.drift for one in channels])  # by cycle, shape (cycles, n)
+        self.ends = tuple(
+            End(tuple(float(f.dead) for f in fits), tuple(f.lag for f in fits), np.array([f.gains for f in fits]))
+            for fits in zip(*(one.ends for one in channels), strict=True)
+        )
         sizes = np.abs(np.linalg.eigvals(self.gains))
-        if sizes.max() < _COUPLED * sizes.min():
-            return None
-        return tuple(tuple(float(f"{w:.3g}") for w in row) for row in np.linalg.inv(self.gains))
-
-    @cached_property
-    def largest_weighted(self) -> float:
-        """As `largest`, of Lambda times the weights."""
-        values = np.linalg.eigvals(self.draws @ np.array(self.weights))
-        size = np.abs(values) ** 2 / np.maximum(np.abs(values.real), 1e-300)
-        return float(np.quantile(size.max(axis=1), 1 - _QUANTILE))
+        self.weights: tuple[tuple[float, ...], ...] | None = (
+            None  # the inverse of Lambda; None: all directions have one gain
+        )
+        if len(sizes) > 1 and not self.refused and sizes.max() >= _COUPLED * sizes.min():
+            self.weights = tuple(tuple(float(f"{w:.3g}") for w in row) for row in np.linalg.inv(self.gains))
+            self.largest_weighted = _largest(draws @ np.array(self.weights))  # of Lambda times the weights
 
     @property
     def uncertain(self) -> bool:
@@ -309,17 +286,9 @@ class Estimates:
         edges = [one.edge for one in self.channels if one.edge]
         return f"the record is too short for the {edges[0]}: take more cycles" if edges else ""
 
-    @cached_property
-    def dead(self) -> np.ndarray:
-        """Least, estimated, and greatest dead time of every input, shape (3, n)."""
-        return np.array([(one.dead_time.low, one.dead_time.value, one.dead_time.high) for one in self.channels]).T
 
-    @cached_property
-    def lag(self) -> np.ndarray:
-        """Least, estimated, and greatest lag of every input, shape (3, n)."""
-        return np.array([(one.lag.low, one.lag.value, one.lag.high) for one in self.channels]).T
-
-    @property
-    def drift(self) -> np.ndarray:
-        """By cycle, shape (cycles, n)."""
-        return np.column_stack([one.drift for one in self.channels])
+def _largest(matrices: np.ndarray) -> float:
+    """The gain that 1 / is deadbeat: |lambda|^2 / |Re lambda| of the eigenvalues, exceeded by one matrix in 40."""
+    values = np.linalg.eigvals(matrices)
+    sizes = np.abs(values) ** 2 / np.maximum(np.abs(values.real), 1e-300)
+    return float(np.quantile(sizes.max(axis=1), 1 - _QUANTILE))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -17,16 +17,16 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.fields.kinds import Count, Seed
 from fpirhc.probing.choice import DARING, Candidate, Choice, mean_ratio, steps_of
-from fpirhc.probing.identification import Estimates, Interval, identify
-from fpirhc.probing.recording import Record, excited, read_recording
+from fpirhc.probing.identification import Estimates, Interval, identify, require_cycles
+from fpirhc.probing.recording import excited, read_recording
 from fpirhc.simulation.model_as_plant import shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
 from fpirhc.simulation.trials import errors_of, weighed
-from fpirhc.summary import line, number, table
+from fpirhc.summary import line, number
 from fpirhc.task.problem import Problem
 
-_FEWEST, _USUAL = 40, 300
+_USUAL = 300  # cycles
 _MORE, _AGAIN = 2.5, 2  # factor of the amplitude where a sign is not certain, and how often it is applied
 _CLIPPED = 0.2  # share of the cycles at a limit, from which it is said
 
@@ -76,24 +76,12 @@ class Probe(FoundByName):
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self.facts), self.lines, self.why)
 
-    def _repr_html_(self) -> str:
-        """The estimates as a table, for notebooks."""
-        return table("Probe", ("", "estimate"), list(self.facts), [self.lines, self.why, *self.notes])
-
     @property
     def plain(self) -> dict[str, object]:
         """Everything but the problem, as plain data."""
-        return {
-            "gain": {n: {m: asdict(one) for m, one in entries.items()} for n, entries in self.gain.items()},
-            "dead_time": {name: asdict(one) for name, one in self.dead_time.items()},
-            "lag": {name: asdict(one) for name, one in self.lag.items()},
-            "noise": dict(self.noise),
-            "drift": dict(self.drift),
-            "lines": self.lines,
-            "why": self.why,
-            "trials": {name: asdict(one) for name, one in self.trials.items()},
-            "notes": list(self.notes),
-        }
+        found = asdict(replace(self, problem=None, candidates={}, deformation=None))
+        names = ("gain", "dead_time", "lag", "noise", "drift", "why", "trials", "notes")
+        return {name: found[name] for name in names} | {"lines": self.lines}
 
     @property
     def facts(self) -> tuple[tuple[str, str], ...]:
@@ -105,16 +93,9 @@ class Probe(FoundByName):
         ]
         dead = [(f"dead time of {name}, cycles", _interval(one)) for name, one in self.dead_time.items()]
         lags = [(f"lag of {name}, {self.time_unit}", _interval(one)) for name, one in self.lag.items()]
-        noise = [(f"noise of {name}{self._unit(name)}", number(one)) for name, one in self.noise.items()]
-        drift = [
-            (f"drift of {name}{self._unit(name, f'/{self.time_unit}^0.5')}", number(v))
-            for name, v in self.drift.items()
-        ]
+        noise = [(f"noise of {name}, {self.units[name]}", number(one)) for name, one in self.noise.items()]
+        drift = [(f"drift of {n}, {self.units[n]}/{self.time_unit}^0.5", number(one)) for n, one in self.drift.items()]
         return (*gains, *dead, *lags, *noise, *drift)
-
-    def _unit(self, name: str, per: str = "") -> str:
-        unit = self.units.get(name, "1")
-        return f", {unit}{per}" if per or unit != "1" else ""
 
 
 @checked_call
@@ -156,95 +137,55 @@ def probe(
             beside a recording.
         FpirhcError: every error that the controller raises about the problem.
     """
-    _check(problem, amplitude, chatter)
-    _check_excitation(cycles, amplitude, recording)
+    names, inputs = problem.plant.controlled_names, tuple(problem.plant.inputs)
+    amplitudes = _by_name("amplitude", amplitude, names, 0.0, "of at least 0")
+    budget = _by_name("chatter", chatter, inputs, np.nextafter(0.0, 1.0), "above 0")
+    for setting, given in (("cycles", cycles), ("amplitude", amplitude)):
+        if recording is not None and given is not None:
+            raise InvalidValue(
+                f"{setting} is of an excitation, and a recording has been excited: leave one of them out"
+            )
     cycles = _USUAL if cycles is None else cycles
+    require_cycles(cycles)
     bare = without_deformation(resolved(problem, controller))
-    estimates, notes = _recorded(problem, bare, cycles, amplitude, recording, seed)
+    estimates, notes = _recorded(problem, bare, cycles, amplitudes, recording, seed)
     trying = trials and recording is None
-    estimated, shortlist, results = None, {}, {}
+    estimated, shortlist, results, name = None, {}, {}, None
     why = estimates.refused or ("" if trying else estimates.unbounded)
     if not why:
         notes += [estimates.unbounded] if estimates.unbounded else []
         try:
-            choice = Choice(problem, bare, estimates, chatter)
-            estimated = choice.problem
-            shortlist = choice.shortlist()
-            why = (
-                "" if shortlist else "no setting that comes back at the ends of the record makes the error clearly less"
-            )
+            choice = Choice(problem, bare, estimates, budget)
+            estimated, shortlist = choice.problem, choice.shortlist()
+            why = "no setting that comes back at the ends of the record makes the error clearly less"
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"
-    try_them = trying and bool(shortlist)
-    if try_them:
+    if shortlist and trying:
         results = OnPlant(problem, bare, choice.allowed).walk(choice, shortlist, notes, seed + 1)
-    candidates = {name: one.deformation for name, one in shortlist.items()}
-    name = best(results) if try_them else "cautious" if "cautious" in candidates else None
-    if try_them and not results:
-        why = "the loop refuses every candidate"
-    elif try_them and name is None:
-        why = _none_of(results, problem)
-    elif candidates and name is None:
-        why = "no candidate bears twice the gain, which one that is not tried has to"
-    elif name is not None:
-        tests = (
-            f": {results[name].error:.3g} of the error of the controller alone"
-            if results
-            else ", not tried on the plant"
+        name = best(results)
+        why = (
+            f"{name}: {results[name].error:.3g} of the error of the controller alone"
+            if name
+            else _none(results, problem)
         )
-        why = f"{name}{tests}"
-    chosen = None if name is None else candidates[name]
-    return _answer(problem, estimates, chosen, why, results, candidates, estimated, notes)
-
-
-def _recorded(
-    problem: Problem,
-    bare: Controller,
-    cycles: int,
-    amplitude: float | Mapping[str, float] | None,
-    recording: str | Path | None,
-    seed: int,
-) -> tuple[Estimates, list[str]]:
-    """What the record says, and what to know beside; excited again where a sign is not certain and the amplitude is free."""
-
-    def estimates(record: Record) -> Estimates:
-        return Estimates(identify(record.measured, record.modelled, problem.period, record.usable), seed)
-
-    if recording is not None:
-        record = read_recording(Path(recording), problem)
-        return estimates(record), _notes(record)
-    names, again = problem.plant.controlled_names, 0
-    record = excited(problem, bare, cycles=cycles, amplitude=amplitude, seed=seed)
-    found = estimates(record)
-    while found.uncertain and amplitude is None and again < _AGAIN:
-        more = dict(zip(names, (_MORE * size for size in record.amplitude), strict=True))
-        record, again = excited(problem, bare, cycles=cycles, amplitude=more, seed=seed), again + 1
-        found = estimates(record)
-    text = f"the sign of a gain was not certain at first; excited again, with {_MORE**again:g} times the amplitude"
-    return found, [*_notes(record), *([text] if again else [])]
-
-
-def _answer(
-    problem: Problem,
-    estimates: Estimates,
-    chosen: Deformation | None,
-    why: str,
-    results: Mapping[str, Trial],
-    candidates: Mapping[str, Deformation],
-    estimated: Problem | None,
-    notes: list[str],
-) -> Probe:
-    names, inputs, channels = problem.plant.controlled_names, tuple(problem.plant.inputs), estimates.channels
+    elif shortlist:
+        name = "cautious" if "cautious" in shortlist else None
+        why = (
+            f"{name}, not tried on the plant"
+            if name
+            else "no candidate bears twice the gain, as one that is not tried has to"
+        )
+    channels = estimates.channels
     return Probe(
         gain={n: dict(zip(names, one.gains, strict=True)) for n, one in zip(names, channels, strict=True)},
         dead_time={n: one.dead_time for n, one in zip(inputs, channels, strict=True)},
         lag={n: one.lag for n, one in zip(inputs, channels, strict=True)},
         noise={n: one.noise for n, one in zip(names, channels, strict=True)},
         drift={n: one.drifting for n, one in zip(names, channels, strict=True)},
-        deformation=chosen,
+        deformation=shortlist[name].deformation if name else None,
         why=why,
-        trials=dict(results),
-        candidates=dict(candidates),
+        trials=results,
+        candidates={title: one.deformation for title, one in shortlist.items()},
         problem=estimated,
         notes=tuple(notes),
         units=dict(zip(names, problem.plant.response_signal("realised").entry_units, strict=True)),
@@ -252,61 +193,72 @@ def _answer(
     )
 
 
-def _none_of(results: Mapping[str, Trial], problem: Problem) -> str:
-    """Why none of the trials is kept; the budget of chatter where nothing else is against one."""
-    loud = {name: one for name, one in results.items() if not one.calm and replace(one, calm=True).passes}
-    if loud:
-        name = min(loud, key=lambda n: loud[n].error)
-        budget = {n: float(f"{_SPARE * step:.2g}") for n, step in loud[name].steps.items()}
-        one = f"{max(budget.values()):g}"
-        given = f"{budget}, or --chatter {one} for every input" if len(budget) > 1 else one
-        return (
-            f"in trials on the plant {name} had {loud[name].error:.3g} of the error of the controller alone, but the steps of its "
-            f"commands are beyond the budget of chatter; where the plant bears them, give chatter={given}"
-        )
-    bearing = "" if all(one.bears for one in results.values()) else f", and bore {MARGIN:g} times its gain"
-    since = "" if problem.measure_from else "; errors count from the start on, where measure_from is not stated"
-    return f"in trials on the plant no candidate made the error clearly less, and that of no coordinate larger{bearing}{since}"
+def _by_name(
+    what: str, setting: float | Mapping[str, float] | None, names: Sequence[str], least: float, words: str
+) -> dict[str, float] | None:
+    """The entries of a setting, checked; one number is that of all."""
+    if setting is None:
+        return None
+    entries = dict(setting) if isinstance(setting, Mapping) else dict.fromkeys(names, setting)
+    for name, value in entries.items():
+        if name not in names:
+            raise InvalidName(f"probe({what}=...): '{name}' is unknown.{nearest(name, names)}")
+        if not least <= value < np.inf:
+            raise InvalidValue(f"probe({what}={value!r}): expected a number {words}, in the unit of the signal")
+    return entries
 
 
-def _notes(record: Record) -> list[str]:
-    notes = [f"the run ended early: {record.stop}"] if record.stop else []
+def _recorded(
+    problem: Problem,
+    bare: Controller,
+    cycles: int,
+    amplitude: Mapping[str, float] | None,
+    recording: str | Path | None,
+    seed: int,
+) -> tuple[Estimates, list[str]]:
+    """What the record says, and what to know beside; excited again where a sign is not certain and the amplitude is free."""
+    again, notes = _AGAIN if amplitude is None and recording is None else 0, []
+    while True:
+        if recording is None:
+            record = excited(problem, bare, cycles=cycles, amplitude=amplitude, seed=seed)
+        else:
+            record = read_recording(Path(recording), problem)
+        found = Estimates(identify(record.measured, record.modelled, problem.period, record.usable), seed)
+        if not (found.uncertain and again):
+            break
+        again -= 1
+        louder = (_MORE * size for size in record.amplitude)
+        amplitude = dict(zip(problem.plant.controlled_names, louder, strict=True))
+        notes = [
+            "the sign of a gain was not certain at first; "
+            f"excited again, with {_MORE ** (_AGAIN - again):g} times the amplitude"
+        ]
+    notes += [f"the run ended early: {record.stop}"] if record.stop else []
     if record.clipped > _CLIPPED:
         notes.append(f"commands stood at a limit in {record.clipped:.0%} of the cycles, which tell less")
-    return notes
+    return found, notes
 
 
-def _check(
-    problem: Problem, amplitude: float | Mapping[str, float] | None, chatter: float | Mapping[str, float] | None
-) -> None:
-    for what, setting, names, least in (
-        ("amplitude", amplitude, problem.plant.controlled_names, "of at least 0"),
-        ("chatter", chatter, tuple(problem.plant.inputs), "above 0"),
-    ):
-        entries = setting if isinstance(setting, Mapping) else {"": setting}
-        for name, value in entries.items():
-            if name and name not in names:
-                raise InvalidName(f"probe({what}=...): '{name}' is unknown.{nearest(name, names)}")
-            least_value = 0.0 if what == "amplitude" else np.nextafter(0.0, 1.0)
-            wrong = value is not None and not least_value <= value < np.inf
-            if wrong:
-                raise InvalidValue(f"probe({what}={value!r}): expected a number {least}, in the unit of the signal")
-
-
-def _check_excitation(
-    cycles: int | None, amplitude: float | Mapping[str, float] | None, recording: str | Path | None
-) -> None:
-    for name, given in (("cycles", cycles), ("amplitude", amplitude)):
-        if recording is not None and given is not None:
-            raise InvalidValue(f"{name} is of an excitation, and a recording has been excited: leave one of them out")
-    if cycles is not None and cycles < _FEWEST:
-        raise InvalidValue(
-            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {_FEWEST}, {_USUAL} are usual"
+def _none(results: Mapping[str, Trial], problem: Problem) -> str:
+    """Why none of the trials is kept; the budget of chatter where nothing else is against one."""
+    loud = {name: one for name, one in results.items() if not one.calm and replace(one, calm=True).passes}
+    if not loud:
+        return (
+            f"in trials on the plant no candidate made the error from {problem.measure_from:g} {problem.time_unit} on clearly "
+            f"less, and that of no coordinate larger, and bore {MARGIN:g} times its gain"
         )
+    name = min(loud, key=lambda n: loud[n].error)
+    steps = loud[name].steps
+    return (
+        f"in trials on the plant {name} had {loud[name].error:.3g} of the error of the controller alone, but the steps of its "
+        f"commands, {', '.join(f'{n} {step:.2g}' for n, step in steps.items())}, are beyond the budget of chatter; where the plant "
+        f"bears them, give chatter={_SPARE * max(steps.values()):.2g}"
+    )
 
 
 def _interval(one: Interval) -> str:
-    return number(one.value) if one.certain else f"{number(one.value)} ({number(one.low)} to {number(one.high)})"
+    certain = one.low == one.high
+    return number(one.value) if certain else f"{number(one.value)} ({number(one.low)} to {number(one.high)})"
 
 
 MARGIN = 1.4  # times its gain that a candidate which prediction has not shown to be safe has to bear in a trial
@@ -371,9 +323,8 @@ class OnPlant:
         pair = errors_of(self._problem, (alone, run), self._names)
         steps = steps_of(run)
         calm = loud or self._allowed is None or bool((steps <= self._allowed(alone)).all())
-        ratio = mean_ratio(self._problem, alone, run, self._names)
         by_input = dict(zip(self._problem.plant.inputs, steps.tolist(), strict=True))
-        return Trial(ratio, max(pair.ratio(n) for n in pair.without), calm=calm, steps=by_input)
+        return Trial(mean_ratio(pair), max(pair.ratio(n) for n in pair.without), calm=calm, steps=by_input)
 
     def walk(self, choice: Choice, shortlist: dict[str, Candidate], notes: list[str], seed: int) -> dict[str, Trial]:
         """Return trials of the shortlist, then of the shares beside the best one, which are added to it, until there are none.
@@ -395,15 +346,16 @@ class OnPlant:
                 proven.add(name)
                 if not self._bears_more(chosen.deformation, results[name], seed):
                     notes.append(f"{name} is not kept: on the plant it does not bear {MARGIN:g} times its gain")
-                    lost = [n for n in results if _walked(n) and shortlist[n].is_larger(chosen)]
-                    results |= {n: replace(results[n], bears=False) for n in (name, *lost)}
+                    same = {n for n in results if _walked(n) and shortlist[n].form == chosen.form}
+                    lost = {n for n in same if shortlist[n].share >= chosen.share}
+                    results |= {n: replace(results[n], bears=False) for n in lost}
                 continue
             known = [one.deformation for one in shortlist.values()]
             beside = choice.beside(chosen, shortlist.values())
             titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
             new = {title: one for title, one in titled.items() if one.deformation not in known}
             # An error falls with the share until the loop is lost, so a smaller one is tried where no larger one is better.
-            larger = {title: one for title, one in new.items() if one.is_larger(chosen)}
+            larger = {title: one for title, one in new.items() if one.share > chosen.share}
             new, needed = (larger, _CLEARLY * results[name].error) if larger else (new, np.inf)
             shortlist |= new
             if not new and name in again:

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
 
 import casadi as ca
 import numpy as np
+import pandas as pd
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.deformation.base import Deformation, Iteration
+from fpirhc.deformation.base import Identity, Iteration
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.motion import input_columns
@@ -30,12 +29,13 @@ _BEGUN = 3  # cycles after which a response is one of the run
 
 
 @dataclass(frozen=True)
-class Excitation(Deformation):
+class Excitation(Identity):
     """r_k = d_k + A s_k with a random binary sequence s, independent in every channel."""
 
     amplitude: tuple[float, ...]  # A of every channel, in the unit of the response; 0 only listens
     cycles: int  # length of the sequence; after it the request is the desired response
     seed: int = 0  # of the sequence
+    adapts = True  # without adaptation no loop passes its response on
 
     @property
     def iteration(self) -> Iteration:
@@ -43,9 +43,7 @@ class Excitation(Deformation):
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         del elements
-        return Layout(
-            (*(scalar(f"{name}_before") for pair in self._names for name in pair), scalar("excitation_cycle"))
-        )
+        return Layout((*(scalar(name) for name in self.shown().values()), scalar("excitation_cycle")))
 
     def shown(self) -> Mapping[str, str]:
         return {name: f"{name}_before" for pair in self._names for name in pair}
@@ -54,30 +52,15 @@ class Excitation(Deformation):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         table = sequence(self.cycles, len(self.amplitude), self.seed) * np.array(self.amplitude)
-        cycle = memory["excitation_cycle"]
-        grid = [np.arange(self.cycles, dtype=float).tolist()]
-        added = [
-            ca.interpolant(f"excitation{k}", "linear", grid, column.tolist())(ca.fmin(cycle, self.cycles - 1))
-            for k, column in enumerate(table.T)
-        ]
+        cycle, grid = memory["excitation_cycle"], np.arange(self.cycles, dtype=float)
+        added = ca.interpolant("excitation", "linear", [grid.tolist()], table.ravel().tolist())
         remembered = {"excitation_cycle": cycle + 1}
         for k, (model, measured) in enumerate(self._names):
             remembered |= {f"{model}_before": request[k], f"{measured}_before": response[k]}
-        return desired + ca.vertcat(*added), remembered
+        return desired + added(ca.fmin(cycle, self.cycles - 1)), remembered
 
     def effective_gain(self) -> float:
-        """Next to nothing; zero would be no adaptation, with which no loop passes its response on."""
-        return 1e-9
-
-    def secant_gain(self) -> float:
-        return self.effective_gain()
-
-    def largest_step(self) -> float:
-        return float("inf")
-
-    def with_effective_gain(self, gain: float) -> Self:
-        del gain
-        return replace(self)
+        return 1e-9  # next to nothing
 
     @property
     def _names(self) -> list[tuple[str, str]]:
@@ -111,12 +94,12 @@ def sequence(cycles: int, channels: int, seed: int) -> np.ndarray:
 
 
 def excited(
-    problem: Problem, controller: Controller, *, cycles: int, amplitude: float | Mapping[str, float] | None, seed: int
+    problem: Problem, controller: Controller, *, cycles: int, amplitude: Mapping[str, float] | None, seed: int
 ) -> Record:
     """Return the record of a run under the controller without its deformation, excited.
 
     Args:
-        amplitude: in the unit of the response, by controlled coordinate or one for all; None: twice the noise of a silent run of
+        amplitude: in the unit of the response, by controlled coordinate; None: twice the noise of a silent run of
             the same length and a tenth of the deviation of its desired response.
     """
     names = problem.plant.controlled_names
@@ -126,10 +109,8 @@ def excited(
         noise = np.median(np.abs(np.diff((silent.measured - silent.modelled)[_BEGUN:], axis=0)), axis=0) / 0.6745
         sizes = _NOISES * noise / np.sqrt(2) + _SHARE * np.std(np.asarray(run["desired"])[_BEGUN:], axis=0)
         chosen = tuple(map(float, sizes))
-    elif isinstance(amplitude, Mapping):
-        chosen = tuple(float(amplitude.get(name, 0.0)) for name in names)
     else:
-        chosen = (float(amplitude),) * len(names)
+        chosen = tuple(float(amplitude.get(name, 0.0)) for name in names)
     return _run(short, bare, chosen, cycles, seed)[1]
 
 
@@ -154,7 +135,7 @@ def require_moving(commands: np.ndarray, inputs: Iterable[str], where: str) -> N
     if still.any():
         raise InvalidValue(
             f"{where}: the input '{list(inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain; "
-            "record a run in which it steps, or excite it"
+            "record a run in which it steps, or leave it room within its limits"
         )
 
 
@@ -175,82 +156,48 @@ def read_recording(path: Path, problem: Problem) -> Record:
     Raises:
         InvalidValue: missing columns, other times than those of the period, entries that are no numbers; all mistakes together.
     """
-    columns = columns_of(path)
+    table = _table(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
-    responses = response_names(plant)
-    lower = {name: name[:-1] for name in responses}
-    needed = ("time", *input_columns(plant), *plant.state.elements)
-    lacking(columns, needed, mistakes)
-    for name in responses:
-        if name not in columns and lower[name] not in columns:
-            mistakes.add(f"it has no column '{name}', nor '{lower[name]}' to take the difference of")
-    mistakes.raise_if_any()
-    check_times(columns, problem, mistakes)
-    mistakes.raise_if_any()
-    states = np.column_stack([columns[e] for e in plant.state.elements])
-    commands = np.column_stack([columns[n] for n in input_columns(plant)])
-    require_moving(commands, plant.inputs, f"recording {path.name}")
-    measured = np.column_stack(
-        [columns[n] if n in columns else np.diff(columns[lower[n]], prepend=np.nan) / period for n in responses]
-    )[1:]
-    modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, plant.approximate)).T
-    usable = np.isfinite(measured).all(axis=1) & np.isfinite(modelled).all(axis=1)
-    if usable.sum() < len(usable):
-        measured, modelled = (np.where(np.isfinite(one), one, 0.0) for one in (measured, modelled))
-    return Record(measured, modelled, usable)
-
-
-def lacking(columns: Mapping[str, np.ndarray], needed: Sequence[str], mistakes: Mistakes, what: str = "") -> None:
-    """Add one mistake that names all columns that are missing, and those that there are."""
-    missing = [name for name in needed if name not in columns]
+    missing = [n for n in ("time", *input_columns(plant), *plant.state.elements) if n not in table]
     if missing:
-        some = "a column" if len(missing) == 1 else "columns"
-        mistakes.add(f"it lacks {some} for {', '.join(missing)}{what}; its columns are {', '.join(columns)}")
-
-
-def check_times(columns: Mapping[str, np.ndarray], problem: Problem, mistakes: Mistakes) -> None:
-    """Add a mistake where the times are missing, or are not a period apart."""
-    if "time" not in columns:
-        lacking(columns, ["time"], mistakes)
-        return
-    times, period, unit = columns["time"], problem.period, problem.time_unit
-    if len(times) < 2:
+        mistakes.add(f"it lacks columns for {', '.join(missing)}; its columns are {', '.join(map(str, table))}")
+    for name in response_names(plant):
+        if name not in table and name[:-1] not in table:
+            mistakes.add(f"it has no column '{name}', nor '{name[:-1]}' to take the difference of")
+    if len(table) < 2:
         mistakes.add("it has fewer than two rows of numbers below the line of names")
-        return
+    mistakes.raise_if_any()
+    times = table["time"].to_numpy()
     uneven = ~(np.abs(np.diff(times) - period) <= _EVEN * period)
     if uneven.any():
         k = int(np.argmax(uneven))
-        mistakes.add(
-            f"its times are not {period:g} {unit} apart, the period of the problem: {times[k]:g} is followed by {times[k + 1]:g}"
+        raise InvalidValue(
+            f"recording {path.name}: its times are not {period:g} {problem.time_unit} apart, the period of the problem: "
+            f"{times[k]:g} is followed by {times[k + 1]:g}"
         )
+    commands, states = (table[list(names)].to_numpy() for names in (input_columns(plant), plant.state.elements))
+    require_moving(commands, plant.inputs, f"recording {path.name}")
+    responses = [table[n] if n in table else table[n[:-1]].diff() / period for n in response_names(plant)]
+    measured = np.column_stack(responses)[1:]
+    modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, plant.approximate)).T
+    usable = np.isfinite(measured).all(axis=1) & np.isfinite(modelled).all(axis=1)
+    measured, modelled = (np.where(np.isfinite(one), one, 0.0) for one in (measured, modelled))
+    return Record(measured, modelled, usable)
 
 
-def columns_of(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a CSV file by name; an empty entry is NaN."""
+def _table(path: Path) -> pd.DataFrame:
+    """The numbers of a CSV file; an entry that is empty or not there is NaN."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = csv.reader(file)
-            numbered = [(lines.line_num, row) for row in lines if row and not row[0].startswith("#")]
+        table = pd.read_csv(path, comment="#", encoding="utf-8-sig", skipinitialspace=True).rename(columns=str.strip)
     except OSError as error:
         raise InvalidValue(f"recording '{path}' cannot be read: {error.strerror}") from None
-    except (ValueError, csv.Error) as error:
-        raise InvalidValue(f"recording {path}: cannot be read as a CSV file with a line of names ({error})") from None
-    if not numbered:
+    except ValueError as error:
         raise InvalidValue(
-            f"recording {path.name}: it is empty; expected a line of names, such as time, and rows of numbers"
+            f"recording {path.name}: expected a line of names, such as time, and rows of as many numbers; {error}"
+        ) from None
+    numbers = table.apply(pd.to_numeric, errors="coerce").astype(float)
+    for row, column in np.argwhere((numbers.isna() & table.notna()).to_numpy())[:1]:
+        raise InvalidValue(
+            f"recording {path.name}: row {row + 1} of numbers has {table.iat[row, column]!r} for {table.columns[column]}"
         )
-    (_, head), *rows = numbered
-    values = []
-    for number, row in rows:
-        if len(row) != len(head):
-            raise InvalidValue(
-                f"recording {path.name}: line {number} has {len(row)} entries, the line of names {len(head)}"
-            )
-        try:
-            values.append([float(entry) if entry.strip() else np.nan for entry in row])
-        except ValueError:
-            raise InvalidValue(
-                f"recording {path.name}: line {number} is not made of numbers: {', '.join(row)}"
-            ) from None
-    table = np.array(values).reshape(-1, len(head))
-    return {name.strip(): column for name, column in zip(head, table.T, strict=True)}
+    return numbers

@@ -90,7 +90,8 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     "probe": [
         (None, "probe line.py --cycles 80 --no-trials", 0, "line: probe with CTC"),
         (recorded, "probe line.py --recording run.csv --json", 0, "{"),
-        (WEAK, "probe line.py --cycles 80", 1, "line: probe with CTC"),
+        (None, "probe line.py --cycles 80 --chatter 1e-9", 1, "line: probe with CTC"),
+        (WEAK, "probe line.py --cycles 80", 2, "fpirhc: probe: the input 'u' never changes"),
     ],
     "compare": [
         (None, "compare line.py --no-compile", 0, MASS),

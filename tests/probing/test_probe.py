@@ -36,7 +36,8 @@ def identified(
     problem: fp.Problem, cycles: int = 300, amplitude: float | None = None, seed: int = 0
 ) -> tuple[Channel, ...]:
     """What one excited run says of every response."""
-    record = excited(problem, RHC, cycles=cycles, amplitude=amplitude, seed=seed)
+    given = None if amplitude is None else {"q": amplitude}
+    record = excited(problem, RHC, cycles=cycles, amplitude=given, seed=seed)
     return identify(record.measured, record.modelled, problem.period, record.usable)
 
 
@@ -201,7 +202,7 @@ def test_trials_keep_none_that_is_worse():
 
 def forms(choice: Choice, *names: str) -> dict[str, Candidate]:
     """The first forms of a choice, by other names: a list of candidates without the search."""
-    return {name: choice._candidate(form, 0.2) for name, form in zip(names, choice._forms().values(), strict=False)}
+    return {name: choice._candidate(form, 0.2) for name, form in zip(names, choice.forms().values(), strict=False)}
 
 
 def test_a_daring_candidate_that_bears_no_more_gain_is_told_as_such(monkeypatch):
@@ -376,8 +377,10 @@ class Untouched:
     [
         ("time,u,q\n0,0,0\n0.01,0,0\n", "no column 'q''"),
         ("time,u,q,q',q''\n0,0,0,0,0\n0.02,0,0,0,0\n", "not 0.01 s apart"),
-        ("time,u,q,q',q''\n0,0,0,x,0\n", "line 2 is not made of numbers"),
-        ("time,u,q,q',q''\n0,0,0,0\n", "line 2 has 4 entries, the line of names 5"),
+        ("time,u,q,q',q''\n0,0,0,x,0\n", "row 1 of numbers has 'x' for q'"),
+        ("time,u,q,q',q''\n0,0,0,0,0\n0,0,0,0,0,0\n", "Expected 5 fields in line 3, saw 6"),
+        ("time,u,q,q',q''\n0,0,0,0\n", "fewer than two rows"),
+        ("", "expected a line of names"),
     ],
 )
 def test_a_wrong_recording_says_what_is_wrong(tmp_path, text, words):
