@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-import pytest
 from plants import swing
 
 import fpirhc as fp
@@ -78,25 +75,6 @@ def test_parameters_are_not_compiled_in():
     other = loops[1].function(memories[1])[0].full()
     assert not np.array_equal(values[0], values[1])
     np.testing.assert_array_equal(values[1], other)
-
-
-LONG = """
-from dataclasses import replace
-import fpirhc as fp
-task = fp.load_problem("two_mass")
-run = fp.simulate(replace(task.problem, duration=200.0), task.controllers["CTC+FPI (eq 6)"], seed=0)
-assert run.cycles == 200_000 and run.stop is None
-fp.measure(task.problem, run)
-# ru_maxrss would begin with the size of the process that started this one.
-print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmHWM")))
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from a file of Linux")
-def test_memory_of_a_long_run():
-    """200 s at 1 kHz with every signal stay under 380 MB: ten minutes stay under 1 GB."""
-    done = subprocess.run([sys.executable, "-c", LONG], capture_output=True, text=True, check=True)
-    assert int(done.stdout) < 380_000
 
 
 # Short runs are not worth a compiler: `compiled=None` chooses
