@@ -77,10 +77,8 @@ class Task(FoundByName):
     def _repr_html_(self) -> str:
         """The controllers as a table, for notebooks."""
         pair = dict(zip(self.headline or (), ("without adaptation", "with adaptation"), strict=False))
-        rows = [
-            (name, type(one).__name__, type(one.deformation).__name__, pair.get(name, ""))
-            for name, one in self.controllers.items()
-        ]
+        kinds = {name: (type(one).__name__, type(one.deformation).__name__) for name, one in self.controllers.items()}
+        rows = [(name, *both, pair.get(name, "")) for name, both in kinds.items()]
         notes = [*self.description.split("\n\n")[:1], f"Problem: {', '.join(problem_facts(self.problem))}."]
         return table(f"{self.name}: {self.title}", ("controller", "kind", "deformation", "headline"), rows, notes)
 
@@ -220,9 +218,8 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
     for path, errors in lacked.items():
         if chosen and len(errors) == len(chosen):
             if path in task.problem.moved.parameters:
-                raise InvalidName(
-                    f"setting '{path}': write exact.{path} for the plant, approximate.{path} for the model"
-                )
+                mend = f"write exact.{path} for the plant, approximate.{path} for the model"
+                raise InvalidName(f"setting '{path}': {mend}")
             raise max(errors, key=lambda error: "Did you mean" in str(error))
     return replace(task, problem=problem, controllers=controllers)
 
@@ -250,11 +247,8 @@ def _line_of(module: ModuleType, name: str) -> str:
     """Return "line 12: " of the last assignment of a name in a module's file; empty where there is none."""
     tree = ast.parse(Path(module.__file__ or "").read_bytes())
     assigned = (one for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) for one in ast.walk(node))
-    lines = [
-        one.lineno
-        for one in assigned
-        if isinstance(one, ast.Name) and one.id == name and isinstance(one.ctx, ast.Store)
-    ]
+    names = [one for one in assigned if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)]
+    lines = [one.lineno for one in names if one.id == name]
     return f"line {lines[-1]}: " if lines else ""
 
 

@@ -15,14 +15,11 @@ from fpirhc.symbolic.paths import changed_at, content_at, names_in
 from fpirhc.task.cases import PARAMETERS, START, Cases, check_change
 from fpirhc.task.problem import Problem
 
-Values = Mapping[str, float]
+Owner = TypeVar("Owner", Controller, Problem)
 _DIGITS = 4  # of every number that is tried, so that a written number is exactly the tried one
 
 
-Owner = TypeVar("Owner", Controller, Problem)
-
-
-def with_settings(owner: Owner, values: Values) -> Owner:
+def with_settings(owner: Owner, values: Mapping[str, float]) -> Owner:
     """Return a controller, or a problem, with other values of some settings.
 
     Args:
@@ -85,12 +82,10 @@ def current_setting(owner: Controller | Problem, path: str) -> float:
     """Return the number at a path."""
     value = content_at(owner, path, "the problem" if isinstance(owner, Problem) else "the controller")
     if isinstance(value, bool) or not isinstance(value, int | float):
-        hint = (
-            " give it a number first"
-            if value is None
-            else f" go on with one of: {', '.join(names_in(value)) or 'none'}"
+        mend = (
+            "give it a number first" if value is None else f"go on with one of: {', '.join(names_in(value)) or 'none'}"
         )
-        raise InvalidValue(f"setting '{path}' is {value!r}, not a number;{hint}")
+        raise InvalidValue(f"setting '{path}' is {value!r}, not a number; {mend}")
     return value
 
 

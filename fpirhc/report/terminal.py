@@ -238,23 +238,19 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Pa
 
 def settings_in_force(run: Run) -> list[str]:
     """Return one line per time from which other live settings were in force."""
-    lines = [
-        (time, ", ".join(f"{path} = {value:g}" for path, value in numbers.items())) for time, numbers in run.in_force
-    ]
+    lines = [(time, ", ".join(f"{path} = {value:g}" for path, value in own.items())) for time, own in run.in_force]
     return [f"settings from {time:g} {run.time_unit}: {text}" for time, text in lines]
 
 
 def set_points_in_force(run: Run) -> list[str]:
     """Return one line per coordinate with the set-points of the run and the times from which they were in force."""
     record = cast(dict[str, list[list[float]] | str], run.settings.get("setpoints", {}))
-    return [f"set-points of {name}: {_steps_text(run, steps)}" for name, steps in record.items()]
-
-
-def _steps_text(run: Run, steps: list[list[float]] | str) -> str:
-    if isinstance(steps, str):
-        return steps
-    shown = [f"{value:g} from {time:g} {run.time_unit}" for time, value in steps[:_MOST_STEPS]]
-    return ", ".join(shown) + (f", and {len(steps) - _MOST_STEPS} more" if len(steps) > _MOST_STEPS else "")
+    lines = []
+    for name, steps in record.items():
+        shown = [steps] if isinstance(steps, str) else [f"{value:g} from {at:g} {run.time_unit}" for at, value in steps]
+        more = [f"and {len(shown) - _MOST_STEPS} more"] if len(shown) > _MOST_STEPS else []
+        lines.append(f"set-points of {name}: {', '.join([*shown[:_MOST_STEPS], *more])}")
+    return lines
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
@@ -281,19 +277,11 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
 
 def _plan_row(solved: Solved) -> list[str]:
     plan, known = solved.plan, solved.certificate
-    bounds = (
-        [f"{known.factor:.3f}", written_out(known.input_error, 2), written_out(known.suboptimality, 2)]
-        if known
-        else ["-"] * 3
-    )
-    return [
-        solved.name,
-        "-" if plan.cost is None else written_out(plan.cost, 7),
-        "-" if plan.stationarity is None else written_out(plan.stationarity, 1),
-        f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-",
-        *bounds,
-        plan.status.name.lower().replace("_", " "),
-    ]
+    bounds = (known.factor, known.input_error, known.suboptimality) if known else (None, None, None)
+    numbers = zip((plan.cost, plan.stationarity, *bounds), (7, 1, 3, 2, 2), strict=True)
+    cost, residual, *known_bounds = ("-" if v is None else written_out(v, digits) for v, digits in numbers)
+    rounds = f"{plan.iterations:.0f}" if plan.iterations >= 0 else "-"
+    return [solved.name, cost, residual, rounds, *known_bounds, plan.status.name.lower().replace("_", " ")]
 
 
 def show_review(found: Review, *, verbose: bool = False) -> None:
