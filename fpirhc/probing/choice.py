@@ -1,8 +1,7 @@
 """Which adaptation suits a plant as estimated: candidates run on it, and come back from a push at the ends of the likelihood.
 
 Gains are shares g of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or the inverse of Lambda where responses are coupled.
-A mirror that is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too, and one with
-three times the lag, which stands for everything slow.
+A mirror that is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too.
 """
 
 from __future__ import annotations
@@ -32,11 +31,7 @@ from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.task.problem import Problem
 
 DARING = ("prompt", "lagging")
-"""Candidates that come back at the estimate alone, or begin with the least share: trials have to show them.
-
-The first believes no lateness, the second a lag and no dead time. They are offered whatever the estimate says of them, and trials
-go on from there.
-"""
+"""Candidates that come back at the estimate alone, or begin with the least share: trials have to show them."""
 SHARES = (0.05, 0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
 _POLES = (0.0, 0.5, 0.8)  # of the filter
 _FIRST = 0.2  # share with which loops are built
@@ -221,19 +216,15 @@ class Choice:
         likely = np.where(high > low, np.ceil((low + high) / 2), value)
         wrong = float(max((high - likely).max(), (likely - low).max(), 1.0)) if likely.any() else 0.0
         cycles, never = tuple(likely.tolist()), (0.0,) * len(value)
-        least, lag, most = (tuple(one.tolist()) for one in self.estimates.lag)
+        lag = tuple(self.estimates.lag[1].tolist())
         forms = {
             "referenced": Form(True, cycles, lag, wrong),
-            "mirrored": Form(True, cycles, most, wrong),
             "prompt": Form(True, never, never),
             "lagging": Form(True, never, lag),
             "plain": Form(False, cycles, never),
         }
-        if any(tau > 0.5 * self._given.period for tau in least):
-            forms["long lag"] = Form(True, cycles, tuple(3 * tau for tau in most), 1.0 if likely.any() else 0.0)
         if self.estimates.weights is not None:
-            forms |= {"matrix": replace(forms["prompt"], weighted=True)}
-            forms |= {"late matrix": replace(forms["referenced"], weighted=True)} if any(cycles) or any(lag) else {}
+            forms["matrix"] = replace(forms["prompt"], weighted=True)
         return {name: one for k, (name, one) in enumerate(forms.items()) if one not in list(forms.values())[:k]}
 
     def allowed(self, alone: Run) -> np.ndarray:

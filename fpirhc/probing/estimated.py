@@ -16,7 +16,7 @@ from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import Parameter, outside
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.sensing.sensing import Sensing, Sensor
+from fpirhc.sensing.sensing import Sensor
 from fpirhc.simulation.model_as_plant import behind_actuators
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
@@ -53,37 +53,29 @@ def estimated_problem(
         duration, times = period * max(len(drift), min(own.cycles, _CYCLES)), period * np.arange(len(drift))
         begin = min(begin, _BEGUN * duration)
         courses = {s: Unknown(Samples(times, w)) for s, w in zip(signals, drift.T, strict=True)}
+    start: Mapping[str, float] = own.start
+    if own.plant.equations.known_on_reference:  # what is judged is what comes after the transient
+        start = dict(zip(own.plant.state.elements, map(float, reference_states(own, 2)[:, 0]), strict=True))
+    sensing = own.sensing
+    if noise and sensing.estimator.shows_response and sensing.observer is None:  # the response itself is measured
+        sizes = zip(response_names(own.plant), noise, strict=True)
+        noisy = {name: Sensor(noise=Noise(size)) for name, size in sizes if size}
+        sensing = replace(sensing, sensors={**sensing.sensors, **noisy})
     actuated = behind_actuators(plant, lags)
     added = [name for name in actuated.coordinates if name not in plant.coordinates]
     at_rest = [float(u) for u, lag in zip(own.inputs_before, lags, strict=True) if lag > 0]
     return replace(
         own,
         plant=problem.plant,
-        start=_start(own),
+        start=start,
         reality=Reality(actuated, integrator=finer, start=dict(zip(added, at_rest, strict=True))),
         dead_time=DeadTime(inputs={name: c * period for name, c in zip(own.plant.inputs, cycles, strict=True)}),
         signals={**own.signals, **courses},
         disturbances={},
-        sensing=_noisy(own, noise),
+        sensing=sensing,
         duration=duration,
         measure_from=begin,
     )
-
-
-def _start(own: Problem) -> Mapping[str, float]:
-    """A start on the reference, where it gives the whole state: what is judged is what comes after the transient."""
-    if not own.plant.equations.known_on_reference:
-        return own.start
-    return dict(zip(own.plant.state.elements, map(float, reference_states(own, 2)[:, 0]), strict=True))
-
-
-def _noisy(own: Problem, noise: Sequence[float]) -> Sensing:
-    """The sensing with the noise of the response, where the response itself is measured."""
-    sensing, names = own.sensing, response_names(own.plant)
-    if not (noise and sensing.estimator.shows_response and sensing.observer is None):
-        return sensing
-    noisy = {name: Sensor(noise=Noise(size)) for name, size in zip(names, noise, strict=True) if size}
-    return replace(sensing, sensors={**sensing.sensors, **noisy})
 
 
 def gain_name(row: int, column: int) -> str:

@@ -317,7 +317,8 @@ class OnPlant:
         """
         alone = self._run_alone(seed)
         try:
-            run = self._run(self._bare.with_deformation(deformation), seed)
+            adapted = self._bare.with_deformation(deformation)
+            run = simulator(self._problem, adapted, compiled=False).run(seed=seed)
         except FpirhcError as error:
             return str(error)
         pair = errors_of(self._problem, (alone, run), self._names)
@@ -350,27 +351,25 @@ class OnPlant:
                     lost = {n for n in same if shortlist[n].share >= chosen.share}
                     results |= {n: replace(results[n], bears=False) for n in lost}
                 continue
-            known = [one.deformation for one in shortlist.values()]
-            beside = choice.beside(chosen, shortlist.values())
-            titled = {f"{name.partition(',')[0]}{_SHARE}{share:g}": one for share, one in beside.items()}
-            new = {title: one for title, one in titled.items() if one.deformation not in known}
+            known, form = [one.deformation for one in shortlist.values()], name.partition(",")[0]
+            beside = choice.beside(chosen, shortlist.values()).items()
+            new = {f"{form}{_SHARE}{share:g}": one for share, one in beside if one.deformation not in known}
             # An error falls with the share until the loop is lost, so a smaller one is tried where no larger one is better.
             larger = {title: one for title, one in new.items() if one.share > chosen.share}
             new, needed = (larger, _CLEARLY * results[name].error) if larger else (new, np.inf)
             shortlist |= new
             if not new and name in again:
                 return results
-            if not new:
+            if not new:  # the largest errors of trials with other seeds too
                 again.add(name)
-                results[name] = self._with_other_seeds(chosen.deformation, results[name], seed)
-
-    def _with_other_seeds(self, chosen: Deformation, first: Trial, seed: int) -> Trial:
-        """The largest errors of a trial of one candidate, and of two with other seeds."""
-        others = [self.trial(chosen, other) for other in self._seeds(seed)[1:]]
-        trials = [first, *(one for one in others if isinstance(one, Trial))]
-        error, worst = max(one.error for one in trials), max(one.worst for one in trials)
-        steps = {name: max(one.steps.get(name, 0.0) for one in trials) for name in first.steps}
-        return replace(first, error=error, worst=worst, calm=all(one.calm for one in trials), steps=steps)
+                others = (self.trial(chosen.deformation, other) for other in self._seeds(seed)[1:])
+                trials = [results[name], *(one for one in others if isinstance(one, Trial))]
+                results[name] = Trial(
+                    max(one.error for one in trials),
+                    max(one.worst for one in trials),
+                    calm=all(one.calm for one in trials),
+                    steps={n: max(one.steps[n] for one in trials) for n in trials[0].steps},
+                )
 
     def _bears_more(self, chosen: Deformation, own: Trial, seed: int) -> bool:
         """Whether trials with a larger gain pass, and have no error that is much larger: else the limit is near."""
@@ -386,11 +385,8 @@ class OnPlant:
 
     def _run_alone(self, seed: int) -> Run:
         if seed not in self._alone:
-            self._alone[seed] = self._run(self._bare, seed)
+            self._alone[seed] = simulator(self._problem, self._bare, compiled=False).run(seed=seed)
         return self._alone[seed]
-
-    def _run(self, controller: Controller, seed: int) -> Run:
-        return simulator(self._problem, controller, compiled=False).run(seed=seed)
 
 
 def _walked(name: str) -> bool:
