@@ -12,6 +12,8 @@ import fpirhc as fp
 from fpirhc.adapters.mujoco import mujoco_body
 from fpirhc.errors import InvalidProblem
 
+pytest.importorskip("mujoco", reason="it needs the extra fpirhc[outside]")
+
 ARM = """<mujoco>
 <option timestep="0.0005" integrator="{integrator}" gravity="0 0 -9.81"/>
 <default><joint armature="{armature}" damping="{damping}" frictionloss="{friction}"/></default>

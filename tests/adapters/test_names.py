@@ -63,6 +63,7 @@ def test_a_derivative_beyond_the_second_is_a_mistake():
 
 def test_what_a_package_raises_has_the_adapters_name(tmp_path):
     """What is no archive is told by the package in its own words, and a file that is not there by its name."""
+    pytest.importorskip("fmpy", reason="it needs the extra fpirhc[outside]")
     (tmp_path / "no.fmu").write_text("nothing")
     for name, words in (("no.fmu", "fmu_body: BadZipFile: File is not a zip file"), ("absent.fmu", "cannot be read")):
         with pytest.raises(InvalidProblem, match=words):
