@@ -188,7 +188,7 @@ def check(
         facts = json.loads(path.read_text(encoding="utf-8"))
         asked, seed = list(select(task, controllers)), int(facts["seed"])
         if unknown := [name for name in asked if name not in facts["controllers"]]:
-            text = f"'{path.name}' has no row of {', '.join(map(repr, unknown))}; measure it again: fpirhc accept PROBLEM --reason ..."
+            text = f"'{path.name}' has no row of {', '.join(map(repr, unknown))}; measure it again: fpirhc accept"
             return Judgement(task.name, none, unusable=text)
         known = {name: facts["controllers"][name] for name in asked}
         expected = {n: {m: (float(v), float(b)) for m, (v, b) in one["metrics"].items()} for n, one in known.items()}
