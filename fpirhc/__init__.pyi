@@ -37,7 +37,6 @@ from .horizon.cost import CustomCost as CustomCost
 from .horizon.cost import LQRTerminal as LQRTerminal
 from .horizon.cost import Quadratic as Quadratic
 from .horizon.hessian_models import ExactHessian as ExactHessian
-from .horizon.hessian_models import GaussNewton as GaussNewton
 from .horizon.horizon import Horizon as Horizon
 from .learning.estimators.base import Uncertain as Uncertain
 from .learning.estimators.disturbance_kalman import DisturbanceKalman as DisturbanceKalman
@@ -60,7 +59,6 @@ from .plant.integrators import RungeKutta4 as RungeKutta4
 from .plant.motion import Output as Output
 from .plant.parameter import LogNormal as LogNormal
 from .plant.parameter import Normal as Normal
-from .plant.parameter import Spread as Spread
 from .plant.parameter import Uniform as Uniform
 from .plant.parameter import outside as outside
 from .plant.plant import Parameter as Parameter
@@ -71,7 +69,6 @@ from .problem_files.settings import LogSpan as LogSpan
 from .problem_files.settings import Span as Span
 from .problem_files.settings import with_settings as with_settings
 from .report.html import write_report as write_report
-from .review.review import Answer as Answer
 from .review.review import review as review
 from .sensing import LowPassDifference as LowPassDifference
 from .sensing import Measured as Measured
@@ -104,7 +101,6 @@ from .studies.limits import limits as limits
 from .studies.open_loop import certify as certify
 from .studies.study import study as study
 from .studies.tune import tune as tune
-from .symbolic.layout import Layout as Layout
 from .symbolic.live import signed_power as signed_power
 from .task.cases import Cases as Cases
 from .task.dead_time import DeadTime as DeadTime

@@ -9,6 +9,7 @@ from plants import heavy
 
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
+from fpirhc.review.review import Answer
 
 PERIOD = 1e-3  # s
 
@@ -24,7 +25,7 @@ def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.Com
     return fp.ComputedTorque(fp.Exponential(rate=rate), fp.Sigmoid(gain=gain, scale=scale))
 
 
-def answers(problem: fp.Problem, controller: Controller | None = None, mismatch: float = 0.0) -> dict[str, fp.Answer]:
+def answers(problem: fp.Problem, controller: Controller | None = None, mismatch: float = 0.0) -> dict[str, Answer]:
     """All answers about the problem and one controller."""
     found = fp.review(problem, {"it": controller or torque()}, mismatch=mismatch, seed=0).answers
     return {a.key: a for some in found.values() for a in some}

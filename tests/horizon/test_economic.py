@@ -15,6 +15,7 @@ from plants import known
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
+from fpirhc.horizon.hessian_models import GaussNewton
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 
@@ -93,6 +94,6 @@ def test_a_long_horizon_passes_the_published_steady_state():
 
 def test_gauss_newton_refuses_an_economic_cost_and_names_the_remedy():
     ocp, data = horizon(0.505, {})
-    for hessian in (None, fp.GaussNewton()):
+    for hessian in (None, GaussNewton()):
         with pytest.raises(NotSupported, match=r"bends upwards.*hessian=ExactHessian\(\)"):
             fp.solve(ocp, fp.FixedPoint(1, TOLERANCE, hessian=hessian), np.array(STARTS[0]), data)

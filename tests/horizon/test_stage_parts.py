@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.hessian_models import hessian_stage, linear_stage, split_hessian, split_stage
+from fpirhc.horizon.hessian_models import GaussNewton, hessian_stage, linear_stage, split_hessian, split_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.transcription import transcribe
 
@@ -52,7 +52,7 @@ def test_first_derivatives(ocp):
         alike(list(parts["pull"](kept, after, data)), [by_state + a.T @ after, by_input + b.T @ after])
 
 
-@pytest.mark.parametrize("hessian", [fp.GaussNewton(), fp.ExactHessian()])
+@pytest.mark.parametrize("hessian", [GaussNewton(), fp.ExactHessian()])
 def test_second_derivatives(ocp, hessian):
     """Q, S and R."""
     whole, parts = hessian_stage(ocp, hessian), split_hessian(ocp, hessian)

@@ -284,7 +284,7 @@ def test_exact_hessian_converges_quadratically():
     first = np.array([2.5, 0.0])
     near = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=0.1), first, data).inputs
     iterations = {}
-    for model in (fp.GaussNewton(), fp.ExactHessian()):
+    for model in (GaussNewton(), fp.ExactHessian()):
         plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=model), first, data, start=near)
         assert plan.status == fp.Status.OK
         iterations[type(model).__name__] = plan.iterations

@@ -11,7 +11,7 @@ from scipy import stats
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.plant.parameter import EXAMPLES, TAILS
+from fpirhc.plant.parameter import EXAMPLES, TAILS, Spread
 from fpirhc.plant.plant import exact_ranges
 
 
@@ -22,7 +22,7 @@ def plant(**parameters: fp.Parameter) -> fp.Plant:
     )
 
 
-def parameter(exact: float, spread: fp.Spread, **changes) -> fp.Parameter:
+def parameter(exact: float, spread: Spread, **changes) -> fp.Parameter:
     return fp.Parameter(approximate=exact, exact=exact, unit="1", spread=spread, **changes)
 
 

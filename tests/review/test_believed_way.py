@@ -12,6 +12,7 @@ import pytest
 import reviewed
 
 import fpirhc as fp
+from fpirhc.review.review import Answer
 from fpirhc.simulation.model_as_plant import behind_actuators, with_believed_way
 
 GALLERY = Path(__file__).parents[2] / "problems" / "gallery"
@@ -42,7 +43,7 @@ def task(**changes) -> fp.Problem:
     return fp.Problem(**(usual | changes))
 
 
-def asked(problem: fp.Problem, deformation) -> fp.Answer:
+def asked(problem: fp.Problem, deformation) -> Answer:
     return reviewed.answers(problem, fp.ComputedTorque(LAW, deformation))["model"]
 
 

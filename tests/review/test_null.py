@@ -12,6 +12,7 @@ import reviewed
 import fpirhc as fp
 from fpirhc.controllers.base import Controller
 from fpirhc.deformation import Deformation
+from fpirhc.review.review import Answer
 
 POLE = 86.7  # 1/s
 MAP = fp.Affine(gain=-1.0)
@@ -44,7 +45,7 @@ def planned(deformation: Deformation | None = None) -> Controller:
     return fp.RecedingHorizon(optimiser) if deformation is None else fp.RecedingHorizon(optimiser, deformation)
 
 
-def alone(problem: fp.Problem, controller: Controller) -> fp.Answer:
+def alone(problem: fp.Problem, controller: Controller) -> Answer:
     """The answer to the null test."""
     return reviewed.answers(problem, controller)["model"]
 
