@@ -29,7 +29,7 @@ class Parameter(Checked):
         exact: value in the simulated plant.
         unit: of both values.
         bounds: least and largest physically possible value, in the same unit.
-        spread: distribution of the exact value in scenarios, and its range in reviews; None: a percentage of the exact value. A run
+        spread: distribution of the exact value in studies, and its range in reviews; None: a percentage of the exact value. A run
             does not depend on it.
         outside: whether it is a signal from outside, whose values over time are those of the problem; see `outside`.
     """

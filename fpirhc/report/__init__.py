@@ -1,1 +1,1 @@
-"""Reports: comparisons, scenarios and reviews on a terminal, as JSON, as figures, and as one HTML file."""
+"""Reports: comparisons, studies and reviews on a terminal, as JSON, as figures, and as one HTML file."""

@@ -134,7 +134,7 @@ class ExternalPlant(Checked):
         if not self.parameters:
             raise NotSupported(
                 "the external plant has no exact parameters that a study could draw; state them, "
-                "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios"
+                "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare it without a study"
             )
         return replace(self, parameters=with_exact_values(self.parameters, exact))
 

@@ -111,7 +111,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "exact parameters of a body that stands": (
         lambda: outside().reality.with_exact(np.array([1.0])),
         "the external plant has no exact parameters that a study could draw; state them, "
-        "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare without scenarios",
+        "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare it without a study",
     ),
     "a body that is not in an external plant": (
         lambda: with_reality(body()),
