@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 import fpirhc as fp
-from fpirhc.deformation.base import Deformation
+from fpirhc.contracts import Deformation
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ import numpy as np
 
 import fpirhc as fp
 from attack.faults import FIRST, Cycle, Fault
+from fpirhc import Status
+from fpirhc.contracts import Controller
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.path import true_response
-from fpirhc.status import Status
 
 _GONE = 1e12  # size of a state that no plant comes back from
 CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again

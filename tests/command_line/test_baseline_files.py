@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from blessed import LINE, NOISY
+from helpers.blessed import LINE, NOISY
 
 import fpirhc as fp
+from fpirhc import check
 from fpirhc.__main__ import main
-from fpirhc.baselines.baseline import FACTOR, TIGHT, accept, check, problems_here
+from fpirhc.baselines.baseline import FACTOR, TIGHT, accept, problems_here
 from fpirhc.errors import BaselineError
 
 pytest_plugins = ["pytester"]

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField

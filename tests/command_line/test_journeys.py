@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import typer
-from line import line_text
+from helpers.line import line_text
 
 import fpirhc as fp
 from fpirhc.__main__ import main

@@ -18,8 +18,8 @@ from mutated_problems import SOURCE
 from raw_errors import raw_error
 
 import fpirhc as fp
+from fpirhc.contracts import Deformation
 from fpirhc.controllers.check import checked
-from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidField
 from fpirhc.fields.checked import Checked, expects_whole_number
 from fpirhc.symbolic.live import SymbolicNumber

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from first_files import PENDULUM, REACTOR, TANKS, changes_of, messages_of
+from helpers.first_files import PENDULUM, REACTOR, TANKS, changes_of, messages_of
 
 import fpirhc as fp
 from fpirhc.__main__ import main

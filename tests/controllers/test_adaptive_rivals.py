@@ -9,10 +9,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, pendulum
+from helpers.plants import chain, pendulum
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.learning.rules.base import Evidence

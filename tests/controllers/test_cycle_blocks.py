@@ -11,22 +11,14 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.contraction.delayed import step_for_basin
-from fpirhc.controllers.base import (
-    Controller,
-    clip,
-    commanding_blocks,
-    deform_block,
-    fed,
-    invert_block,
-    reference_block,
-    with_held_deformation,
-)
+from fpirhc.contracts import Block, Controller, Deformation, Layout, Response, reference_block, scalar
+from fpirhc.controllers.base import clip, commanding_blocks, deform_block, fed, invert_block, with_held_deformation
 from fpirhc.controllers.check import check_form, checked
 from fpirhc.controllers.contract import (
     Planner,
     PlantModel,
-    Response,
     resolved,
     tracking_law,
     with_lateness,
@@ -42,11 +34,9 @@ from fpirhc.controllers.reference_states import (
     request_of_plans,
 )
 from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
-from fpirhc.deformation.base import Deformation, with_inner
+from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
-from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, compose
-from fpirhc.symbolic.layout import Layout, scalar
+from fpirhc.symbolic.block import compose
 
 PERIOD = 0.1
 TIMES = np.linspace(0.0, 10.0, 100001)

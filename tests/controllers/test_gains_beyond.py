@@ -6,11 +6,11 @@ from dataclasses import replace
 from functools import cache
 
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
+from fpirhc import simulator
 from fpirhc.errors import NotContractive
-from fpirhc.simulation.simulate import simulator
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))

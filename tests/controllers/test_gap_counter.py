@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.conformance.loops import two_masses
+from fpirhc.contracts import Block, Layout, scalar
 from fpirhc.controllers.gate import AGAIN, Gap, across_gaps
 from fpirhc.controllers.sensing_chain import compose_with_sensing
-from fpirhc.status import Status
-from fpirhc.symbolic.block import LONG, Block, compose
-from fpirhc.symbolic.layout import Layout, scalar
+from fpirhc.symbolic.block import LONG, compose
 
 NAMES = ("missing_cycles", "still_settling")
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Gate, Status
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.gate import AGAIN, Gap, Gate, was_skipped
-from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, compose
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.contracts import Block, Layout, Signal, scalar
+from fpirhc.controllers.gate import AGAIN, Gap, was_skipped
+from fpirhc.symbolic.block import compose
 from fpirhc.symbolic.live import Derived
 
 LIMITS = fp.Limits(inputs={"Fa": (-30.0, 30.0), "Fb": (-6.0, 40.0)})

@@ -7,11 +7,11 @@ from functools import cache
 from typing import Any, cast
 
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
-from fpirhc.deformation import Deformation, Identity
+from fpirhc import Identity
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.errors import InvalidField, InvalidProblem
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.01, measure_from=0.0))

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, linear, pendulum
-from plants import simulated as run
+from helpers.plants import chain, linear, pendulum
+from helpers.plants import simulated as run
 
 import fpirhc as fp
 from fpirhc.controllers.rivals.intelligent_pid import window_weights

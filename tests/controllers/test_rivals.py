@@ -8,14 +8,14 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, linear, pendulum
-from plants import simulated as simulate
+from helpers.plants import chain, linear, pendulum
+from helpers.plants import simulated as simulate
 
 import fpirhc as fp
+from fpirhc import compare
 from fpirhc.errors import InvalidProblem
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import render
-from fpirhc.studies.comparison.compare import compare
 
 RATE = 6.0
 TRACK = fp.Exponential(rate=RATE)

@@ -9,16 +9,16 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from forms import FORMS
-from plants import pendulum
-from plants import simulated as run
+from helpers import tasks
+from helpers.forms import FORMS
+from helpers.plants import pendulum
+from helpers.plants import simulated as run
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc import Status
+from fpirhc.contracts import Controller
 from fpirhc.controllers.slots.slot import output_chain
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue
-from fpirhc.status import Status
 from fpirhc.symbolic.layout import Named
 
 # Slots and schedules of shipped controllers are read and changed, which the contract of controllers says nothing about.

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.contracts import Block, Delay
 
 LARGEST = 20.0  # N
 

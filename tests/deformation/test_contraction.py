@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fpirhc import RFPT, Affine, RFPTVector, Rotation, Sigmoid
+from fpirhc import RFPT, Affine, Identity, Parameter, Plant, RFPTVector, Rotation, Sigmoid
 from fpirhc.contraction.spectrum import (
     Spectrum,
     assess_gain,
@@ -23,9 +23,8 @@ from fpirhc.contraction.spectrum import (
     spectrum_over_box,
     spectrum_over_run,
 )
-from fpirhc.deformation import Deformation, Identity
+from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive
-from fpirhc.plant.plant import Parameter, Plant
 
 MAPS = (
     Affine(gain=-0.5),

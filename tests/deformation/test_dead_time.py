@@ -8,13 +8,12 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from plants import linear, pendulum
+from helpers import tasks
+from helpers.plants import linear, pendulum
 from test_adaptation import Scalar
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
-from fpirhc.deformation.base import Deformation
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.errors import FpirhcError
 
 DELAYS = (0, 1, 2, 3, 5, 10, 20)

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fpirhc import RFPT, Affine, RFPTVector, Rotation, Sigmoid
+from fpirhc import RFPT, Affine, Identity, RFPTVector, Rotation, Sigmoid
 from fpirhc.conformance import check_deformation
-from fpirhc.deformation import Deformation, Identity
+from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.members import examples, member_classes
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 from test_dead_time import LAW, affine, iteration_radius
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import limit_behind_weights, loop_polynomial
-from fpirhc.deformation import Deformation
+from fpirhc.contracts import Deformation
 from fpirhc.deformation.base import Iteration, LastRequest, Mirror
 from fpirhc.deformation.leaky import leaky_pole
 from fpirhc.errors import InvalidValue, NotSupported

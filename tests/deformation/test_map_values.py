@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import brentq
 
 import fpirhc as fp
-from fpirhc.deformation.base import Deformation, Reach, RequestChange, automatic
+from fpirhc.contracts import Deformation
+from fpirhc.deformation.base import Reach, RequestChange, automatic
 from fpirhc.errors import InvalidValue
 
 

@@ -8,13 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from exchange import told, with_exact_model
-from plants import chain
+from helpers import tasks
+from helpers.exchange import told, with_exact_model
+from helpers.plants import chain
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
-from fpirhc.deformation import Deformation
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.errors import NotContractive
 
 LAW = fp.Exponential(rate=6.0)

@@ -9,17 +9,17 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from exchange import told, with_exact_model
-from kinds import shipped
+from helpers import tasks
+from helpers.exchange import told, with_exact_model
+from helpers.kinds import shipped
 from test_adaptation import stepping
 from test_anti_windup import overshoot, request_kept, settled, step_of_two_metres
 from test_dead_time import affine
 
 import fpirhc as fp
+from fpirhc.contracts import Block
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import NotSupported
-from fpirhc.symbolic.block import Block
 
 LAW = fp.Exponential(rate=6.0)
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from plants import sine_of_three
+from helpers.plants import sine_of_three
 
 import fpirhc as fp
+from fpirhc import compare
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.comparison.compare import compare
 
 PLAIN = fp.ComputedTorque(fp.Exponential(rate=6.0))
 

@@ -10,7 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 from scipy.special import betainc
 from test_noise import noisy as noisy_two_mass
 

@@ -10,7 +10,8 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance import check_deformation
-from fpirhc.deformation.base import Deformation, Iteration
+from fpirhc.contracts import Deformation
+from fpirhc.deformation.base import Iteration
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 
 GAINS = np.array([[0.8, 0.3], [-0.5, 0.4]])

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.errors import InvalidName, NotSupported, OutputError
 from fpirhc.export.device import Device, default_name, identifiers
 from fpirhc.export.samples import with_faults
 from fpirhc.export.target import device_of, target_called, targets, write
-from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
 COMPILERS = [path for path in (shutil.which("gcc"), shutil.which("clang")) if path]

@@ -20,7 +20,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.contraction.spectrum import factors_along, response_jacobians
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.export.lab import lab as module
 from fpirhc.export.lab.lab import Lab, make_lab, page

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.export.device import Device
 from fpirhc.export.target import device_of
 from fpirhc.export.targets.c import filled, sources
-from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")

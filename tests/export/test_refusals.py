@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from first_files import messages_of
+from helpers.first_files import messages_of
 
 from fpirhc.__main__ import main
 from fpirhc.export import binaries

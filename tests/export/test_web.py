@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported

@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import known, pendulum
+from helpers.plants import known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue

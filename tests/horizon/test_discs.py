@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Status, solve
+from fpirhc.contracts import judge
 from fpirhc.errors import NotSupported
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import judge
-from fpirhc.optimisers.plan import solve
-from fpirhc.status import Status
 
 INERTIA = 2.25e-4  # kg m^2
 SPRINGS = 2.697e-3, 2.66e-3, 3.05e-3, 2.86e-3  # N m/rad: motor to disc, between discs, disc to motor

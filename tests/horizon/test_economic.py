@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.plants import known
 from judging import Judge
-from plants import known
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported

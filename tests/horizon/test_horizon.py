@@ -9,12 +9,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from plants import chain, pendulum
+from helpers import tasks
+from helpers.plants import chain, pendulum
 
 import fpirhc as fp
+from fpirhc.contracts import reduced_gradient
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.horizon.problem import reduced_gradient, rollout
+from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.full_space import auxiliary_gradient, auxiliary_hessian

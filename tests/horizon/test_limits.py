@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, known, pendulum
+from helpers.plants import chain, known, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, NotSupported

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from kinds import slow_but
-from plants import pendulum
+from helpers.kinds import slow_but
+from helpers.plants import pendulum
 from scipy.optimize import minimize
 
 import fpirhc as fp

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, NotSupported

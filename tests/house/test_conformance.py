@@ -10,8 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from kinds import shipped
-from on_problem import named
+from helpers.kinds import shipped
+from helpers.on_problem import named
 from wrong.tables import CONTROLLERS as WRONG_CONTROLLERS
 from wrong.tables import LOUD
 from wrong.tables import MAPS as WRONG_MAPS
@@ -30,15 +30,11 @@ from fpirhc.conformance import check_controller, check_optimiser, check_plant, c
 from fpirhc.conformance.horizons import Trial as OptimiserTrial
 from fpirhc.conformance.laws import keep, within
 from fpirhc.conformance.loops import Trial, two_masses
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Block, Controller, Delay, Layout, Optimiser, Signal, Tracking, scalar
 from fpirhc.controllers.contract import Planner
 from fpirhc.errors import InvalidProblem, InvalidValue
 from fpirhc.members import FAMILIES, Example, examples, member_classes
-from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Equations
-from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Layout, Signal, scalar
-from fpirhc.tracking.base import Tracking
 
 FINE = 1e-6  # tolerance of the optimisers, N
 TRACKING = fp.Exponential(rate=8.0)

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from reviewed import answers, mass, torque
+from helpers.reviewed import answers, mass, torque
 
 import fpirhc
 import fpirhc as fp
-from fpirhc.controllers.base import Controller, closing_blocks, reference_block, rename
+from fpirhc.contracts import Controller, Deformation, closing_blocks, reference_block
+from fpirhc.controllers.base import rename
 from fpirhc.controllers.contract import resolved, with_optimiser, without_deformation
-from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
 from fpirhc.studies.open_loop import with_optimisers
 

@@ -15,13 +15,12 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Ipopt, SequentialQuadratic, signed_power
+from fpirhc.contracts import is_finite, status_of
 from fpirhc.horizon.problem import OptimalControl, rollout
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import status_of
-from fpirhc.optimisers.nlp import Ipopt, SequentialQuadratic
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.expression import is_finite
-from fpirhc.symbolic.live import SMOOTHING, signed_power
+from fpirhc.symbolic.live import SMOOTHING
 
 PLANT = fp.Plant(
     coordinates={"y": "m"},

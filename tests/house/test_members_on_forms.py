@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from forms import CYCLE, FORMS
+from helpers.forms import CYCLE, FORMS
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError
 from fpirhc.members import examples, member_classes
 from fpirhc.simulation.step_arguments import raw_measurements

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue, NoAnswer, nearest

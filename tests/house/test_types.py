@@ -9,9 +9,9 @@ import casadi as ca
 import pytest
 
 import fpirhc
-from fpirhc.symbolic.block import Block
+from fpirhc.contracts import Block, Layout, scalar
 from fpirhc.symbolic.expression import Signals, column, kind
-from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.layout import Expression
 
 
 def test_an_unknown_signal_of_a_step_names_the_nearest_one() -> None:

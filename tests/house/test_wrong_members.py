@@ -22,8 +22,7 @@ from fpirhc.conformance import optimiser as optimiser_laws
 from fpirhc.conformance.horizons import Trial as OptimiserTrial
 from fpirhc.conformance.laws import keep
 from fpirhc.conformance.loops import Trial, two_masses
-from fpirhc.controllers.contract import Controller
-from fpirhc.deformation.base import Deformation
+from fpirhc.contracts import Controller, Deformation
 
 DEFORMATION = fp.Sigmoid(gain=-0.5)
 

@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from plants import linear, pendulum
-from plants import simulated as run
+from helpers.plants import linear, pendulum
+from helpers.plants import simulated as run
 
 import fpirhc as fp
+from fpirhc import Replanning
 from fpirhc.controllers.model_inputs import ResponsePairs
-from fpirhc.controllers.replanning import Replanning
 from fpirhc.symbolic.expression import Signals
 
 PERIOD = 0.01
@@ -98,7 +98,7 @@ class Onlooker(fp.ComputedTorque):
 
 
 def _timed(block):
-    from fpirhc.symbolic.layout import Layout, scalar
+    from fpirhc.contracts import Layout, scalar
 
     return block.reads if "time" in block.reads else block.reads + Layout((scalar("time", "s"),))
 

@@ -10,17 +10,16 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from forms import FORMS
+from helpers import tasks
+from helpers.forms import FORMS
 
 import fpirhc as fp
-from fpirhc.conformance.laws import check_live
+from fpirhc import simulator, tune
+from fpirhc.conformance import check_live
 from fpirhc.controllers.live_settings import live_settings
 from fpirhc.errors import CompileError, InvalidName, InvalidValue, NotContractive, NotSupported
 from fpirhc.problem_files.problem_file import with_numbers_of_all
 from fpirhc.simulation.loop import close_loop
-from fpirhc.simulation.simulate import simulator
-from fpirhc.studies.tune import tune
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.live import live_number
 from fpirhc.symbolic.paths import content_at

@@ -8,13 +8,12 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc import DeadTime, simulator
+from fpirhc.contracts import Controller
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.simulation.simulate import simulator
-from fpirhc.task.dead_time import DeadTime
 
 LONGEST = {"Q1": 0.012, "Q2": 0.02, "measurement": 0.008}  # s; cycles of 1 ms
 queued = cache(

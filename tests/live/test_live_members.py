@@ -7,17 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from on_problem import named, on_problem
+from helpers.on_problem import named, on_problem
 
 import fpirhc as fp
-from fpirhc.conformance.laws import check_live, number_paths
+from fpirhc import Problem, load_problem, simulator
+from fpirhc.conformance import check_live
+from fpirhc.conformance.laws import number_paths
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError, InvalidValue
 from fpirhc.members import Example, examples
-from fpirhc.problem_files.problem_file import load_problem
-from fpirhc.simulation.simulate import simulator
-from fpirhc.task.problem import Problem
 
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
 TRACKING = fp.Exponential(rate=8.0)

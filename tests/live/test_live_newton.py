@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance.laws import check_live
-from fpirhc.controllers.base import Controller
+from fpirhc.conformance import check_live
+from fpirhc.contracts import Controller
 from fpirhc.symbolic.live import nan_where
 
 MAP = fp.Sigmoid(gain=-0.3, scale=50.0)

@@ -8,12 +8,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
+from fpirhc import simulator
 from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidShape, InvalidValue
 from fpirhc.fields.kinds import real_number
-from fpirhc.simulation.simulate import simulator
 
 aimed = cache(
     lambda: replace(

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.plant.maps import over

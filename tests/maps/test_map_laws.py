@@ -12,12 +12,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import simulated
+from helpers.plants import simulated
 from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError
 
 A = np.array([[-1.0, 1.0], [-2.0, -0.6]])  # y' = v - y, v' = -2 y - 0.6 v + 1.5 u

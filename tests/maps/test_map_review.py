@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from reviewed import answers
+from helpers.reviewed import answers
 
 import fpirhc as fp
 

@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import simulated
+from helpers.plants import simulated
 
 import fpirhc as fp
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported

@@ -9,19 +9,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.plants import pendulum
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import pendulum
 
 import fpirhc as fp
+from fpirhc import Search
+from fpirhc.contracts import judge, reduced_gradient
 from fpirhc.horizon.hessian_models import GaussNewton
-from fpirhc.horizon.problem import reduced_gradient
 from fpirhc.horizon.riccati import box_policy
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import judge
 from fpirhc.optimisers.plain import call_symbols, first_anchor
-from fpirhc.optimisers.search import Search
 from fpirhc.symbolic.native import find_compiler, native
 from fpirhc.symbolic.program import generate
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from c_alone import call, columns, defined, library
+from helpers.c_alone import call, columns, defined, library
 
 from fpirhc.symbolic.expression import FINITE
 from fpirhc.symbolic.native import find_compiler

@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 import pytest
 from foreign import FOREIGN, first_states
+from helpers.kinds import slow_but
+from helpers.plants import known
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judging import Judge
-from kinds import slow_but
-from plants import known
 
 import fpirhc as fp
 from fpirhc.horizon.problem import curvature_at_rest

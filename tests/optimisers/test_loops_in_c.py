@@ -10,10 +10,10 @@ import sys
 
 import numpy as np
 import pytest
-from loops_in_c import pair, within_its_arrays
+from helpers.loops_in_c import pair, within_its_arrays
 
 import fpirhc as fp
-from fpirhc.status import Status
+from fpirhc import Status
 from fpirhc.symbolic.native import find_compiler
 
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")

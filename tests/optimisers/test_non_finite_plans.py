@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hand_made_runs import CYCLES, SOLVE, problem, run
+from helpers.hand_made_runs import CYCLES, SOLVE, problem, run
 
 import fpirhc as fp
+from fpirhc import Status, measure
+from fpirhc.contracts import Signal
 from fpirhc.report.terminal import show_plans
-from fpirhc.simulation.metrics import measure
-from fpirhc.status import Status
 from fpirhc.studies.open_loop import Solved
 from fpirhc.studies.view import status_shares
-from fpirhc.symbolic.layout import Signal
 
 
 def exploding() -> fp.Problem:

@@ -9,18 +9,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
+from helpers.plants import chain, known
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import chain, known
 
 import fpirhc as fp
+from fpirhc.contracts import judge
 from fpirhc.controllers.contract import resolved
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.horizon.problem import rollout
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import judge
 from fpirhc.symbolic.native import native
 from fpirhc.symbolic.program import generate
 

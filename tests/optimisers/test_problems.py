@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 from test_certificate import PROBLEMS, first_horizon
 
 import fpirhc as fp
@@ -91,7 +91,7 @@ def shifted(optimiser, ocp):
 
 def test_indefinite_costs_are_refused_with_what_to_use_instead():
     """A cost that bends downwards has no quadratic model with a minimum."""
-    from plants import pendulum
+    from helpers.plants import pendulum
 
     cost = fp.CustomCost(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
     ocp = transcribe(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost, fp.Limits())

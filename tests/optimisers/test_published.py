@@ -10,8 +10,9 @@ import pytest
 from test_fixed_point import linear_problem, pendulum_problem
 
 import fpirhc as fp
+from fpirhc.contracts import reduced_gradient
 from fpirhc.errors import NotContractive, NotSupported
-from fpirhc.horizon.problem import reduced_gradient, steepest_curvature
+from fpirhc.horizon.problem import steepest_curvature
 from fpirhc.optimisers.full_space import auxiliary_hessian
 
 FIRST = np.array([0.5, -0.5])

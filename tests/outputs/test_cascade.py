@@ -8,12 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 from test_outputs import OPTIMISER, hill, planned, sedated
 
 import fpirhc as fp
+from fpirhc import Setpoint
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
-from fpirhc.task.set_point import Setpoint
 
 STATIC = fp.FeedforwardOnly()
 SETTLING, LAGGED = fp.ThroughModel(lag=20.0), fp.ThroughModel(lag=5.0)  # the heat exchanger's, and that of `linear`

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from test_cascade import affine, simulated
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 
 STATIC = fp.FeedforwardOnly()

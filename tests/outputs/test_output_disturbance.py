@@ -12,9 +12,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from own_disturbance import Sawtooth
-from plants import simulated
+from helpers import tasks
+from helpers.own_disturbance import Sawtooth
+from helpers.plants import simulated
 from test_outputs import OPTIMISER, SAME, curve, hill, on_outputs, planned, sedated, shortened
 
 import fpirhc as fp

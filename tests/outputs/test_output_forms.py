@@ -8,12 +8,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import simulated
+from helpers.plants import simulated
 from test_outputs import ARM, arm, circle, hill, sedated
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
-from fpirhc.deformation.base import Deformation
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.errors import InvalidProblem, NotSupported
 
 FORMS: dict[str, Deformation] = {

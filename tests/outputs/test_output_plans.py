@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import simulated
+from helpers.plants import simulated
 
 import fpirhc as fp
 

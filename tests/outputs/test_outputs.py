@@ -15,11 +15,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from plants import simulated
+from helpers import tasks
+from helpers.plants import simulated
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotInvertible
 from fpirhc.simulation.loop import close_loop
 

@@ -9,14 +9,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import simulated
-from reviewed import answers
+from helpers.plants import simulated
+from helpers.reviewed import answers
 from test_outputs import OPTIMISER, arm, circle, hill, planned, sedated
 
 import fpirhc as fp
+from fpirhc import simulator
 from fpirhc.controllers.wrappers.predicted import output_ahead
 from fpirhc.errors import NotSupported
-from fpirhc.simulation.simulate import simulator
 
 LAW = fp.Exponential(rate=1.0)
 LATE = 0.2  # min, of the pump

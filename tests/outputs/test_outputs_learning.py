@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from plants import simulated
+from helpers.plants import simulated
 from test_outputs import arm, circle, hill, planned, sedated
 from test_outputs import depth_error as rms
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plants import simulated
-from reviewed import answers
+from helpers.plants import simulated
+from helpers.reviewed import answers
 from test_outputs import arm, circle, curve, hill, sedated
 
 import fpirhc as fp

@@ -16,14 +16,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from forms import named_again, with_arguments
-from kinds import slow_but
-from on_problem import on_problem
-from plants import simulated
+from helpers import tasks
+from helpers.forms import named_again, with_arguments
+from helpers.kinds import slow_but
+from helpers.on_problem import on_problem
+from helpers.plants import simulated
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.members import examples
 from fpirhc.plant.motion import followed_units
 

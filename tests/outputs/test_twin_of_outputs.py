@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from exchange import told
+from helpers.exchange import told
 
 import fpirhc as fp
 

@@ -7,7 +7,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
 from fpirhc.horizon.stage_data import shifted_reference

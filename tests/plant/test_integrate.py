@@ -7,7 +7,7 @@ import itertools
 import casadi as ca
 import numpy as np
 import pytest
-from plants import pendulum
+from helpers.plants import pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, linear, pendulum
+from helpers.plants import chain, linear, pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, NotInvertible

@@ -7,9 +7,9 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.plants import pendulum
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import pendulum
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported

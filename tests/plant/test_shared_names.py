@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Run
 from fpirhc.conformance import check_plant
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotContractive
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.members import examples
 from fpirhc.probing.recording import read_recording
-from fpirhc.simulation.run import Run
 from fpirhc.task.external_plant import Body
 
 JOINTS = ("shoulder", "elbow")

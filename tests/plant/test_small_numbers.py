@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Projection
 from fpirhc.learning.rules.base import Evidence
-from fpirhc.learning.rules.projection import Projection
 
 LAW = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False))
 

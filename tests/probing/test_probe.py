@@ -15,7 +15,7 @@ import pytest
 from bodies import PERIOD, RHC, body_problem
 
 import fpirhc as fp
-from fpirhc.deformation.base import Deformation
+from fpirhc.contracts import Deformation
 from fpirhc.probing.choice import Candidate, Choice, Form
 from fpirhc.probing.identification import Channel, Estimates, delayed, identify
 from fpirhc.probing.probe import OnPlant, Trial, best

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fpirhc as fp
-from fpirhc.plant.plant import Plant
+from fpirhc import Plant
 
 
 def rates(plant: Plant, state: list[float], inputs: list[float]) -> np.ndarray:

@@ -13,7 +13,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 

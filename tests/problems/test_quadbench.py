@@ -9,7 +9,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
-from kinds import slow_but
+from helpers.kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.problem_files.problem_file import Task

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
+from fpirhc import compare
 from fpirhc.errors import NotContractive
-from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.comparison.verdict import Outcome
 
 

@@ -12,10 +12,11 @@ import pytest
 from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
 
 import fpirhc as fp
+from fpirhc import simulator
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.path import moving
-from fpirhc.simulation.simulate import Patch, run_cycles, simulator
+from fpirhc.simulation.simulate import Patch, run_cycles
 
 MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
 

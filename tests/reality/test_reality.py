@@ -8,7 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import linear, pendulum
+from helpers.plants import linear, pendulum
 from scipy.linalg import expm
 
 import fpirhc as fp

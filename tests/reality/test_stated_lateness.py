@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.contracts import Deformation
 from fpirhc.controllers.contract import resolved
-from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidProblem
 
 PERIOD, LATE, LAG = 1e-2, 3, 0.05

@@ -17,10 +17,9 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import compare, write_report
 from fpirhc.export.lab.lab import Lab, lab_of, make_lab, write_lab
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.report.html import write_report
-from fpirhc.studies.comparison.compare import compare
 
 pytestmark = pytest.mark.browser
 

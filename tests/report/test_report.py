@@ -10,15 +10,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from plants import sine_of_three
+from helpers.plants import sine_of_three
 
 import fpirhc as fp
+from fpirhc import compare, write_report
 from fpirhc.errors import OutputError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import colours_of
-from fpirhc.report.html import INTERVALS, blocks, chart_data, render, whole_numbers, write_report
+from fpirhc.report.html import INTERVALS, blocks, chart_data, render, whole_numbers
 from fpirhc.report.terminal import show
-from fpirhc.studies.comparison.compare import compare
 from fpirhc.studies.view import to_json
 from fpirhc.summary import written_out
 

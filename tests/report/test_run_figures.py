@@ -8,14 +8,14 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.plants import chain
 from matplotlib.axes import Axes
-from plants import chain
 
 import fpirhc as fp
+from fpirhc import compare
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import contraction_figure
-from fpirhc.studies.comparison.compare import compare
 
 
 def task(order: int, unit: str = "mg/l") -> Task:

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import reviewed
+from helpers import reviewed
 
 import fpirhc as fp
 from fpirhc.review.review import Answer

@@ -7,11 +7,10 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-import reviewed
+from helpers import reviewed
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
-from fpirhc.deformation import Deformation
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.review.review import Answer
 
 POLE = 86.7  # 1/s

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.controllers.wrappers.predicted import Predictor
-from fpirhc.deformation import Deformation
 
 RATE, PERIOD, FORCE = 3.0, 0.01, 1.0  # 1/s, s, m/s^2
 KP, KD = RATE**2, 2 * RATE

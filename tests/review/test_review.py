@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from reviewed import answers, mass, torque
+from helpers.reviewed import answers, mass, torque
 from typer.testing import CliRunner
 
 import fpirhc as fp

@@ -11,14 +11,14 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from filters import extended_filter, runge_kutta
-from plants import linear, pendulum
+from helpers.filters import extended_filter, runge_kutta
+from helpers.plants import linear, pendulum
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller, StateObserver
 from fpirhc.controllers.observed_state import unobservable_errors
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, NotSupported
-from fpirhc.sensing.base import StateObserver, unobservable
+from fpirhc.sensing.base import unobservable
 from fpirhc.simulation.step_arguments import raw_measurements
 
 CTC = fp.ComputedTorque(fp.Exponential(rate=0.5))

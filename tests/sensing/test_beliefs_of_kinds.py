@@ -8,13 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from filters import extended_filter
-from plants import linear
+from helpers.filters import extended_filter
+from helpers.plants import linear
 
 import fpirhc as fp
-from fpirhc.conformance.laws import check_live
+from fpirhc.conformance import check_live
+from fpirhc.contracts import StateObserver
 from fpirhc.errors import NotSupported
-from fpirhc.sensing.base import StateObserver
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=0.2))
 T = 2.0  # s, one step of the map

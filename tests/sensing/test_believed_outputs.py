@@ -13,13 +13,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from filters import extended_filter, runge_kutta
-from plants import simulated as run
+from helpers import tasks
+from helpers.filters import extended_filter, runge_kutta
+from helpers.plants import simulated as run
 
 import fpirhc as fp
+from fpirhc.contracts import StateObserver
 from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
-from fpirhc.sensing.base import StateObserver
 
 LAW = fp.Exponential(rate=1.0)
 PLAIN, FPI = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.Affine(-1.0))

@@ -9,19 +9,17 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 import pytest
-from lossy import Lossy
+from helpers.lossy import Lossy
 
 import fpirhc as fp
+from fpirhc import Status, Uncertain
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.contract import Controller
-from fpirhc.learning.estimators.base import Uncertain
+from fpirhc.contracts import Block, Controller, DerivativeEstimator, Signal, StateObserver
 from fpirhc.members import examples
-from fpirhc.sensing.base import DerivativeEstimator, StateObserver
 from fpirhc.simulation.clock import missed_cycles
-from fpirhc.status import Status
-from fpirhc.symbolic.block import LONG, Block, bridged, shares
+from fpirhc.symbolic.block import LONG, bridged, shares
 from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression
 from fpirhc.symbolic.native import find_compiler
 
 ESTIMATORS: tuple[DerivativeEstimator, ...] = examples("derivative estimators")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.errors import InvalidProblem, InvalidValue
-from fpirhc.status import Status
 
 TASK = fp.load_problem("two_mass")
 # Of sin(c t) CasADi makes one product of c, the period and the number of the cycle, which rounds otherwise than the time of a step.

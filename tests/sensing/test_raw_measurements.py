@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import simulator
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 from fpirhc.errors import InvalidShape
-from fpirhc.simulation.simulate import simulator
 
 TRACK = fp.Exponential(rate=6.0)
 GENTLE = fp.Affine(gain=-0.05)

@@ -8,8 +8,7 @@ import casadi as ca
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
-from fpirhc.sensing.base import StateObserver
+from fpirhc.contracts import Controller, StateObserver
 
 TRACK = fp.ComputedTorque(fp.Exponential(rate=4.0))
 

@@ -9,14 +9,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain, linear
+from helpers.plants import chain, linear
 
 import fpirhc as fp
 from fpirhc.contraction.delayed import delayed_limit
+from fpirhc.contracts import Signal
 from fpirhc.controllers import check
 from fpirhc.errors import InvalidProblem, InvalidValue, NotContractive
 from fpirhc.simulation.loop import close_loop
-from fpirhc.symbolic.layout import Signal
 
 ESTIMATORS = (
     fp.Measured(),

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.conformance.loops import two_masses
 from fpirhc.errors import InvalidValue
-from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
 PROBLEM = replace(two_masses(), duration=0.4)

@@ -13,19 +13,18 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
-from gaps import gone_on, status
+from helpers.gaps import gone_on, status
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc import Status
+from fpirhc.contracts import Controller, Deformation, Layout, Wrapper, scalar
 from fpirhc.controllers.gate import FAILED, PATIENCE
-from fpirhc.deformation.base import Deformation, Wrapper, memory_of_map
+from fpirhc.deformation.base import memory_of_map
 from fpirhc.members import Example, examples
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.step_arguments import raw_measurements
-from fpirhc.status import Status
 from fpirhc.symbolic.expression import Expression
-from fpirhc.symbolic.layout import Layout, scalar
 from fpirhc.symbolic.native import find_compiler
 
 SHAPE = fp.Sigmoid(gain=-0.5, scale=2.0)

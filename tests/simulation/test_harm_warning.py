@@ -10,7 +10,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import linear
+from helpers.plants import linear
 
 import fpirhc as fp
 from fpirhc.controllers.contract import without_deformation

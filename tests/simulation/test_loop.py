@@ -8,12 +8,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from plants import linear, pendulum, swing
+from helpers.plants import linear, pendulum, swing
 
 import fpirhc as fp
+from fpirhc import simulator
 from fpirhc.errors import InvalidName, InvalidProblem
 from fpirhc.simulation.path import SHORT
-from fpirhc.simulation.simulate import simulator
 from fpirhc.symbolic.evaluate import Evaluator
 
 TRACK = fp.Exponential(rate=6.0)

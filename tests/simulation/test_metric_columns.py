@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hand_made_runs import CYCLES, SOLVE, problem, run
-from plants import linear
+from helpers.hand_made_runs import CYCLES, SOLVE, problem, run
+from helpers.plants import linear
 
 import fpirhc as fp
+from fpirhc import Status
+from fpirhc.contracts import Signal
 from fpirhc.simulation.metrics import known_metrics
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.trials import errors_of
-from fpirhc.status import Status
-from fpirhc.symbolic.layout import Signal
 
 BY_NAME = {metric.name: metric for metric in known_metrics()}
 

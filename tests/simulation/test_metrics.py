@@ -10,15 +10,15 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hand_made_runs import CYCLES, SOLVE, problem, run, step
-from plants import linear
+from helpers.hand_made_runs import CYCLES, SOLVE, problem, run, step
+from helpers.plants import linear
 
 import fpirhc as fp
+from fpirhc import Status
+from fpirhc.contracts import Layout, Signal
 from fpirhc.errors import InvalidName, InvalidValue
 from fpirhc.simulation.metrics import base, known_metrics, with_own_metrics
 from fpirhc.simulation.metrics.base import columns
-from fpirhc.status import Status
-from fpirhc.symbolic.layout import Layout, Signal
 
 
 def test_errors_are_those_of_the_measured_part():

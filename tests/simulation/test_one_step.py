@@ -13,17 +13,17 @@ from typing import Any
 import abroad
 import numpy as np
 import pytest
-from gaps import gone_on
-from plants import pendulum
+from helpers.gaps import gone_on
+from helpers.plants import pendulum
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.conformance.controller import same_command_everywhere
 from fpirhc.conformance.laws import keep
 from fpirhc.conformance.loops import Trial
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.members import examples
 from fpirhc.simulation.step_arguments import raw_measurements
-from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
 Loop = tuple[fp.Problem, Controller]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from blessed import LINE
+from helpers.blessed import LINE
 
 import fpirhc as fp
 from fpirhc.simulation.metrics import base, entries

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plants import swing
+from helpers.plants import swing
 
 import fpirhc as fp
 from fpirhc.errors import OutputError

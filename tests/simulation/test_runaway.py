@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import heavy
+from helpers.plants import heavy
 
 import fpirhc as fp
 

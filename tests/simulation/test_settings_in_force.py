@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
+from fpirhc import compare
 from fpirhc.errors import InvalidProblem
-from fpirhc.studies.comparison.compare import compare
 
 NAME, GAIN, SCALE = "CTC+FPI (eq 6)", "deformation.gain", "deformation.scale"
 CHANGES = {0.1: {GAIN: -0.9}, 0.2: {GAIN: -0.9, SCALE: 3.0}}

@@ -13,12 +13,11 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.conformance.loops import two_masses
+from fpirhc.contracts import Deformation, Tracking
 from fpirhc.controllers.reference_states import largest_response
-from fpirhc.deformation.base import Deformation
 from fpirhc.simulation.loop import close_loop
 from fpirhc.simulation.path import true_response
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.tracking.base import Tracking
 
 PROBLEM = replace(two_masses(), duration=6.0)
 PLANT = PROBLEM.plant

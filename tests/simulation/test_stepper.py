@@ -10,15 +10,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from gaps import status
-from plants import linear
+from helpers.gaps import status
+from helpers.plants import linear
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.contract import Controller
-from fpirhc.deformation.base import Deformation
+from fpirhc.contracts import Controller, Deformation
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidShape, InvalidValue, NotSupported
-from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Latest
 
 TRACK = fp.Exponential(rate=6.0)

@@ -7,12 +7,12 @@ from functools import cache
 
 import numpy as np
 import pytest
-from gaps import status
+from helpers.gaps import status
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.controllers.contract import named_in_task
 from fpirhc.errors import InvalidShape
-from fpirhc.status import Status
 from fpirhc.symbolic.native import find_compiler
 
 PLANT = fp.Plant(

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
-from plants import swing
+from helpers.plants import swing
 
 import fpirhc as fp
 from fpirhc.symbolic.native import find_compiler

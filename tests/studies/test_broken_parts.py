@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-import tasks
+from helpers import tasks
 
 import fpirhc as fp
 from fpirhc.simulation import simulate as simulating

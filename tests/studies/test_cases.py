@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from line import line_text
+from helpers.line import line_text
 
 import fpirhc as fp
 from fpirhc.errors import InvalidField, InvalidName, InvalidProblem

@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import casadi as ca
 import numpy as np
 import pytest
-from line import line_text
+from helpers.line import line_text
 
 import fpirhc as fp
 from fpirhc.contraction import spectrum

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import study
 from fpirhc.studies.comparison.verdict import Yardstick, left_alone
 from fpirhc.studies.runs import ranges
-from fpirhc.studies.study import study
 from fpirhc.studies.variants import CasesOf
 
 REST = fp.Trajectory(lambda t: {"y": 1.0 + 0 * t})

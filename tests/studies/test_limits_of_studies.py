@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc import limits
+from fpirhc.contracts import Controller
 from fpirhc.errors import InvalidName, InvalidValue
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.limits import Limits, limits
+from fpirhc.studies.limits import Limits
 from fpirhc.studies.variants import Draws
 
 RATE, PERIOD = 2.0, 0.02  # 1/s, s

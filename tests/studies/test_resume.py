@@ -14,13 +14,13 @@ from pathlib import Path
 import joblib
 import pandas as pd
 import pytest
-from line import line_text
+from helpers.line import line_text
 
 import fpirhc as fp
+from fpirhc import limits
 from fpirhc.errors import InvalidProblem, OutputError, WorkerDied
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies import runs
-from fpirhc.studies.limits import limits
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import Draws
 

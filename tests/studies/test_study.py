@@ -10,17 +10,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from line import EXACT, line_text
+from helpers.line import EXACT, line_text
 from scipy import stats
 from typer.testing import CliRunner
 
 import fpirhc as fp
+from fpirhc import study
 from fpirhc.cli import app
 from fpirhc.errors import FpirhcError
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.studies.comparison.verdict import Outcome
 from fpirhc.studies.objective import Objective, objective
-from fpirhc.studies.study import VariantStudy, interval, middle, share_interval, study, summarised
+from fpirhc.studies.study import VariantStudy, interval, middle, share_interval, summarised
 from fpirhc.studies.variants import CasesOf, Draws, Grid
 
 CASES = """

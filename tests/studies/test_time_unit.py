@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 import fpirhc as fp
+from fpirhc import compare, study
 from fpirhc.describe import digest
 from fpirhc.errors import InvalidProblem
 from fpirhc.plant.motion import forcing_units
@@ -17,9 +18,9 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.figures import plan_figure
 from fpirhc.report.html import chart_data, render, render_charted
 from fpirhc.report.terminal import show
-from fpirhc.studies.comparison.compare import Comparison, compare
+from fpirhc.studies.comparison.compare import Comparison
 from fpirhc.studies.open_loop import first_plans
-from fpirhc.studies.study import study, write_csv
+from fpirhc.studies.study import write_csv
 from fpirhc.studies.variants import Draws
 
 GALLERY = Path(__file__).parents[2] / "problems" / "gallery"

@@ -10,14 +10,14 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from line import EXACT, line_text
+from helpers.line import EXACT, line_text
 
 import fpirhc as fp
+from fpirhc import tune
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported
 from fpirhc.problem_files.settings import current_setting
 from fpirhc.studies.objective import PENALTY
 from fpirhc.studies.runs import run_variants
-from fpirhc.studies.tune import tune
 from fpirhc.studies.variants import CasesOf, Draws
 from fpirhc.task.cases import is_whole
 

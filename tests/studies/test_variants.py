@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from line import EXACT, line_text
+from helpers.line import EXACT, line_text
 from scipy import stats
 
 import fpirhc as fp

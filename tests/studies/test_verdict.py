@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Run
+from fpirhc.contracts import Layout, Signal
 from fpirhc.report.html import css_class
 from fpirhc.report.terminal import STYLES
 from fpirhc.simulation.metrics import Metrics, known_metrics
-from fpirhc.simulation.run import Run
 from fpirhc.simulation.trials import ErrorPair
 from fpirhc.studies.comparison.compare import Entry
 from fpirhc.studies.comparison.verdict import FLAGS, Finding, Outcome, Yardstick, findings, judge
 from fpirhc.studies.objective import Objective
-from fpirhc.symbolic.layout import Layout, Signal
 
 CYCLES = 100
 UNITS = {"y": "m", "z": "rad"}

@@ -9,7 +9,8 @@ import abroad
 import pytest
 
 import fpirhc as fp
-from fpirhc.studies.comparison.compare import Comparison, broken_limits, compare
+from fpirhc import compare
+from fpirhc.studies.comparison.compare import Comparison, broken_limits
 from fpirhc.studies.comparison.verdict import Outcome
 
 

@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fpirhc as fp
+from fpirhc.contracts import Block, Delay, Layout, Signal, scalar, vector
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue
 from fpirhc.simulation.loop import close_loop
-from fpirhc.symbolic.block import Block, Delay, compose, every
-from fpirhc.symbolic.layout import Layout, Named, Signal, scalar, vector
+from fpirhc.symbolic.block import compose, every
+from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.live import copied, is_live, live_number, live_numbers, nominal
 from fpirhc.symbolic.paths import changed_at
 

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from loops_in_c import coupled
+from helpers.loops_in_c import coupled
 
 import fpirhc as fp
 from fpirhc.optimisers import base

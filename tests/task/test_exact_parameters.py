@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc import Problem, Reality
 from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem
 from fpirhc.plant.motion import with_exact_parameters
-from fpirhc.task.problem import Problem
-from fpirhc.task.reality import Reality
 
 CACHED = sorted(name for name, one in vars(Problem).items() if isinstance(one, cached_property))
 NAMES = ["two_mass", "tumour", "freeway", "crane_slots", "heat_exchanger"]

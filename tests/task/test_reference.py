@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from plants import chain
+from helpers.plants import chain
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidShape, InvalidValue

@@ -8,18 +8,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-import tasks
-from plants import chain
+from helpers import tasks
+from helpers.plants import chain
 from scipy.linalg import expm
 from scipy.special import comb
 
 import fpirhc as fp
+from fpirhc import load_run
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.reference_states import request_along_reference
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidShape, InvalidValue
 from fpirhc.report.terminal import set_points_in_force
 from fpirhc.simulation.loop import close_loop
-from fpirhc.simulation.run import load_run
 from fpirhc.symbolic.native import native
 from fpirhc.task.set_point import transition
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 
 LAW = fp.Exponential(rate=2.0)
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.plants import chain
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import chain
 
 import fpirhc as fp
 from fpirhc.controllers.sensing_chain import compose_controller

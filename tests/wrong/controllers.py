@@ -7,13 +7,11 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc import Identity
+from fpirhc.contracts import Block, Controller, Deformation, Layout, closing_blocks, like, reference_block
 from fpirhc.controllers.contract import PlantModel
-from fpirhc.deformation import Deformation, Identity
 from fpirhc.errors import NotSupported
 from fpirhc.plant.motion import with_exact_parameters
-from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.layout import Layout
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.deformation import Deformation
+from fpirhc.contracts import Deformation
 from fpirhc.deformation.base import Iteration
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.sensing.base import StateObserver, values_of
-from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.contracts import Layout, Signal, StateObserver, values_of
 
 
 @dataclass(frozen=True)

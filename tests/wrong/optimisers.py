@@ -10,11 +10,20 @@ from typing import Any
 import casadi as ca
 
 import fpirhc as fp
+from fpirhc.contracts import (
+    Layout,
+    Optimiser,
+    Signal,
+    clip,
+    is_finite,
+    judge,
+    reduced_gradient,
+    remembered_plan,
+    sane,
+    shift,
+    status_of,
+)
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.problem import reduced_gradient
-from fpirhc.optimisers.base import Optimiser, clip, judge, remembered_plan, sane, shift, status_of
-from fpirhc.symbolic.expression import is_finite
-from fpirhc.symbolic.layout import Layout, Signal
 
 _SHARE, _MOMENTUM = 0.12, 0.5
 

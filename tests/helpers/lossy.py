@@ -9,11 +9,10 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
+from fpirhc import Status
+from fpirhc.contracts import Controller, values_of
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import Controller
-from fpirhc.sensing.base import values_of
 from fpirhc.simulation.path import true_response
-from fpirhc.status import Status
 
 
 class Lossy:

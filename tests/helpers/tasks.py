@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from fpirhc.problem_files.problem_file import Task, load_problem
+from fpirhc import load_problem
+from fpirhc.problem_files.problem_file import Task
 
 _loaded = cache(load_problem)
 

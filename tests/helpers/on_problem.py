@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from fpirhc import Problem, load_problem
 from fpirhc.conformance.loops import two_masses
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.members import Example
-from fpirhc.problem_files.problem_file import load_problem
-from fpirhc.task.problem import Problem
 
 
 def on_problem(member: Any) -> tuple[Controller, Problem]:

@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 
 
 def linear(gain: float, believed: float) -> fp.Plant:

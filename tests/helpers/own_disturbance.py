@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fpirhc.task.disturbance import Disturbance
+from fpirhc.contracts import Disturbance
 
 
 class Sawtooth(Disturbance):

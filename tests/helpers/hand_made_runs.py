@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from plants import linear
 
 import fpirhc as fp
-from fpirhc.simulation.run import Run, with_common_columns
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc import Run
+from fpirhc.contracts import Layout, Signal, scalar
+from fpirhc.simulation.run import with_common_columns
+from helpers.plants import linear
 
 PERIOD, CYCLES = 0.1, 100
 SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")

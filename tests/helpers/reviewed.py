@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import casadi as ca
-from plants import heavy
 
 import fpirhc as fp
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 from fpirhc.review.review import Answer
+from helpers.plants import heavy
 
 PERIOD = 1e-3  # s
 

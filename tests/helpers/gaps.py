@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import fpirhc as fp
+from fpirhc import Status
 from fpirhc.simulation.clock import MEMORY as CLOCK
-from fpirhc.status import Status
 
 COUNTS = {"missing_cycles", "skipped_before", CLOCK.name}  # in every stepper
 MANY = {"jumps", "_integral_before"}  # in many: the check of responses, and integrals of errors, which go on

@@ -1,0 +1,1 @@
+"""Plants, loops, faults and rules that several tests use."""
