@@ -24,7 +24,7 @@ SECTIONS = {
     "Running and measuring": ("simulation", "status", "errors"),
     "Review, studies and reports": ("review", "probing", "studies", "report", "baselines", "certificate"),
 }
-BESIDE = ("fpirhc.conformance", "fpirhc.studies.variants", "fpirhc.contraction.spectrum")  # imported from the module
+BESIDE = ("fpirhc.conformance", "fpirhc.contraction.spectrum")  # imported from the module
 MEMBERS = {"Run", "Stepper", "Simulator", "Plant", "Problem", "Plan", "figures"}  # shown with all that they have
 
 

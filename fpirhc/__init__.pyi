@@ -101,6 +101,9 @@ from .studies.limits import limits as limits
 from .studies.open_loop import certify as certify
 from .studies.study import study as study
 from .studies.tune import tune as tune
+from .studies.variants import CasesOf as CasesOf
+from .studies.variants import Draws as Draws
+from .studies.variants import Grid as Grid
 from .symbolic.live import signed_power as signed_power
 from .task.cases import Cases as Cases
 from .task.dead_time import DeadTime as DeadTime

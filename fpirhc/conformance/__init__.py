@@ -2,6 +2,7 @@
 
 Each function raises one AssertionError for the first law that is broken, with the numbers, and returns nothing (`check_live`: what
 became of every number). The laws are the tuples `LAWS` of the modules, one module per family.
+`examples(family)` are the members that they are tried on, of other distributions too.
 """
 
 import lazy_loader as _lazy

@@ -13,6 +13,10 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.describe import describe
 from fpirhc.errors import CompileError, FpirhcError, NotSupported
+from fpirhc.members import FAMILIES as FAMILIES
+from fpirhc.members import Example as Example
+from fpirhc.members import examples as examples
+from fpirhc.members import member_classes as member_classes
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.symbolic.paths import entry, names_in
 from fpirhc.task.problem import Problem

@@ -92,7 +92,7 @@ def load_problem(name_or_path: str | Path) -> Task:
     It may also define
 
     - `headline`, a pair (controller without adaptation, the same one with it) for the verdict,
-    - `cases`, a `Cases`: named cases for `fpirhc compare --cases`,
+    - `cases`, a `Cases`: named cases for `fpirhc study --cases`,
     - `headline_metric`, the name of the number by which controllers are compared and tuned, 'in_band' or 'rms_error.q1',
     - `tuning`, {controller: {path of a setting: Span or LogSpan}}, the ranges in which `fpirhc tune` searches,
     - `metrics`, a sequence of `Metric` for all tables, files and baselines of the problem, in addition to the shipped ones,
