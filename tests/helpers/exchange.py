@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import fpirhc as fp
-from fpirhc.task.exogenous import really_known
 
 
 def with_exact_model(problem: fp.Problem) -> fp.Problem:
@@ -14,7 +13,7 @@ def with_exact_model(problem: fp.Problem) -> fp.Problem:
     known = {n: replace(p, approximate=p.exact) for n, p in problem.plant.parameters.items()}
     sensors = {n: replace(s, noise=None, dropout=0.0) for n, s in problem.sensing.sensors.items()}
     plant, sensing = replace(problem.plant, parameters=known), replace(problem.sensing, sensors=sensors)
-    signals = really_known(problem.signals)
+    signals = {name: fp.Known(one.values) for name, one in problem.signals.items()}
     return replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
 
 

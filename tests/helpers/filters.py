@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.simulation.step_arguments import raw_measurements
+from helpers.replay import samples
 
 State = Any
 
@@ -49,7 +49,7 @@ def extended_filter(
         measured: deviation of the sensor.
     """
     x, p, states = start[0], np.diag(start[1]) ** 2, []
-    for k, sample in enumerate(raw_measurements(result)):
+    for k, sample in enumerate(samples(result)):
         x, p = _predicted(step, x, p, result["command"][k - 1, 0], noise) if k else (x, p)
         c = slope(shown, x)
         gain = p @ c.T / (c @ p @ c.T + measured**2)

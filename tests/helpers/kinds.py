@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fpirhc.problem_files.shipped import shipped_problems
+_FOLDER = Path(__file__).parents[2] / "problems"
+NAMES = sorted(p.stem for where in (_FOLDER, _FOLDER / "gallery") for p in where.glob("[!_]*.py"))
 
 ALIKE = {  # a problem of the same kind: the problems that repeat it
     "anaesthesia": ("anaesthesia_drawn", "anaesthesia_monitor", "anaesthesia_people", "anaesthesia_stimulated"),
@@ -26,8 +28,8 @@ ALIKE = {  # a problem of the same kind: the problems that repeat it
 def shipped(*long: str) -> list[Any]:
     """All names; those that repeat another, and those that take long here, with the mark of the slow lane."""
     slow = {*long, *(name for names in ALIKE.values() for name in names)}
-    assert slow | {*ALIKE} <= {*shipped_problems()}
-    return [pytest.param(n, marks=[pytest.mark.slow] if n in slow else ()) for n in sorted(shipped_problems())]
+    assert slow | {*ALIKE} <= {*NAMES}
+    return [pytest.param(n, marks=[pytest.mark.slow] if n in slow else ()) for n in NAMES]
 
 
 def slow_but(values: Iterable[Any], *quick: Any) -> list[Any]:

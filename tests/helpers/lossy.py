@@ -9,10 +9,7 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc import Status
 from fpirhc.contracts import Controller, values_of
-from fpirhc.controllers.check import checked
-from fpirhc.simulation.path import true_response
 
 
 class Lossy:
@@ -28,10 +25,6 @@ class Lossy:
         self.problem, plant = problem, problem.plant
         self.stepper = fp.Stepper(problem, controller, **({"compiled": False} | settings))
         self._advance = problem.integrator.step(plant, problem.period)
-        own = checked(problem, controller).response(problem)
-        response = (own or true_response(problem)).function
-        assert response is not None
-        self._response = response
         self._shows = self._seen if self.stepper.estimates else self._measured
         x, u, p = plant.symbols()
         values = values_of(plant, x, u, p)
@@ -82,12 +75,12 @@ class Lossy:
             ).ravel()
         return np.array(commands)
 
-    def statuses(self) -> list[Status]:
-        return [Status(int(row["status"][0])) for row in self.trace]
+    def statuses(self) -> list[fp.Status]:
+        return [fp.Status(int(row["status"][0])) for row in self.trace]
 
     def _measured(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         plant = self.problem.plant
-        realised = self._response(x, u, plant.exact, np.zeros(len(plant.names)))
+        realised = plant.equations.controlled_response(x, u, plant.exact)
         return np.concatenate([x, np.asarray(realised.full()).ravel()])
 
     def _seen(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:

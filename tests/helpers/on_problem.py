@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fpirhc import Problem, load_problem
-from fpirhc.conformance.loops import two_masses
+import fpirhc as fp
+from fpirhc.conformance import Example, two_masses
 from fpirhc.contracts import Controller
-from fpirhc.members import Example
 
 
-def on_problem(member: Any) -> tuple[Controller, Problem]:
+def on_problem(member: Any) -> tuple[Controller, fp.Problem]:
     """A controller of the shipped examples with its problem."""
     if not isinstance(member, Example):
         return member, two_masses()
-    task = load_problem(member.problem) if member.problem else None
+    task = fp.load_problem(member.problem) if member.problem else None
     problem = replace(task.problem if task else two_masses(), **{"measure_from": 0.0, **member.changes})
     return (task.controllers[member.controller] if task and member.value is None else member.value), problem
 

@@ -8,7 +8,6 @@ import casadi as ca
 
 import fpirhc as fp
 from fpirhc.contracts import Controller
-from fpirhc.review.review import Answer
 from helpers.plants import heavy
 
 PERIOD = 1e-3  # s
@@ -25,7 +24,7 @@ def torque(gain: float = -0.5, rate: float = 6.0, scale: float = 20.0) -> fp.Com
     return fp.ComputedTorque(fp.Exponential(rate=rate), fp.Sigmoid(gain=gain, scale=scale))
 
 
-def answers(problem: fp.Problem, controller: Controller | None = None, mismatch: float = 0.0) -> dict[str, Answer]:
+def answers(problem: fp.Problem, controller: Controller | None = None, mismatch: float = 0.0) -> dict[str, Any]:
     """All answers about the problem and one controller."""
     found = fp.review(problem, {"it": controller or torque()}, mismatch=mismatch, seed=0).answers
     return {a.key: a for some in found.values() for a in some}

@@ -10,8 +10,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.gaps import status
 from helpers.plants import linear
+from helpers.replay import status
 
 import fpirhc as fp
 from fpirhc import Status

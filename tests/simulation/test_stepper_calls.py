@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.gaps import status
+from helpers.replay import status
 
 import fpirhc as fp
 from fpirhc import Status
