@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import casadi as ca
@@ -36,7 +36,13 @@ class Lossy:
         self.trace: list[dict[str, np.ndarray]] = []  # of every step
         self.states: list[np.ndarray] = []  # of the plant, in every cycle
 
-    def run(self, cycles: int, lost: Collection[int] = (), how: str = "lost") -> np.ndarray:
+    def run(
+        self,
+        cycles: int,
+        lost: Collection[int] = (),
+        how: str = "lost",
+        shown: Callable[[int, np.ndarray], np.ndarray] = lambda _, row: row,
+    ) -> np.ndarray:
         """Return the commands in force in every cycle, shape (cycles, inputs).
 
         Args:
@@ -44,6 +50,7 @@ class Lossy:
             lost: cycles whose sample is missing.
             how: "lost": it is NaN; "missed": the stepper is not called; "interpolated": it is called afterwards, with samples on
                 the line between those before and after, and its commands are too late.
+            shown: (cycle, sample) -> what the stepper is given.
         """
         problem, period = self.problem, self.problem.period
         memory, x = self.stepper.start(), np.array(problem.start_state, dtype=float)
@@ -63,7 +70,7 @@ class Lossy:
                     shown = last + (sample - last) * (i + 1) / (len(waiting) + 1)
                     _, memory = self.stepper.step_measured(j * period, shown, memory)
                 waiting = []
-                row = np.full(sample.size, np.nan) if k in lost else sample
+                row = np.full(sample.size, np.nan) if k in lost else shown(k, sample.copy())
                 command, memory = self.stepper.step_measured(k * period, row, memory)
             commands.append(command)
             sent.append(command)

@@ -1,18 +1,22 @@
-"""The time of a step follows that of the step before: what cannot is skipped with a status; a clock that was set is believed."""
+"""The time of a step follows that of the step before: what cannot is skipped with a status; a clock that was set is believed.
+
+Late steps are counted and told; the clock of these tests is a list.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import chain
 
 import numpy as np
 import pytest
+from helpers.machine import needs_compiler
+from helpers.replay import status
 
 import fpirhc as fp
-from fpirhc import Status
-from fpirhc.conformance.loops import two_masses
-from fpirhc.errors import InvalidValue
-from fpirhc.symbolic.native import find_compiler
+from fpirhc.conformance import two_masses
+from fpirhc.errors import FpirhcError
 
 PROBLEM = replace(two_masses(), duration=0.4)
 PERIOD = PROBLEM.period
@@ -20,7 +24,7 @@ CONTROLLERS = {
     "computed torque": fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0)),
     "plan": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)),
 }
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+LIMIT = 1e-3  # s
 
 
 @cache
@@ -28,7 +32,7 @@ def stepper(name: str = "computed torque", *, compiled: bool = False) -> fp.Step
     return fp.Stepper(PROBLEM, CONTROLLERS[name], compiled=compiled)
 
 
-def stepped(times: list[float], name: str = "computed torque", *, compiled: bool = False) -> list[Status]:
+def stepped(times: list[float], name: str = "computed torque", *, compiled: bool = False) -> list[fp.Status]:
     """Statuses of steps at these times with one sample."""
     own, statuses = stepper(name, compiled=compiled), []
     memory, x, r = own.start(), np.array(PROBLEM.start_state), np.zeros(2)
@@ -36,7 +40,7 @@ def stepped(times: list[float], name: str = "computed torque", *, compiled: bool
         command, memory = own.step(t, x, r, memory)
         assert np.isfinite(command).all()
         assert np.isfinite(memory).all()
-        statuses.append(Status(int(own.trace()["status"][0])))
+        statuses.append(status(own))
     return statuses
 
 
@@ -56,11 +60,11 @@ WRONG = {
 def test_a_time_that_cannot_follow_is_skipped(name, which):
     """It is BAD_TIME in its own cycle alone: the next good time is that of an ordinary cycle."""
     good = stepped([k * PERIOD for k in range(3)], name)
-    assert Status.BAD_TIME not in good
+    assert fp.Status.BAD_TIME not in good
     next_one = 3.0 if "repeats" in which else 4.0
     statuses = stepped([0.0, PERIOD, 2 * PERIOD, WRONG[which] * PERIOD, next_one * PERIOD], name)
-    assert statuses[3] == Status.BAD_TIME
-    assert Status.BAD_TIME not in (*statuses[:3], statuses[4])
+    assert statuses[3] == fp.Status.BAD_TIME
+    assert fp.Status.BAD_TIME not in (*statuses[:3], statuses[4])
 
 
 def test_a_skipped_time_changes_nothing():
@@ -76,13 +80,13 @@ def test_a_skipped_time_changes_nothing():
 
 @pytest.mark.parametrize("jitter", [-0.45, 0.45])
 def test_jitter_within_half_a_period_is_fine(jitter):
-    assert Status.BAD_TIME not in stepped([k * PERIOD + (k % 2) * jitter * PERIOD for k in range(12)])
+    assert fp.Status.BAD_TIME not in stepped([k * PERIOD + (k % 2) * jitter * PERIOD for k in range(12)])
 
 
 @pytest.mark.parametrize(("first", "fits"), [(1.7e9, True), (-5.0, True), (1.7e18, False), (1e18, False)])
 def test_the_first_time_resolves_the_period(first, fits):
     """Seconds since 1970 do; nanoseconds since then do not."""
-    assert (stepped([first])[0] != Status.BAD_TIME) == fits
+    assert (stepped([first])[0] != fp.Status.BAD_TIME) == fits
 
 
 @pytest.mark.parametrize("to", [-1000.0, 0.0, 1e6])
@@ -90,10 +94,10 @@ def test_a_clock_that_was_set_is_believed(to):
     """Twenty regular times are no glitch; a clock that stands still is never believed."""
     times = [5.0 + k * PERIOD for k in range(3)] + [to + k * PERIOD for k in range(25)]
     statuses = stepped(times)
-    assert all(s == Status.BAD_TIME for s in statuses[3:22])
-    assert Status.BAD_TIME not in statuses[23:]
+    assert all(s == fp.Status.BAD_TIME for s in statuses[3:22])
+    assert fp.Status.BAD_TIME not in statuses[23:]
     still = stepped([5.0 + k * PERIOD for k in range(3)] + [5.0] * 30)
-    assert all(s == Status.BAD_TIME for s in still[3:])
+    assert all(s == fp.Status.BAD_TIME for s in still[3:])
 
 
 @needs_compiler
@@ -103,21 +107,45 @@ def test_compiled_clock_is_the_same():
     times = [k * PERIOD * (1 if generator.random() < 0.8 else 10.0 ** generator.integers(-2, 15)) for k in range(80)]
     times += [-7.0 + k * PERIOD for k in range(30)]
     assert stepped(times) == stepped(times, compiled=True)
-    assert {Status.OK, Status.BAD_TIME} <= set(stepped(times))
+    assert {fp.Status.OK, fp.Status.BAD_TIME} <= set(stepped(times))
 
 
-MASKED = {
-    "state": lambda x, r: (np.ma.masked_array(x, [True, False, False, False]), r),
-    "realised": lambda x, r: (x, np.ma.masked_array(r, [True, False])),
-    "state, nothing masked": lambda x, r: (np.ma.masked_array(x), r),
-    "state, a list": lambda x, r: ([True, 0.0, 0.0, 0.0], r),
-    "realised, a tuple": lambda x, r: (x, (np.True_, 0.0)),
-}
+def timed(durations: list[float] | np.ndarray) -> fp.Stepper:
+    """A stepper with a deadline whose steps took these durations."""
+    clock = chain.from_iterable((0.0, float(d)) for d in durations)
+    law = fp.ComputedTorque(fp.Exponential(rate=6.0))
+    one = fp.Stepper(PROBLEM, law, compiled=False, deadline=LIMIT, clock=lambda: next(clock))
+    memory = one.start()
+    for k in range(len(durations)):
+        _, memory = one.step(k * PERIOD, np.array(PROBLEM.start_state), np.zeros(2), memory)
+    return one
 
 
-@pytest.mark.parametrize("which", MASKED)
-def test_masked_arrays_and_truth_values_are_refused(which):
-    """A masked number is none, and what lies under the mask must not be used; a truth value in a list is no measurement."""
-    own, (x, r) = stepper(), MASKED[which](np.zeros(4), np.zeros(2))
-    with pytest.raises(InvalidValue, match=which.partition(",")[0]):
-        own.step(0.0, x, r, own.start())
+def test_late_steps_are_counted_and_told():
+    one = timed([1e-4, 2e-3, 1e-3, 5e-3, 1e-4, 1.1e-3, 9e-4])
+    deadline = one.deadline
+    assert deadline is not None
+    assert (deadline.cycles, deadline.late, deadline.worst, deadline.last) == (7, 3, 5e-3, 9e-4)
+    assert str(deadline) == "deadline 1 ms: 3 of 7 cycles late, worst 5 ms, 99.9 % within 5 ms"
+    assert str(deadline) in repr(one)
+    with pytest.raises(StopIteration):  # a step that is refused has its time too
+        one.step(0.0, np.ones(3), np.zeros(2), one.start())
+
+
+def test_percentiles_are_those_of_all_steps():
+    """To the width of a class above, and never below, numpy's of everything that was measured; an hour is in the last class."""
+    durations = 1e-4 * np.exp(np.random.default_rng(0).standard_normal(2_001))
+    deadline = timed(durations).deadline
+    assert deadline is not None
+    for percent in (50.0, 99.0, 99.9):
+        exact = float(np.percentile(durations, percent, method="inverted_cdf"))
+        assert 1.0 <= deadline.percentile(percent) / exact <= 2 ** (1 / 32) * (1 + 1e-12)
+    hour = timed([0.0, -1.0, 3600.0]).deadline
+    assert hour is not None
+    assert (hour.worst, hour.percentile()) == (3600.0, 3600.0)
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf, "1", True])
+def test_a_deadline_is_a_positive_number(limit):
+    with pytest.raises(FpirhcError, match=r"deadline: expected a|expected a positive number of seconds"):
+        fp.Stepper(PROBLEM, CONTROLLERS["computed torque"], compiled=False, deadline=limit)

@@ -8,13 +8,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.plants import linear, pendulum, swing
+from helpers.faults import Failing
+from helpers.machine import COMPILER
+from helpers.plants import heavy, linear, pendulum, swing
+from helpers.tasks import made
 
 import fpirhc as fp
-from fpirhc import simulator
 from fpirhc.errors import InvalidName, InvalidProblem
-from fpirhc.simulation.path import SHORT
-from fpirhc.symbolic.evaluate import Evaluator
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -118,40 +118,18 @@ def test_run_stops_where_a_signal_is_not_finite():
     assert np.isnan(metrics.rms_error["y"])
 
 
-@pytest.mark.parametrize("fails", ["raises", "sets its flag"])
-def test_run_stops_where_a_solver_fails(fails, monkeypatch):
-    """The run keeps the cycles before, and the reason is the solver's."""
-    ready = simulator(swing(), fp.ComputedTorque(TRACK), compiled=False)
-    evaluate, calls = ready.evaluator.evaluate, []
-
-    def broken() -> object:
-        calls.append(1)
-        if len(calls) > 2 and fails == "raises":
-            raise RuntimeError("first line\nOSQP failed")
-        return evaluate()
-
-    monkeypatch.setattr(ready.evaluator, "evaluate", broken)
-    if fails != "raises":
-        monkeypatch.setattr(Evaluator, "failed", property(lambda self: len(calls) > 2))
-    run = ready.run(seed=0)
-    assert run.cycles == 2 * SHORT
-    assert run.stop is not None
-    assert ("OSQP failed" if fails == "raises" else "compiled code failed") in run.stop
-
-
-def test_save_and_load(tmp_path):
-    result = run(swing(duration=0.1, measure_from=0.0))
-    result.save(tmp_path / "run.npz")
-    again = fp.load_run(tmp_path / "run.npz")
-    assert np.array_equal(again.log, result.log)
-    assert again.layout.columns == result.layout.columns
-    settings: Any = again.settings
-    assert settings["controller"]["is"] == "ComputedTorque"
-    (tmp_path / "bad.npz").write_bytes((tmp_path / "run.npz").read_bytes()[:200])
-    with pytest.raises(fp.FpirhcError, match="cannot read"):
-        fp.load_run(tmp_path / "bad.npz")
-    with pytest.raises(fp.FpirhcError, match="cannot write"):
-        result.save(tmp_path / "no" / "run.npz")
+def test_run_stops_where_a_solver_fails():
+    """The run keeps the cycles before, and the reason is the solver's last line."""
+    problem = swing(horizon=fp.Horizon(stages=4, step=0.02), cost=fp.Quadratic({"angle": 1.0}, effort={"torque": 1e-3}))
+    whole, broken = (
+        fp.simulate(problem, fp.RecedingHorizon(Failing(iterations=1, tolerance=1e-3, at=at)), seed=0, compiled=False)
+        for at in (None, 30)
+    )
+    assert whole.stop is None
+    assert str(broken.stop).startswith("a solver failed within")
+    assert "OSQP failed" in str(broken.stop)
+    assert 0 < broken.cycles <= 30 * 20  # a plan every twentieth cycle
+    np.testing.assert_array_equal(broken["command"], whole["command"][: broken.cycles])
 
 
 def test_signals_by_name():
@@ -162,6 +140,102 @@ def test_signals_by_name():
     assert "error.angle" in result.to_dataframe().columns
     with pytest.raises(InvalidName, match="Did you mean 'desired'"):
         result["desird"]
+
+
+def late_mass(late: float, amplitude: float = 0.2, duration: float = 60.0) -> fp.Problem:
+    """A mass without limits behind a dead time that its law does not know."""
+    reference, late_by = fp.Trajectory(lambda t: {"q": amplitude + 0 * t}), fp.DeadTime(inputs={"F": late})
+    return fp.Problem(heavy(1.0, 1.0, u="F"), reference, {"q": 0.0}, 0.01, duration, dead_time=late_by)
+
+
+@pytest.mark.parametrize(
+    ("problem", "stops"),
+    [(late_mass(0.5), True), (late_mass(0.5, duration=3.0), False), (late_mass(0.0, 0.0, 5.0), False)],
+    ids=["runs away", "ends before", "a reference of zero has no million times"],
+)
+def test_a_loop_that_runs_away_stops_where_its_error_is_a_million_times_the_reference(problem, stops):
+    run = fp.simulate(problem, fp.ComputedTorque(TRACK), seed=0, compiled=False)
+    assert ("more than a million times the 0.2 m of its reference and start" in str(run.stop)) == stops
+    assert (run.cycles < problem.cycles) == stops
+    assert np.abs(run["error"]).max() <= 2e5
+
+
+# Every kind of reference and integrator, compiled where it can be and where it is worth it
+
+
+def test_table_reference_is_tracked_like_the_expression_it_samples():
+    """A table goes through the same loop; its look-up keeps the loop an MX graph, which still compiles."""
+    times = np.linspace(0, 3, 601)
+    table = swing(reference=fp.Table(times, {"angle": 0.5 * np.sin(2 * times)}))
+    runs = [
+        fp.simulate(p, fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0)), seed=0) for p in (swing(), table)
+    ]
+    assert runs[1].compiled == (COMPILER is not None)
+    np.testing.assert_allclose(runs[1]["state.angle"], runs[0]["state.angle"], atol=1e-6)
+
+
+def test_reference_integrator_gives_the_same_run():
+    """CVODES against Runge-Kutta: the same closed loop within its tolerance; it stays in the virtual machine and says so."""
+    controller = fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0))
+    reference, ordinary = (
+        fp.simulate(swing(integrator=one, duration=0.5, measure_from=0.0), controller, seed=0)
+        for one in (fp.Cvodes(1e-10), fp.RungeKutta4(2))
+    )
+    assert not reference.compiled
+    np.testing.assert_allclose(ordinary["state"], reference["state"], atol=1e-7)
+
+
+def test_plant_that_is_not_affine_in_its_input():
+    """A valve with a cubic characteristic: the inverse is found numerically, and adaptation works on it."""
+    tank = fp.Plant(
+        {"level": "m"},
+        {"valve": "1"},
+        {"c": fp.Parameter(approximate=0.7, exact=1.0, unit="m/s"), "k": fp.Parameter(0.3, 0.5, "1/s")},
+        lambda q, u, p: {"level": p.c * (u.valve + 0.5 * u.valve**3) - p.k * q.level},
+        order=1,
+    )
+    problem = fp.Problem(
+        tank, fp.Trajectory(lambda t: {"level": 1 + 0.3 * ca.sin(t)}), {"level": 1.0}, 1e-2, 10.0, measure_from=5.0
+    )
+    # rate x period = 0.02; the response error falls by about half per cycle
+    controllers = [fp.ComputedTorque(fp.Exponential(2.0), d) for d in (fp.Identity(), fp.Sigmoid(gain=-1.0, scale=5.0))]
+    plain, adaptive = (fp.measure(problem, fp.simulate(problem, c, seed=0)).rms_error["level"] for c in controllers)
+    assert adaptive < 0.1 * plain
+
+
+def test_a_short_run_is_not_compiled_unless_it_is_asked_for():
+    """None chooses by cycles and stages; the run says why, and is that of the virtual machine."""
+    chosen = fp.simulate(swing(duration=0.02, measure_from=0.0), fp.ComputedTorque(TRACK), seed=0, compiled=None)
+    assert chosen.settings["why not compiled"] == "the run is short, and a compiler would take longer"
+    ready = fp.simulator(swing(duration=200.0), fp.ComputedTorque(TRACK), compiled=None)
+    assert ready.compiled or "short" not in ready.why_not_compiled
+
+
+def test_every_hard_limit_that_is_left_is_noted():
+    """Of a state and of an expression, by their own values; a rate is kept by the command, and what is weighed is no limit."""
+    task = fp.load_problem("van_der_pol")
+    power = fp.PathConstraint(lambda v: v.input.u * v.state["q'"], -20.0, 20.0, "W")
+    hard = replace(
+        task.problem.limits, states={"q'": (-1.0, 1.0)}, rates={"u": (-300.0, 300.0)}, paths={"power": power}
+    )
+    law = fp.ComputedTorque(TRACK)
+
+    def notes(limits: fp.Limits) -> tuple[fp.Run, list[str]]:
+        problem = replace(task.problem, duration=2.0, measure_from=0.0, limits=limits)
+        [entry] = fp.compare(made(problem, {"CTC": law}), seed=0, compiled=False).entries
+        return entry.run, [note for note in entry.notes if "hard limit" in note]
+
+    run, said = notes(hard)
+    speed, force = run["plant_state"][:, 1], np.ravel(run["command"])
+    assert np.abs(np.diff(force)).max() <= 300.0 * run.period * (1 + 1e-9)
+    for name, values in {"q'": speed, "power": force * speed}.items():
+        worst = values[np.argmax(np.abs(values))]
+        assert [note for note in said if note.startswith(f"{name} reaches {worst:.4g} ")], said
+    assert len(said) == 2
+    assert notes(replace(hard, soft={"power": 1.0, "q'": 1.0}))[1] == []
+
+
+# Mistakes at the door
 
 
 BAD: dict[str, dict[str, Any]] = {

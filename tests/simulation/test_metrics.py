@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +13,8 @@ from helpers.hand_made_runs import CYCLES, SOLVE, problem, run, step
 from helpers.plants import linear
 
 import fpirhc as fp
-from fpirhc import Status
 from fpirhc.contracts import Layout, Signal
 from fpirhc.errors import InvalidName, InvalidValue
-from fpirhc.simulation.metrics import base, known_metrics, with_own_metrics
-from fpirhc.simulation.metrics.base import columns
 
 
 def test_errors_are_those_of_the_measured_part():
@@ -104,7 +100,7 @@ def test_cost_is_the_sum_of_the_measured_part_by_term():
 
 def test_statuses_are_counted_and_the_worst_is_told():
     """Ninety cycles as they should be, seven not converged, three held."""
-    status = np.repeat([Status.OK, Status.NOT_CONVERGED, Status.HELD], [90, 7, 3])
+    status = np.repeat([fp.Status.OK, fp.Status.NOT_CONVERGED, fp.Status.HELD], [90, 7, 3])
     metrics = fp.measure(problem(), run(0.0, status=status))
     assert metrics.statuses == {"OK": 90, "NOT_CONVERGED": 7, "HELD": 3}
     assert metrics.worst_status == "HELD"
@@ -187,13 +183,97 @@ def test_a_run_of_an_older_version_gets_its_columns(tmp_path):
     assert fp.measure(problem(), again).rms_error == fp.measure(problem(), result).rms_error
 
 
-def test_a_problem_has_a_name_that_is_no_setting():
-    """A run knows it, and nothing that compares settings sees it."""
-    from fpirhc.describe import describe
+def of_solves(plans) -> Any:
+    """Metrics of a run with these plans, cycle by cycle: one number stands for a whole plan."""
+    plans = np.asarray(plans, dtype=float)
+    solve = np.column_stack([plans, 0 * plans, 0 * plans, -1 + 0 * plans, 0 * plans])
+    return fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
 
-    named = replace(problem(), name="case")
-    assert fp.simulate(named, fp.ComputedTorque(fp.Exponential(rate=1.0)), seed=0, compiled=False).problem == "case"
-    assert describe(named) == describe(problem())
+
+def cut(source, cycles: int):
+    """The first cycles of a run."""
+    return replace(source, log=source.log[:cycles])
+
+
+def test_a_run_that_ended_at_once_has_no_numbers():
+    solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
+    metrics = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
+    assert np.isnan([metrics.at_limit, metrics.settling["y"], metrics.effort["u"], metrics.rms_error["y"]]).all()
+    assert np.isnan(metrics["total_variation"]["u"])
+    assert metrics.solve == {}
+    assert metrics.statuses == {"NON_FINITE": 1}
+    assert metrics["cycles"] == {"": 0}
+    assert metrics.broken == fp.measure(problem(), run(1.0)).broken == {}
+
+
+def test_one_cycle_is_enough_for_a_solve():
+    solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
+    metrics = fp.measure(problem(measure_from=0.0), cut(run(0.0, solve=solve), 1))
+    assert metrics.solve["plans"] == 1
+    assert metrics.solve["worst_iterations"] == 1
+
+
+def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
+    """Two held cycles of that status, and the one in which the run ended; a status that never occurred counts zero."""
+    status = np.where(np.arange(CYCLES) < 2, float(fp.Status.NON_FINITE), 0.0)
+    metrics = fp.measure(problem(), run(0.0, status=status, stop="signal 'x' is not finite"))
+    assert metrics.statuses == {"OK": 23, "NON_FINITE": 3}
+    always = ("OK", "NOT_CONVERGED", "INFEASIBLE", "HELD", "NON_FINITE")  # the others are statuses of a machine
+    assert metrics["status"] == {name: {"OK": 23, "NON_FINITE": 3}.get(name, 0) for name in always}
+
+
+def test_plans_that_return_are_counted_once():
+    assert of_solves(np.arange(CYCLES) // 10 % 2).solve["plans"] == 2
+    assert of_solves(np.zeros(CYCLES)).solve["plans"] == 1
+    assert of_solves(np.arange(CYCLES)).solve["plans"] == CYCLES
+
+
+def test_plans_that_differ_by_one_everywhere_are_two():
+    """Cost, residuals, iterations and status of one are each larger by one than those of the other, whichever is first."""
+    for first in (0, 1):
+        solve = np.repeat((first + np.arange(CYCLES))[:, None] % 2, 5, axis=1)
+        assert fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve["plans"] == 2
+
+
+def test_a_plan_that_is_not_finite_has_iterations_and_no_residual():
+    """It took its time, and its residual is no number of a plan."""
+    solve = np.tile([0.0, 0.1, 0.2, 3.0, fp.Status.OK], (CYCLES, 1))
+    solve[7] = [0.0, 9.0, 9.0, 50.0, fp.Status.NON_FINITE]
+    of = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve
+    assert (of["worst_iterations"], of["worst_stationarity"], of["worst_feasibility"]) == (50, 0.1, 0.2)
+
+
+def test_a_run_that_ended_early_has_no_cost():
+    """A sum over fewer cycles would look like a small cost."""
+    cost = (Signal("cost", ("states",)), 1.0)
+    assert fp.measure(problem(), run(0.0, cost=cost)).cost == {"states": 50.0, "total": 50.0}
+    assert fp.measure(problem(), run(0.0, cost=cost, stop="signal 'x' is not finite")).cost == {}
+
+
+@pytest.fixture(scope="module")
+def adaptive():
+    """A run of computed torque with adaptation and its problem, a thousand cycles."""
+    task = problem(plant=linear(1.6, 1.0), start={"y": 0.5}, period=1e-3, duration=1.0, measure_from=0.0)
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.4, scale=50.0))
+    return task, fp.simulate(task, controller, seed=0, compiled=False)
+
+
+def test_contraction_needs_ten_cycles(adaptive):
+    task, result = adaptive
+    for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.growing", "contraction.measured"})):
+        metrics = fp.measure(task, cut(result, cycles))
+        assert {m.name for m, _, _ in metrics if m.name.startswith("contraction")} == names
+
+
+def test_contraction_is_that_of_an_adapting_controller(adaptive):
+    """Neither a controller without a logged contraction nor one without a gain has a factor."""
+    task, result = adaptive
+    layout = type(result.layout)(tuple(s for s in result.layout.signals if s.name != "contraction"))
+    columns_left = [k for k, c in enumerate(result.layout.columns) if c in layout.columns]
+    silent = replace(result, layout=layout, log=result.log[:, columns_left])
+    gainless = replace(result, settings={k: v for k, v in result.settings.items() if k != "effective_gain"})
+    for other in (silent, gainless):
+        assert fp.measure(task, other)["contraction.predicted"] == {}
 
 
 # --- A metric of a user's own -----------------------------------------------------------------------------------------
@@ -207,37 +287,14 @@ def overshoot(task, run):
 OVERSHOOT = fp.Metric("overshoot", overshoot, by="coordinate", unit="m", headline=True, order=15)
 
 
-def test_the_metrics_of_another_file_are_taken_over():
-    """A file that shares another's metrics lists the shipped ones too; they are there once."""
-    of_another = with_own_metrics([OVERSHOOT])
-    assert with_own_metrics(of_another) == of_another
-
-
 def test_a_metric_is_one_value():
-    """Measured, with its unit, in the order of its column, and as it writes itself."""
-    metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), with_own_metrics([OVERSHOOT]))
+    """Measured, with its unit, and as it writes itself."""
+    metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), [OVERSHOOT])
     assert metrics["overshoot"] == {"y": 0.25}
-    headings = [c.heading for c in columns([metrics], lambda m: m.headline)]
-    assert headings == ["rms error y [m]", "overshoot y [m]", "moves u [N/s]", "at limit"]
     assert metrics.text("overshoot", "y") == "0.25"
+    assert metrics.units["overshoot"]["y"] == "m"
     with pytest.raises(InvalidName, match="Did you mean 'overshoot'"):
         metrics["overshot"]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"name": "rms_error"}, "is defined 2 times"),
-        ({"name": "stop"}, "another meaning in results"),
-        ({"name": "solve"}, "another meaning in results"),
-        ({"name": "My metric"}, "small letters"),
-        ({"better": "smallest"}, "write 'smaller'"),
-        ({"compared": "exactly"}, "write 'exact'"),
-    ],
-)
-def test_a_wrong_metric_is_refused(wrong, message):
-    with pytest.raises((InvalidName, InvalidValue), match=message):
-        with_own_metrics([fp.Metric(**{"name": "mine", "function": overshoot, **wrong})])
 
 
 @pytest.mark.parametrize("result", [3.0, {"y": "three"}, "three"])
@@ -246,25 +303,6 @@ def test_a_function_that_returns_something_else_is_refused(result):
     metric = fp.Metric("mine", lambda problem, run: result, by="coordinate")
     with pytest.raises(InvalidValue, match="metric 'mine'"):
         fp.measure(problem(), run(0.0), [metric])
-
-
-def test_metrics_of_an_installed_package_are_found(monkeypatch):
-    """An entry point of the group 'fpirhc.metrics' leads to one metric or to several."""
-    points = [
-        SimpleNamespace(load=lambda: OVERSHOOT),
-        SimpleNamespace(load=lambda: (replace(OVERSHOOT, name="other"),)),
-    ]
-    monkeypatch.setattr(base, "entry_points", lambda group: points if group == "fpirhc.metrics" else [])
-    names = [m.name for m in base.known_metrics.__wrapped__()]
-    assert {"overshoot", "other"} == set(names) - {m.name for m in known_metrics()}
-
-
-def test_the_best_of_a_column_follows_its_direction():
-    """Smaller, larger or neither; a run that did not reach it is never the best."""
-    for better, best in (("smaller", 1.0), ("larger", 3.0), ("neither", None)):
-        metric = replace(OVERSHOOT, better=cast(Any, better))
-        column = columns([fp.measure(problem(), run(0.0), [metric])])[0]
-        assert column.best([2.0, 1.0, None, np.nan, 3.0]) == best
 
 
 # Figures of merit by value, on runs that were made by hand; 50 cycles of 0.1 s are measured, from t = 5 s on

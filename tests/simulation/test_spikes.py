@@ -5,22 +5,17 @@ The samples reach the controller, because no range is stated here; with `Sensor(
 
 from __future__ import annotations
 
-import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.lossy import Lossy
 
 import fpirhc as fp
-from fpirhc.conformance.loops import two_masses
+from fpirhc.conformance import two_masses
 from fpirhc.contracts import Deformation, Tracking
-from fpirhc.controllers.reference_states import largest_response
-from fpirhc.simulation.loop import close_loop
-from fpirhc.simulation.path import true_response
-from fpirhc.symbolic.evaluate import Evaluator
 
 PROBLEM = replace(two_masses(), duration=6.0)
-PLANT = PROBLEM.plant
 LAWS: dict[str, Tracking] = {
     "exponential": fp.Exponential(rate=6.0),
     "exponential, integral from zero": fp.Exponential(rate=6.0, bumpless=False),
@@ -54,42 +49,26 @@ RETURNS = 15.0  # over the law's rate: time after which the run is back
 NEAR = 2e-3  # m; the motion has 0.4 m
 
 
-@dataclass(frozen=True)
-class Spike:
-    """One sample of a state or response of this size, in this cycle."""
-
-    what: str
-    size: float
-    cycle: int
-
-
-def motion(stepper: fp.Stepper, spike: Spike | None, cycles: int) -> np.ndarray:
-    """Positions of the two masses, shape (cycles, 2)."""
-    function = true_response(PROBLEM).function
-    assert function is not None
-    advance, response = Evaluator(PROBLEM.integrator.step(PLANT, PROBLEM.period)), Evaluator(function)
-    memory, x, u, calm = stepper.start(), np.array(PROBLEM.start_state), np.zeros(2), np.zeros(2)
-    positions = []
-    for k in range(cycles):
-        sample = {"state": x, "realised": response(x, u, PLANT.exact, calm)[0]}
-        if spike is not None and k == spike.cycle:
-            sample[spike.what] = np.full_like(sample[spike.what], spike.size)
-        u, memory = stepper.step(k * PROBLEM.period, sample["state"], sample["realised"], memory)
-        (x,) = advance(x, u, PLANT.exact, calm)
-        positions.append(x[:2])
-    return np.array(positions)
-
-
 def stays_away(law: Tracking, deformation: Deformation) -> dict[str, float]:
     """Distance to the undisturbed motion after the stated time, of every spike where it is too large."""
-    stepper = fp.Stepper(PROBLEM, fp.ComputedTorque(law, deformation), compiled=False)
+    own = Lossy(PROBLEM, fp.ComputedTorque(law, deformation))
     assert law.speed is not None
     back, after = round(RETURNS / law.speed / PROBLEM.period), 20
-    cycles = 200 + back + after
-    clean, far = motion(stepper, None, cycles), {}
+
+    def motion(what: str = "", size: float = 0.0, at: int = -1, cycles: int = 220 + back) -> np.ndarray:
+        """Positions of the two masses; one sample of the states or of the responses has this size."""
+
+        def shown(k: int, row: np.ndarray) -> np.ndarray:
+            row[slice(4) if what == "state" else slice(4, None)] = size
+            return row
+
+        own.run(cycles, shown=lambda k, row: shown(k, row) if k == at else row)
+        return np.array(own.states)[:, :2]
+
+    clean, far = motion(), {}
     for what, size, first in SPIKES:
         end = first + back
-        rest = np.abs(motion(stepper, Spike(what, size, first), end + after) - clean[: end + after])[end:].max()
+        rest = np.abs(motion(what, size, first, end + after) - clean[: end + after])[end:].max()
         if not rest < NEAR:
             far[f"{what} {size:g} in cycle {first}"] = float(rest)
     return far
@@ -112,34 +91,3 @@ def test_without_its_bound_the_law_does_not_return():
     """The test above can fail: a law that is told that anything is possible keeps the first spike in its integral."""
     unbounded = fp.Exponential(rate=6.0, largest=(np.inf, np.inf))
     assert "state 1e+09 in cycle 0" in stays_away(unbounded, SHAPE)
-
-
-def test_the_largest_response_is_that_of_the_limits():
-    """Q'' of either mass by its own force alone, and the model's coupling, at one place along the reference, rounded up."""
-    largest = largest_response(PROBLEM)
-    reference = PROBLEM.reference.function(PLANT)
-    sizes = []
-    for t in np.linspace(0.0, PROBLEM.duration, 100):
-        x = np.asarray(reference(t)[0].full()).ravel()
-        corners = [(a, b) for a in PROBLEM.limits.inputs["Fa"] for b in PROBLEM.limits.inputs["Fb"]]
-        sizes.append([np.asarray(PLANT.equations.controlled_response(x, u, PLANT.approximate).full()) for u in corners])
-    # The two forces act on their own masses alone here, so the bound is attained to the spread of the samples.
-    assert np.abs(sizes).max(axis=(0, 1)).ravel() * 2 ** (1 / 16) == pytest.approx(np.array(largest), rel=0.05 + 1 / 16)
-    assert (np.abs(sizes).max(axis=(0, 1)).ravel() <= np.array(largest) * (1 + 1e-9)).all()
-    free = replace(PROBLEM, limits=fp.Limits(inputs={"Fa": (-30.0, 30.0)}))
-    assert largest_response(free) == (np.inf, np.inf)
-
-
-def test_the_largest_response_is_computed_once_for_a_loop(monkeypatch):
-    """Law, update and map have the same bound, and one evaluation along the reference."""
-    evaluations: list[fp.Problem] = []
-    module = sys.modules[largest_response.__module__]
-    states = module._states
-
-    def counted(task: fp.Problem) -> np.ndarray:
-        evaluations.append(task)
-        return states(task)
-
-    monkeypatch.setattr(module, "_states", counted)
-    close_loop(replace(PROBLEM, duration=1.0), fp.ComputedTorque(fp.Exponential(rate=6.0), SHAPE))
-    assert len(evaluations) == 1

@@ -9,9 +9,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.machine import COMPILER, needs_compiler
 
 import fpirhc as fp
-from fpirhc.symbolic.native import find_compiler
 
 CASES = {
     "CTC+FPI": ("two_mass", "CTC+FPI (eq 6)", ["deformation.gain", "limits.inputs.Q1"]),
@@ -65,14 +65,14 @@ def test_a_loop_of_ones_own_is_the_stepper_bit_by_bit(name):
         assert same(trace, np.concatenate(list(stepper.trace().values()))), k
 
 
-@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@needs_compiler
 @pytest.mark.parametrize("name", ["CTC+FPI", "outputs"])
 def test_code_generation_of_ones_own_gives_the_stepper_bit_by_bit(name, tmp_path: Path, monkeypatch):
     """CasADi's own generator, a compiler, and flat arrays in the order of `reads`."""
     stepper, rows = case(name)
     monkeypatch.chdir(tmp_path)  # CasADi writes into the current folder alone
     stepper.function.generate("step.c", {"with_header": False})
-    compiler = str(find_compiler())
+    compiler = str(COMPILER)
     flags = ("-shared", "-fPIC", "-O2", "-ffp-contract=off")
     subprocess.run([compiler, *flags, "step.c", "-o", "step.so", "-lm"], check=True, capture_output=True)
     function = ca.external(stepper.function.name(), str(tmp_path / "step.so"))

@@ -5,20 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import compare
-from fpirhc.errors import InvalidProblem
 
 NAME, GAIN, SCALE = "CTC+FPI (eq 6)", "deformation.gain", "deformation.scale"
 CHANGES = {0.1: {GAIN: -0.9}, 0.2: {GAIN: -0.9, SCALE: 3.0}}
-
-
-def test_changes_of_unknown_controllers_are_refused():
-    with pytest.raises(InvalidProblem, match=r"changes.*eq 6"):
-        compare(tasks.two_mass, seed=0, controllers=["CTC", NAME], changes={"CTC+FPI (eq6)": CHANGES})
 
 
 def test_limits_count_from_when_they_are_in_force():
