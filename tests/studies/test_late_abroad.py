@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import abroad
@@ -11,7 +10,6 @@ import pytest
 from scipy.linalg import expm
 
 import fpirhc as fp
-from fpirhc.errors import InvalidField, InvalidValue
 
 K, TAU, LAG, LATE, PERIOD, RATE, GAIN, POLE = 2.0, 10.0, 0.5, 10, 0.1, 0.2, 0.1, 0.95  # GAIN: half of the map's own
 K_MODEL, TAU_MODEL = 1.4, 14.0
@@ -58,22 +56,3 @@ def by_hand(*, adapts: bool) -> float:
 def test_dead_time_and_lag_are_those_of_an_independent_integration(tank, adapts):
     controller = tank.controllers["CTC+FPI" if adapts else "CTC"]
     assert rms(tank, controller) == pytest.approx(by_hand(adapts=adapts), rel=1e-3)
-
-
-def test_an_uncertainty_is_checked_with_the_dead_time_that_the_problem_fills_in(tank):
-    """Left open, the dead time is that of the problem: ten cycles bear an error of ten, and none of eleven."""
-    law, affine = tank.controllers["CTC"].tracking, fp.Affine(gain=-0.2)
-    for uncertainty in (0, 10):
-        referenced = fp.ModelReferenced(affine, uncertainty=uncertainty)
-        assert rms(tank, fp.ComputedTorque(law, referenced)) < by_hand(adapts=False)
-    with pytest.raises(
-        InvalidValue, match=r"uncertainty=11\): expected whole cycles from 0 to 10, the dead time of 10"
-    ):
-        rms(tank, fp.ComputedTorque(law, fp.ModelReferenced(affine, uncertainty=11)))
-
-
-def test_a_plant_in_place_of_a_reality_is_told_how_to_write_one(tank):
-    with pytest.raises(
-        InvalidField, match=r"Problem.reality: expected a Reality .*; write fp.Reality\(plant=...\) or "
-    ):
-        replace(tank.problem, reality=tank.problem.reality.plant)

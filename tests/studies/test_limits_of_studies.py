@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import limits
 from fpirhc.contracts import Controller
-from fpirhc.errors import InvalidName, InvalidValue
-from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.limits import Limits
-from fpirhc.studies.variants import Draws
 
 RATE, PERIOD = 2.0, 0.02  # 1/s, s
 BOUNDS = (1e-6, 1e6)
@@ -46,9 +41,9 @@ LAW = fp.ComputedTorque(fp.Exponential(rate=RATE, integral=False))
 ADAPTIVE = LAW.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.8)))
 
 
-def found(quantity: str, problem: fp.Problem, controller: Controller = LAW, **more: Any) -> Limits:
-    task = Task("pump", Path("pump.py"), "A pump", "", problem, {"law": controller})
-    return limits(task, over=[quantity], compiled=False, **more)
+def found(quantity: str, problem: fp.Problem, controller: Controller = LAW, **more: Any) -> Any:
+    task = tasks.made(problem, {"law": controller})
+    return fp.limits(task, over=[quantity], compiled=False, **more)
 
 
 def limit_of(quantity: str, problem: fp.Problem, controller: Controller = LAW, **more: Any) -> Any:
@@ -86,7 +81,7 @@ def test_drawn_plants_are_limited_by_the_largest_of_them():
     problem = pump(0.7 * 2 / (PERIOD * RATE), duration=30.0, measure_from=20.0)
     one = limit_of("plants", problem)
     largest = {
-        percent: max(v.problem.plant.exact[0] for v in Draws(100, percent).of_problem(problem))
+        percent: max(v.problem.plant.exact[0] for v in fp.Draws(100, percent).of_problem(problem))
         for percent in (one.holds, one.fails)
     }
     assert largest[one.holds] * 0.99 < 2 / (PERIOD * RATE) < largest[one.fails] * 1.01
@@ -155,22 +150,8 @@ def test_a_state_that_leaves_its_limits_has_failed():
 
 
 def test_who_bears_most_is_told():
-    task = Task("pump", Path("pump.py"), "A pump", "", pump(1.2), {"law": LAW, "law+FPI": ADAPTIVE})
-    one = limits(task, over=["mismatch"], compiled=False)
+    task = tasks.made(pump(1.2), {"law": LAW, "law+FPI": ADAPTIVE})
+    one = fp.limits(task, over=["mismatch"], compiled=False)
     best = one.table.controller[one.table.fails.idxmax()]
     assert one.view.sentences == [(f"mismatch: {best} bears most.", None)]
     assert [row.cells[0] for row in one.view.tables[0].rows] == ["law", "law+FPI"]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "error", "says"),
-    [
-        ({"over": ["latncy"]}, InvalidName, "Did you mean 'latency'"),
-        ({"controllers": ["lwa"]}, Exception, "Did you mean 'law'"),
-        ({"fails": 0.0}, InvalidValue, "fails: expected a number above 0"),
-    ],
-)
-def test_wrong_input_is_named(wrong, error, says):
-    task = Task("pump", Path("pump.py"), "A pump", "", pump(), {"law": LAW})
-    with pytest.raises(error, match=says):
-        limits(task, **wrong)

@@ -10,6 +10,7 @@ import sys
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import joblib
 import pandas as pd
@@ -17,17 +18,13 @@ import pytest
 from helpers.line import line_text
 
 import fpirhc as fp
-from fpirhc import limits
 from fpirhc.errors import InvalidProblem, OutputError, WorkerDied
-from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies import runs
-from fpirhc.studies.runs import run_variants
-from fpirhc.studies.variants import Draws
 
 LINE = line_text("period=5e-3, duration=1.5, measure_from=0.5, disturbances={'u': fp.Noise(0.1)}", bounds="(0.5, 2.4)")
 # A controller that kills the process which builds it a second time: the first one stands in a file beside the problem.
 DEADLY = """
 from pathlib import Path
+from typing import Any
 import os, signal
 
 class Deadly(fp.ComputedTorque):
@@ -40,18 +37,22 @@ class Deadly(fp.ComputedTorque):
 
 controllers["deadly"] = Deadly(tracking)
 """
-DRAWS = Draws(12, 20.0, 5)
+DRAWS = fp.Draws(12, 20.0, 5)
 
 
 @pytest.fixture
-def task(tmp_path, monkeypatch) -> Task:
+def task(tmp_path, monkeypatch) -> Any:
     """The task in a file of its own, in an empty working folder."""
     monkeypatch.chdir(tmp_path)
     Path("line.py").write_text(LINE)
     return fp.load_problem("line.py")
 
 
-def kept(path: str = "runs.jsonl") -> list[str]:
+def rows(task: Any, variants: Any, **settings: Any) -> pd.DataFrame:
+    return fp.study(task, variants, compiled=False, **settings).table
+
+
+def kept(path: str = "kept/runs.jsonl") -> list[str]:
     return Path(path).read_text().splitlines()
 
 
@@ -60,32 +61,31 @@ def same(one: pd.DataFrame, other: pd.DataFrame) -> None:
     assert one.attrs == other.attrs
 
 
-def test_what_is_kept_is_not_run_again(task, monkeypatch):
+def test_what_is_kept_is_not_run_again(task):
     """A torn line is run again; more plants and other controllers of the same study go on from it, and its rows stay."""
-    whole = run_variants(task, DRAWS, compiled=False, keep=Path("runs.jsonl"))
+    whole = rows(task, DRAWS, folder=Path("kept"))
     lines = kept()
     assert len(lines) == 1 + 24
-    Path("runs.jsonl").write_text("\n".join(lines[:7]) + "\n" + lines[7][:40])
+    Path("kept/runs.jsonl").write_text("\n".join(lines[:7]) + "\n" + lines[7][:40])
     told: list[str] = []
-    again = run_variants(
-        task, DRAWS, compiled=False, keep=Path("runs.jsonl"), progress=lambda name, done, of: told.append(name)
-    )
+    again = rows(task, DRAWS, folder=Path("kept"), progress=lambda name, done, of: told.append(name))
     same(again, whole)
     assert len(told) == 24 - 6
     before = kept()
-    more = run_variants(task, Draws(15, 20.0, 5), controllers=["CTC"], compiled=False, keep=Path("runs.jsonl"))
+    more = rows(task, fp.Draws(15, 20.0, 5), controllers=["CTC"], folder=Path("kept"))
     assert kept()[: len(before)] == before
     assert len(kept()) == len(before) + 3
     same(more.iloc[:12], whole.iloc[:12])
-    monkeypatch.setattr(runs, "Runner", lambda *_, **__: pytest.fail("everything is there already"))
-    same(run_variants(task, DRAWS, compiled=False, keep=Path("runs.jsonl")), whole)
+    told.clear()
+    same(rows(task, DRAWS, folder=Path("kept"), progress=lambda name, done, of: told.append(name)), whole)
+    assert not told
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda task: (task, Draws(12, 10.0, 5)), "mismatch was 20.0, is 10.0"),
-        (lambda task: (task, Draws(12, 20.0, 6)), "seed was 5, is 6"),
+        (lambda task: (task, fp.Draws(12, 10.0, 5)), "mismatch was 20.0, is 10.0"),
+        (lambda task: (task, fp.Draws(12, 20.0, 6)), "seed was 5, is 6"),
         (lambda task: (replace(task, problem=replace(task.problem, duration=1.0)), DRAWS), "problem was "),
         (
             lambda task: (replace(task, controllers={**task.controllers, "CTC": task.controllers["CTC+FPI"]}), DRAWS),
@@ -94,52 +94,43 @@ def test_what_is_kept_is_not_run_again(task, monkeypatch):
     ],
 )
 def test_rows_of_another_study_are_never_mixed(change, says, task):
-    run_variants(task, DRAWS, controllers=["CTC"], compiled=False, keep=Path("runs.jsonl"))
+    rows(task, DRAWS, controllers=["CTC"], folder=Path("kept"))
     before = kept()
     other, variants = change(task)
     with pytest.raises(OutputError, match=rf"rows of another study \(.*{says}.*--out"):
-        run_variants(other, variants, compiled=False, keep=Path("runs.jsonl"))
+        rows(other, variants, folder=Path("kept"))
     assert kept() == before
-    Path("runs.jsonl").write_text("no study\n")
+    Path("kept/runs.jsonl").write_text("no study\n")
     with pytest.raises(OutputError, match="holds no rows of a study"):
-        run_variants(task, DRAWS, compiled=False, keep=Path("runs.jsonl"))
-
-
-def test_another_file_is_another_study(task):
-    """A number in a formula is no setting, so the text of the file counts."""
-    run_variants(task, DRAWS, controllers=["CTC"], compiled=False, keep=Path("runs.jsonl"))
-    Path("other").mkdir()
-    Path("other/line.py").write_text(LINE.replace("ca.sin(2 * t)", "ca.sin(3 * t)"))
-    with pytest.raises(OutputError, match="file was"):
-        run_variants(fp.load_problem("other/line.py"), DRAWS, compiled=False, keep=Path("runs.jsonl"))
+        rows(task, DRAWS, folder=Path("kept"))
 
 
 def test_processes_change_nothing(task):
     """Nor does the number of plants in a job; another task than that of the file is refused, because they load the file."""
-    same(run_variants(task, DRAWS, processes=2, compiled=False), run_variants(task, DRAWS, compiled=False))
+    same(rows(task, DRAWS, processes=2), rows(task, DRAWS))
     changed = replace(task, problem=replace(task.problem, duration=1.0))
     with pytest.raises(InvalidProblem, match=r"is not that of .*line.py', which other processes load"):
-        run_variants(changed, DRAWS, processes=2, compiled=False)
+        rows(changed, DRAWS, processes=2)
 
 
 def test_a_killed_process_is_told_and_the_same_call_goes_on(task):
     """No row is lost, doubled or changed."""
     Path("line.py").write_text(LINE + DEADLY)
     deadly = fp.load_problem("line.py")
-    whole = run_variants(deadly, DRAWS, compiled=False)
+    whole = rows(deadly, DRAWS)
     Path("armed").touch()
     with pytest.raises(WorkerDied, match="the same call goes on"):
-        run_variants(deadly, DRAWS, processes=2, compiled=False, keep=Path("runs.jsonl"))
+        rows(deadly, DRAWS, processes=2, folder=Path("kept"))
     assert not Path("armed").exists()
-    same(run_variants(deadly, DRAWS, processes=2, compiled=False, keep=Path("runs.jsonl")), whole)
-    rows = [json.loads(line) for line in kept()[1:]]
-    assert len({(row["controller"], row["variant"]) for row in rows}) == len(rows) == 36
+    same(rows(deadly, DRAWS, processes=2, folder=Path("kept")), whole)
+    done = [json.loads(line) for line in kept()[1:]]
+    assert len({(row["controller"], row["variant"]) for row in done}) == len(done) == 36
 
 
 def test_a_cluster_of_dask_gives_the_rows_of_one_process(task):
     """Two workers, one of which is killed on the way: Dask gives its jobs to others."""
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    whole = run_variants(task, DRAWS, compiled=False)
+    whole = rows(task, DRAWS)
     killed: list[int] = []
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
@@ -154,9 +145,9 @@ def test_a_cluster_of_dask_gives_the_rows_of_one_process(task):
                 killed.append(workers[0])
                 os.kill(workers[0], signal.SIGKILL)
 
-        same(run_variants(task, DRAWS, compiled=False), whole)
-        assert not Path("runs.jsonl").exists()
-        same(run_variants(task, DRAWS, compiled=False, keep=Path("runs.jsonl"), progress=kill), whole)
+        same(rows(task, DRAWS), whole)
+        assert not Path("kept/runs.jsonl").exists()
+        same(rows(task, DRAWS, folder=Path("kept"), progress=kill), whole)
     assert killed
     assert len(kept()) == 1 + 24
 
@@ -180,22 +171,22 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(task, proces
     finished = kept("out/runs.jsonl")
     assert 4 <= len(finished) < 81
     task = fp.load_problem("line.py")
-    again = run_variants(task, Draws(40, 20.0, 5), compiled=False, keep=Path("out/runs.jsonl"))
+    again = rows(task, fp.Draws(40, 20.0, 5), folder=Path("out"))
     assert kept("out/runs.jsonl")[: len(finished)] == finished
-    same(again, run_variants(task, Draws(40, 20.0, 5), compiled=False))
+    same(again, rows(task, fp.Draws(40, 20.0, 5)))
 
 
-def test_limits_that_were_found_are_not_searched_again(task, monkeypatch):
+def test_limits_that_were_found_are_not_searched_again(task):
     """An interruption between two of them costs the one that was searched."""
     facts = {"over": ["mismatch", "lost"], "controllers": ["CTC", "CTC+FPI"], "compiled": False}
-    whole = limits(task, **facts, folder=Path("whole"))
+    whole = fp.limits(task, **facts, folder=Path("whole"))
 
     def interrupt(name: str, done: int, of: int) -> None:
         if name == "CTC+FPI" and done < of:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        limits(task, **facts, folder=Path("out"), progress=interrupt)
+        fp.limits(task, **facts, folder=Path("out"), progress=interrupt)
     assert len(kept("out/limits.jsonl")) == 1 + 3
-    pd.testing.assert_frame_equal(limits(task, **facts, folder=Path("out")).table, whole.table)
+    pd.testing.assert_frame_equal(fp.limits(task, **facts, folder=Path("out")).table, whole.table)
     assert kept("out/limits.jsonl") == kept("whole/limits.jsonl")

@@ -13,13 +13,7 @@ import pytest
 from helpers.line import EXACT, line_text
 
 import fpirhc as fp
-from fpirhc import tune
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, NotSupported
-from fpirhc.problem_files.settings import current_setting
-from fpirhc.studies.objective import PENALTY
-from fpirhc.studies.runs import run_variants
-from fpirhc.studies.variants import CasesOf, Draws
-from fpirhc.task.cases import is_whole
+from fpirhc.errors import InvalidProblem, InvalidValue, NotSupported
 
 TUNING = """tuning = {
     "CTC": {"tracking.rate": fp.Span(2.0, 12.0)},
@@ -39,9 +33,6 @@ def task(tmp_path, monkeypatch):
     return fp.load_problem("line.py")
 
 
-# --- Settings by path -------------------------------------------------------------------------------------------------
-
-
 def test_settings_are_changed_by_path_and_nothing_else_is():
     """Fields, keys of mappings and wrapped controllers; the controller that was given stays as it was."""
     cost = fp.Quadratic(states={"q": 1.0, "q'": 2.0}, deviation={"u": 3.0})
@@ -56,29 +47,6 @@ def test_settings_are_changed_by_path_and_nothing_else_is():
     assert dict(changed.controller.cost.states) == {"q": 1.0, "q'": 5.0}
     assert changed.controller.optimiser == fp.FixedPoint(iterations=3, tolerance=1e-2)
     assert inner.deformation == fp.Sigmoid(gain=-0.5)
-    for path, value in values.items():
-        assert current_setting(changed, path) == value
-    assert is_whole(fp.ExactModel(inner), "controller.optimiser.iterations")
-    assert not is_whole(fp.ExactModel(inner), "controller.deformation.gain")
-
-
-@pytest.mark.parametrize(
-    ("path", "error", "message"),
-    [
-        ("deformation.gian", InvalidName, r"\(Sigmoid\) has no 'gian'.*Did you mean 'gain'"),
-        ("deformatoin.gain", InvalidName, "Did you mean 'deformation'"),
-        ("deformation", InvalidValue, "not a number; go on with one of: gain, shift, scale"),
-        ("deformation.scale", InvalidValue, "is None, not a number; give it a number first"),
-        ("deformation.gain.x", InvalidName, "has no 'x'"),
-    ],
-)
-def test_wrong_paths_get_the_nearest_name(path, error, message):
-    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5))
-    with pytest.raises(error, match=message):
-        fp.with_settings(controller, {path: 1.0})
-
-
-# --- Search spaces ----------------------------------------------------------------------------------------------------
 
 
 def test_spans_go_from_end_to_end():
@@ -99,24 +67,6 @@ def test_spans_are_checked(wrong):
         fp.LogSpan(-1.0, 1.0)
 
 
-# --- Tuning -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("metric", "error", "message"),
-    [
-        ("max_eror.y", InvalidName, "Did you mean 'max_error'"),
-        ("max_error", InvalidValue, "a number for every coordinate"),
-        ("effort.u", InvalidValue, "no better direction"),
-        ("max_error.z", InvalidName, "Did you mean 'max_error.y'"),
-        ("cost.total", InvalidValue, r"'cost\.total' needs Problem\(horizon=\.\.\., cost="),
-    ],
-)
-def test_a_wrong_metric_is_refused(metric, error, message, task, tmp_path):
-    with pytest.raises(error, match=message):
-        tune(task, trials=1, seed=0, folder=tmp_path / "t", metric=metric)
-
-
 def test_failing_trials_cost_a_finite_penalty(task, tmp_path):
     """Gains far beyond the limit of contraction diverge, and a scale below zero is refused: the settings stay as they are."""
     wild = {"deformation.gain": fp.Span(-1e4, -1e3), "deformation.scale": fp.Span(1e5, 1e6)}
@@ -125,12 +75,12 @@ def test_failing_trials_cost_a_finite_penalty(task, tmp_path):
         ({"deformation.scale": fp.Span(-2.0, -1.0)}, {"deformation.scale": 20.0}),
     ):
         folder = tmp_path / "-".join(spans)
-        tuned = tune(replace(task, tuning={"CTC+FPI": spans}), trials=4, seed=0, folder=folder, compiled=False)
+        tuned = fp.tune(replace(task, tuning={"CTC+FPI": spans}), trials=4, seed=0, folder=folder, compiled=False)
         assert tuned.settings() == {"CTC+FPI": expected}
         assert (tuned.table.cost == tuned.table.cost_before).all()
         values = [value for value in costs(folder) if value > tuned.table.cost[0]]
         assert len(values) == 4
-        assert all(PENALTY / 1e3 < value <= 2 * PENALTY for value in values)
+        assert all(9.9 < value <= 20 for value in values)  # ranges of the reference
 
 
 def costs(folder: Path) -> list[float]:
@@ -141,13 +91,13 @@ def costs(folder: Path) -> list[float]:
 
 def test_the_best_is_never_worse_and_costs_what_its_runs_say(task, tmp_path):
     """The cost is the mean relative error over the plants, which are the same for all trials; lines of Python give it."""
-    draws = Draws(3, 10.0, 7)
-    tuned = tune(task, trials=12, seed=1, variants=draws, controllers=["CTC+FPI"], folder=tmp_path, compiled=False)
+    draws = fp.Draws(3, 10.0, 7)
+    tuned = fp.tune(task, trials=12, seed=1, variants=draws, controllers=["CTC+FPI"], folder=tmp_path, compiled=False)
     row, [gain] = tuned.table.iloc[0], tuned.settings()["CTC+FPI"].values()
     assert row.cost < row.cost_before
     for value, cost in ((gain, row.cost), (-0.1, row.cost_before)):
         controllers = {"one": fp.with_settings(task.controllers["CTC+FPI"], {"deformation.gain": value})}
-        rows = run_variants(replace(task, controllers=controllers, tuning={}), draws, compiled=False)
+        rows = fp.study(replace(task, controllers=controllers, tuning={}), draws, compiled=False).table
         assert cost == pytest.approx(rows.error.mean(), rel=1e-9)
     scope = {"controllers": dict(task.controllers), "fp": fp}
     exec(tuned.python(), scope)
@@ -158,27 +108,27 @@ def test_a_metric_of_which_more_is_better_is_tuned_upwards(task, tmp_path):
     inside = fp.Metric("inside", lambda problem, run: float((abs(run["error.y"]) < 0.02).mean()), better="larger")
     task = replace(task, metrics=[*task.metrics, inside])
     facts = {"trials": 8, "seed": 0, "controllers": ["CTC"], "metric": "inside", "compiled": False}
-    row = tune(task, folder=tmp_path, **facts).table.iloc[0]
+    row = fp.tune(task, folder=tmp_path, **facts).table.iloc[0]
     assert row.cost <= row.cost_before < 0
 
 
 def test_a_disturbed_search_finds_what_a_calm_one_finds(task, tmp_path):
     """Interrupted within a trial, or begun with fewer trials: the same trials, bit by bit. Trials beyond the tenth learn."""
-    facts: dict[str, Any] = {"seed": 3, "variants": Draws(2, 10.0, 3), "controllers": ["CTC+FPI"], "compiled": False}
-    calm = tune(task, trials=14, folder=tmp_path / "calm", **facts)
+    facts: dict[str, Any] = {"seed": 3, "variants": fp.Draws(2, 10.0, 3), "controllers": ["CTC+FPI"], "compiled": False}
+    calm = fp.tune(task, trials=14, folder=tmp_path / "calm", **facts)
 
     def interrupt(name: str, done: int, of: int) -> None:
         if done == 5:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        tune(task, trials=14, folder=tmp_path / "cut", progress=interrupt, **facts)
+        fp.tune(task, trials=14, folder=tmp_path / "cut", progress=interrupt, **facts)
     cut = tmp_path / "cut" / "trials.log"
     lines = cut.read_text().splitlines(keepends=True)
     cut.write_text("".join(lines[:-1]))  # the fifth was running
     assert len(costs(tmp_path / "cut")) == 4
-    tune(task, trials=11, folder=tmp_path / "cut", **facts)
-    again = tune(task, trials=14, folder=tmp_path / "cut", **facts)
+    fp.tune(task, trials=11, folder=tmp_path / "cut", **facts)
+    again = fp.tune(task, trials=14, folder=tmp_path / "cut", **facts)
     pd.testing.assert_frame_equal(again.table, calm.table)
     assert costs(tmp_path / "cut") == costs(tmp_path / "calm")
 
@@ -186,12 +136,12 @@ def test_a_disturbed_search_finds_what_a_calm_one_finds(task, tmp_path):
 def test_other_plants_and_spans_are_another_search(task, tmp_path):
     """Their trials stand beside each other in one folder, and none counts for the other."""
     facts: dict[str, Any] = {"seed": 3, "controllers": ["CTC"], "compiled": False, "folder": tmp_path}
-    tune(task, trials=2, **facts)
-    tune(task, trials=2, variants=Draws(2, 10.0, 3), **facts)
+    fp.tune(task, trials=2, **facts)
+    fp.tune(task, trials=2, variants=fp.Draws(2, 10.0, 3), **facts)
     wider = replace(task, tuning={"CTC": {"tracking.rate": fp.Span(1.0, 12.0)}})
-    tune(wider, trials=2, **facts)
+    fp.tune(wider, trials=2, **facts)
     assert len(costs(tmp_path)) == 6
-    tune(task, trials=2, **facts)
+    fp.tune(task, trials=2, **facts)
     assert len(costs(tmp_path)) == 6
 
 
@@ -202,33 +152,21 @@ def test_tuning_on_some_cases_leaves_the_others(task, tmp_path):
     )
     task = replace(task, cases=cases)
     facts = {"trials": 2, "controllers": ["CTC"], "compiled": False, "folder": tmp_path}
-    row = tune(task, variants=CasesOf(("some",)), **facts).table.iloc[0]
-    rows = run_variants(task, CasesOf(("some",)), controllers=["CTC"], compiled=False)
+    row = fp.tune(task, variants=fp.CasesOf(("some",)), **facts).table.iloc[0]
+    rows = fp.study(task, fp.CasesOf(("some",)), controllers=["CTC"], compiled=False).table
     assert row.cost_before == pytest.approx(rows.error.mean(), rel=1e-9)
 
 
 def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):
     with pytest.raises(InvalidProblem, match="no search space for controller 'CTC exact'"):
-        tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
+        fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
     with pytest.raises(InvalidProblem, match=r"add to its file, for example, tuning ="):
-        tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
+        fp.tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
     with pytest.raises(InvalidValue, match="trials 0: expected at least 1"):
-        tune(task, trials=0, seed=0, folder=tmp_path)
+        fp.tune(task, trials=0, seed=0, folder=tmp_path)
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(NotSupported, match=r"pip install 'fpirhc\[tune\]'"):
-        tune(task, trials=1, seed=0, folder=tmp_path)
-
-
-def test_a_search_space_that_is_missing_is_offered_for_a_controller_that_adapts(tmp_path):
-    """The gain of the first one that has any, around its number; a problem without one is offered a rate."""
-    task = fp.load_problem("leaking_tanks")
-    with pytest.raises(
-        InvalidProblem, match=r"tuning = \{'RHC\+FPI': \{'deformation\.gain': fpirhc\.LogSpan\(-6, -0\.2\)\}\}"
-    ):
-        tune(replace(task, tuning={}), trials=1, seed=0, folder=tmp_path)
-    alone = replace(task, controllers={"RHC": task.controllers["RHC"]}, headline=None, tuning={})
-    with pytest.raises(InvalidProblem, match=r"tuning = \{'RHC': "):
-        tune(alone, trials=1, seed=0, folder=tmp_path)
+        fp.tune(task, trials=1, seed=0, folder=tmp_path)
 
 
 def test_settings_of_a_problem():
