@@ -1,56 +1,24 @@
-"""A foreign reality: an object outside, called once per cycle; what it may do wrong, and what a run then keeps."""
+"""A foreign reality: an object outside, called once per cycle; what it may do wrong, and what a run then keeps.
+
+Dead time and lag that it states are known and not simulated. A run ends by name where its plant leaves its physical range.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from typing import Any
-from unittest.mock import DEFAULT, Mock
 
+import casadi as ca
 import numpy as np
 import pytest
-from test_reality import CONTROLLERS, PAIRS, SENSING, TAU, lagged, run, task
+from helpers.drives import CONTROLLERS, MEASURES, PAIRS, SENSING, TAU, Wrapped, lagged, run, task
+from helpers.faults import Failing
 
 import fpirhc as fp
-from fpirhc import simulator
-from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
-from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.path import moving
-from fpirhc.simulation.simulate import Patch, run_cycles
-
-MEASURES = {"y": "m", "y'": "m/s", "y''": "m/s^2"}
-
-
-class Wrapped:
-    """The problem's own plant behind reset and step, moved by a Runge-Kutta step of numpy's own."""
-
-    calls = 0
-
-    def __init__(self, problem: fp.Problem, measures=tuple(MEASURES)) -> None:
-        self.problem, self.measures = problem, measures
-
-    def reset(self, seed):
-        del seed
-        self.calls = 0
-        self.x = np.array(self.problem.start_state)
-        return self._answer(np.array(self.problem.inputs_before))
-
-    def step(self, time, command):
-        self.calls, h = self.calls + 1, self.problem.period
-        assert time == pytest.approx((self.calls - 1) * h)
-        k1 = self._rate(self.x, command)
-        k2 = self._rate(self.x + h / 2 * k1, command)
-        k3 = self._rate(self.x + h / 2 * k2, command)
-        k4 = self._rate(self.x + h * k3, command)
-        self.x = self.x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return self._answer(command)
-
-    def _rate(self, x, u):
-        return np.array([x[1], 2.0 * u[0]])
-
-    def _answer(self, u):
-        every = {"y": self.x[0], "y'": self.x[1], "y''": self._rate(self.x, u)[1]}
-        return np.array([every[name] for name in self.measures])
+from fpirhc.contracts import Deformation
+from fpirhc.errors import InvalidProblem
 
 
 class Faulty(Wrapped):
@@ -137,31 +105,6 @@ def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
         assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
 
 
-def test_a_dead_time_is_stated_once_and_by_name():
-    """Two statements that differ are one mistake, and an input that does not exist is another."""
-    body = fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002})
-    with pytest.raises(InvalidProblem, match="state it once"):
-        task(dead_time=fp.DeadTime(inputs={"u": 0.005}), reality=body)
-    with pytest.raises(InvalidProblem, match="input 'v' is unknown"):
-        task(reality=replace(body, dead_time={"v": 0.002}))
-
-
-def test_a_dead_time_of_the_body_goes_with_the_body():
-    """Another body brings its own, the model in its place has it simulated, and what is simulated before a body stays."""
-    body = fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002})
-    stated = task(reality=body)
-    slower = replace(stated, reality=replace(body, dead_time={"u": 0.003}))
-    assert slower.dead_time.inputs == {"u": 0.003}
-    assert replace(stated, reality=replace(body, dead_time={})).dead_time.inputs == {}
-    assert replace(stated, reality=None).dead_time.inputs == {}
-    assert stated.of_equations.dead_time.simulated.inputs == stated.of_model.dead_time.simulated.inputs == {"u": 0.002}
-    more = replace(stated, dead_time=replace(stated.dead_time, inputs={"u": 0.003}))
-    assert more.dead_time.simulated.inputs == {"u": pytest.approx(0.001)}
-    assert replace(more, reality=slower.reality).dead_time.inputs == {"u": pytest.approx(0.004)}
-    with pytest.raises(InvalidProblem, match=r"'u' is 0\.001 s, less than the 0.002 s that the external plant states"):
-        replace(stated, dead_time=replace(stated.dead_time, inputs={"u": 0.001}))
-
-
 def test_the_lateness_of_a_run_is_that_of_the_body_and_what_is_simulated_before_it():
     """One cycle of the loop before two of the body, and three of the loop before a body without."""
     late = task(reality=fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002}))
@@ -169,13 +112,6 @@ def test_the_lateness_of_a_run_is_that_of_the_body_and_what_is_simulated_before_
     alone = outside(task(dead_time=fp.DeadTime(inputs={"u": 0.003})))
     one, other = (run(p, CONTROLLERS["computed torque"]) for p in (late, alone))
     assert np.abs(one["plant_state"] - other["plant_state"]).max() < 1e-12
-
-
-def test_one_input_is_late_in_the_body_and_another_before_it():
-    """Both are known, and one is simulated."""
-    late = fp.DeadTime(inputs={"w": 0.01}).behind({"u": 0.002}, Mistakes("problem"))
-    assert late.inputs == {"u": 0.002, "w": 0.01}
-    assert late.simulated.queued == ("w",)
 
 
 def test_positions_alone_are_enough_for_an_estimator():
@@ -239,15 +175,6 @@ def test_bad_first_answer_is_an_error():
         run(replace(problem, reality=fp.ExternalPlant(body, MEASURES)))
 
 
-def test_nothing_is_drawn_and_no_model_is_exact():
-    """Parameters of an object outside are nobody's to set."""
-    problem = outside(task())
-    with pytest.raises(NotSupported, match="no exact parameters"):
-        problem.with_exact(np.array([1.0]))
-    with pytest.raises(NotSupported, match="no equations"):
-        run(problem, fp.ExactModel(CONTROLLERS["computed torque"]))
-
-
 # A body that is made from parameters
 
 
@@ -287,78 +214,6 @@ def test_a_made_body_is_new_in_every_run_and_has_its_seed():
     assert not np.array_equal(first["plant_state"], weaker["plant_state"])
 
 
-def loose(body: Any = None, **settings: Any) -> Any:
-    """An external plant from whatever is given."""
-    return fp.ExternalPlant(
-        body if "make" in settings else body or Wrapped(task()), **{"measures": MEASURES} | settings
-    )
-
-
-class Stepless:
-    """Half a body."""
-
-    reset = Wrapped.reset
-
-
-WRONG: dict[str, tuple[Any, str]] = {
-    "no body": (lambda: fp.ExternalPlant(measures=MEASURES), "either a body or make=lambda parameters, seed: body"),
-    "two bodies": (lambda: loose(Wrapped(task()), make=lambda _p, _s: None), "either a body or make=lambda parameters"),
-    "half a body": (
-        lambda: loose(Stepless()),
-        "its body is a value of the class Stepless without step; expected an object",
-    ),
-    "a body that is a class": (
-        lambda: loose(Stepless),
-        "its body is the class Stepless; write Stepless() for an object of it",
-    ),
-    "a body that is none": (lambda: loose(object()), "its body is a value of the class object without reset and step"),
-    "not all as a list": (
-        lambda: task(reality=loose(measures=["y"])),
-        "it does not measure y' (m/s), which the sensing",
-    ),
-    "nothing measured": (lambda: task(reality=loose(measures={})), "it does not measure y (m), which the sensing"),
-    "not all": (lambda: task(reality=loose(measures={"y": "m", "y'": "m/s"})), "y'' (m/s^2), which the sensing"),
-    "a name": (lambda: task(reality=loose(measures={**MEASURES, "yy": "m"})), "'yy' is unknown. Did you mean 'y'?"),
-    "a unit": (
-        lambda: task(reality=loose(measures={**MEASURES, "y": "mm"})),
-        "measures y in mm, the model has it in m",
-    ),
-    "half a hold": (lambda: loose(holds=1.5), "holds: expected a whole number of at least 0, got 1.5"),
-    "an option": (lambda: loose(dead_times={}), "no field 'dead_times'. Did you mean 'dead_time'?"),
-    "a dead time": (
-        lambda: loose(dead_time=0.002),
-        "dead_time: expected {name: a finite number of at least 0}, got 0.002; write",
-    ),
-    "a negative one": (
-        lambda: task(reality=loose(dead_time={"u": -0.1})),
-        "dead_time['u']: expected a finite number of at least 0, got -0.1",
-    ),
-    "an input": (lambda: task(reality=loose(dead_time={"v": 0.1})), "dead_time: input 'v' is unknown. Valid: u."),
-    "parameters alone": (lambda: loose(parameters=GAIN), "a body that stands cannot take parameters; write make="),
-    "a number": (lambda: loose(make=Wrapped, parameters={"b": 1.0}), "parameters['b']: expected a Parameter, got 1.0"),
-    "one argument": (lambda: loose(make=lambda _: None), "make: expected a function of 2 arguments or None"),
-    "made of nothing": (
-        lambda: run(task(reality=loose(make=lambda _p, _s: None))),
-        "reality: make returned None; expected an object with reset(seed) and step(time, command)",
-    ),
-    "a name in make": (
-        lambda: run(task(reality=loose(make=lambda p, _: p["c"]))),
-        "reality: make raised KeyError: 'c'",
-    ),
-    "out of bounds": (lambda: made(task()).with_exact(np.array([20.0])), "outside its bounds"),
-    "a disturbance": (lambda: outside(task(disturbances={"y": fp.Step(0.0, 1.0)})), "disturbances"),
-    "no object": (lambda: task(reality=Wrapped(task())), "reality: expected a Reality or an ExternalPlant"),
-}
-
-
-@pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_use_says_what_was_expected(name):
-    use, words = WRONG[name]
-    with pytest.raises(fp.FpirhcError) as caught:
-        use()
-    assert words in " ".join(str(caught.value).split())
-
-
 def test_contraction_is_identified_where_the_response_is_measured():
     """The run's own requests and responses give the factor 1 - a b / b^ without any equation of the body."""
     controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.5))
@@ -392,41 +247,153 @@ def test_lagged_body_is_the_lagged_reality():
     assert np.abs(one["command"] - other["command"]).max() < 1e-6 * np.abs(one["command"]).max()
 
 
-def test_comparison_and_report_of_an_object_outside(tmp_path):
-    """The same table, verdict, null test and page as for a plant."""
-    shipped = fp.load_problem("two_mass")
-    pair = {name: CONTROLLERS[name] for name in ("computed torque", "plain form")}
-    file = replace(shipped, problem=outside(task()), controllers=pair, headline=("computed torque", "plain form"))
-    comparison = fp.compare(file, seed=0, compiled=False)
-    errors = [entry.metrics.rms_error["y"] for entry in comparison.entries]
-    inside = [fp.measure(task(), run(task(), one)).rms_error["y"] for one in pair.values()]
-    assert errors == pytest.approx(inside, rel=1e-10)
-    fp.write_report(comparison, tmp_path / "report.html")
-    assert "plain form" in (tmp_path / "report.html").read_text()
+def test_a_gain_that_changes_during_a_run_acts_from_that_cycle_on():
+    """The commands before are those of the run without the change."""
+    ready = fp.simulator(outside(task(duration=0.1)), CONTROLLERS["plain form"], compiled=False, live=["tracking.rate"])
+    before, after = (ready.run(seed=0, changes=one)["command.u"] for one in (None, {0.05: {"tracking.rate": 12.0}}))
+    assert np.array_equal(before[:50], after[:50])
+    assert np.abs(after[50:] - before[50:]).max() > 0.1 * np.abs(before).max()
 
 
-def test_memory_that_changes_during_the_run():
-    """A change of the believed mass before cycle 50 leaves the commands before it alone, and acts from that cycle on."""
-    problem = outside(task(duration=0.1))
-    ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
-    start = start_memory(ready.loop, problem, ready.controller)
-    place = np.arange(start.size)[ready.loop.memory.slice("parameters")]
-    patches: list[list[Patch]] = [[], [(50, place, np.array([2.0]))]]
-    loop, talk = (ready.loop, ready.evaluator), moving(problem).exchange(0)
-    before, after = (run_cycles(problem, start, *loop, [], talk, patches=one)[0] for one in patches)
-    commands = [log[:, ready.loop.trace.slice("command")].ravel() for log in (before, after)]
-    assert np.array_equal(commands[0][:50], commands[1][:50])
-    assert commands[1][50] == pytest.approx(0.5 * commands[0][50], rel=1e-12)
+def test_solver_that_fails_ends_the_run():
+    """The reason is the solver's last line; the cycles before are kept."""
+    failing = fp.RecedingHorizon(Failing(iterations=1, tolerance=1e-3, at=3))
+    result = run(outside(task(duration=0.1)), failing)
+    assert re.search(r"a solver failed \(OSQP failed\) at t = 0.0\d+ s", str(result.stop))
+    assert 0 < result.cycles < 100
 
 
-def test_solver_that_fails_ends_the_run(monkeypatch):
-    """As CasADi's do, with a RuntimeError: the reason is the solver's last line; the cycles before are kept."""
-    problem = outside(task(duration=0.1))
-    ready = simulator(problem, CONTROLLERS["computed torque"], compiled=False)
-    failure = RuntimeError("Error in Function::call\nsolver has no solution")
-    evaluate = Mock(wraps=ready.evaluator.evaluate, side_effect=[*[DEFAULT] * 10, failure])
-    monkeypatch.setattr(ready.evaluator, "evaluate", evaluate)
-    start = start_memory(ready.loop, problem, ready.controller)
-    log, stop = run_cycles(problem, start, ready.loop, ready.evaluator, [], moving(problem).exchange(0))
-    assert len(log) == 10
-    assert "a solver failed (solver has no solution) at t = 0.01 s (cycle 10)" in str(stop)
+# Physical ranges
+
+
+def tank(**ranges) -> fp.Plant:
+    """A tank with a leak; its level is in m."""
+    return fp.Plant(
+        {"level": "m"},
+        {"pump": "m^3/s"},
+        {"leak": fp.Parameter(0.1, 0.2, "m^2/s")},
+        lambda q, u, p: {"level": u.pump - p.leak * q.level},
+        order=1,
+        ranges=ranges,
+    )
+
+
+def emptying(plant: fp.Plant, cycles: int = 1000) -> fp.Problem:
+    """A tank that is asked to go below its floor: level = 0.2 - t."""
+    reference = fp.Trajectory(lambda t: {"level": 0.2 - t + 0 * ca.sin(t)})
+    return fp.Problem(plant, reference, {"level": 0.2}, 1e-3, cycles * 1e-3)
+
+
+def test_run_ends_where_the_level_is_below_zero():
+    """The run without the range is the same up to the last cycle with a level of at least zero, and the reason names it."""
+    free, checked = run(emptying(tank())), run(emptying(tank(level=(0.0, np.inf))))
+    first = int(np.argmax(free["state.level"] < 0))
+    assert 100 < first < 500
+    assert checked.cycles == first
+    assert np.array_equal(checked["state.level"], free["state.level"][:first])
+    assert checked.stop is not None
+    assert checked.stop.startswith("state 'level' is -")
+    assert f"outside its physical range of 0 to inf m at t = {first * 1e-3:g} s (cycle {first})" in checked.stop
+    assert free.stop is None
+
+
+def test_range_in_a_later_chunk_of_cycles():
+    """Cycles are computed 500 at a time; a range that is left in the second chunk ends the run at its own cycle."""
+    free, checked = run(emptying(tank())), run(emptying(tank(level=(-0.5, 1.0))))
+    first = int(np.argmax(free["state.level"] < -0.5))
+    assert first > 500
+    assert checked.cycles == first
+
+
+def test_state_of_a_reality_and_of_a_body_outside():
+    """The state that counts is that of what moves: the reality's force, the measured coordinate of an object."""
+    real = fp.Reality(replace(lagged(), ranges={"F": (-5.0, 0.5)}), start={"F": 0.0})
+    result = run(task(reality=real))
+    assert "state 'F' is " in str(result.stop)
+    assert np.all(result["reality_state.F"] <= 0.5)
+    problem = task(plant=replace(task().plant, ranges={"y'": (-1.0, 1.0)}))
+    body = run(replace(problem, reality=fp.ExternalPlant(Wrapped(problem), MEASURES)))
+    assert body.stop == run(problem).stop
+    assert "y'" in str(body.stop)
+
+
+def test_noisy_sensor_does_not_end_a_run():
+    """The range is that of the level and not of its measurement."""
+    noisy = fp.Sensing(sensors={"level": fp.Sensor(noise=fp.Noise(0.5))})
+    reference = fp.Trajectory(lambda t: {"level": 0.2 + 0 * t})
+    calm = replace(emptying(tank(level=(0.0, 1.0)), 200), reference=reference, sensing=noisy)
+    result = run(calm, fp.ComputedTorque(fp.Exponential(rate=1.0)))
+    assert result["state.level"].min() < 0
+    assert result.stop is None
+
+
+# Lateness that the body states
+
+CYCLE, LATE, LAG = 1e-2, 3, 0.05
+
+
+class Cart:
+    """x'' = what was commanded, three cycles ago, behind a lag; exact for a held command."""
+
+    def __init__(self, late: int = 0, lag: float = 0.0) -> None:
+        self.late, self.lag = late, lag
+
+    def reset(self, seed):
+        del seed
+        self.waiting, self.x, self.v, self.u = [0.0] * self.late, 0.0, 0.0, 0.0
+        return [0.0, 0.0, 0.0]
+
+    def step(self, time, command):
+        del time
+        self.waiting.append(float(command[0]))
+        wanted, before = self.waiting.pop(0), self.v
+        steps = 200
+        for _ in range(steps):
+            h = CYCLE / steps
+            start = self.u
+            self.u = wanted + (self.u - wanted) * math.exp(-h / self.lag) if self.lag else wanted
+            mean = (start + self.u) / 2 if self.lag else wanted
+            self.x += h * self.v + h * h / 2 * mean
+            self.v += h * mean
+        return [self.x, self.v, (self.v - before) / CYCLE]
+
+
+CART = fp.Plant(
+    coordinates={"x": "m"},
+    inputs={"u": "m/s^2"},
+    parameters={"b": fp.Parameter(approximate=1.0, exact=1.0, unit="1")},
+    response=lambda _q, _v, u, p: {"x": p.b * u.u},
+)
+FORM = fp.ModelReferenced(fp.Affine(gain=-1.0))
+
+
+def cart(**facts) -> fp.Problem:
+    body = Cart(round(facts.get("dead_time", {}).get("u", 0.0) / CYCLE), facts.get("lag", {}).get("u", 0.0))
+    return fp.Problem(
+        plant=CART,
+        reality=fp.ExternalPlant(body, measures={"x": "m", "x'": "m/s", "x''": "m/s^2"}, **facts),
+        reference=fp.Trajectory(lambda t: {"x": 1 - ca.cos(2 * t)}),
+        start={"x": 0.0},
+        period=CYCLE,
+        duration=3.0,
+        limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
+    )
+
+
+def law(form: Deformation) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate=3.0, integral=False), form)
+
+
+def deformed(one: fp.Problem, form: fp.ModelReferenced) -> float:
+    """Largest difference between request and desired response."""
+    result = run(one, law(form))
+    assert result.stop is None
+    return float(np.abs(result["deformed"] - result["desired"]).max())
+
+
+@pytest.mark.parametrize("facts", [{"dead_time": {"u": LATE * CYCLE}}, {"lag": {"u": LAG}}], ids=["dead time", "lag"])
+def test_an_exact_model_is_left_alone_behind_what_the_body_states(facts):
+    """The form that knows of nothing deforms what needs no deformation."""
+    one = cart(**facts)
+    unknowing = fp.ModelReferenced(FORM.map, cycles=0.0, lag=0.0)
+    assert deformed(one, FORM) < 0.06 * deformed(one, unknowing)

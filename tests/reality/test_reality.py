@@ -8,86 +8,25 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.plants import linear, pendulum
+from helpers.drives import (
+    CONTROLLERS,
+    FPI,
+    PAIRS,
+    PERIOD,
+    SENSING,
+    TAU,
+    TRACK,
+    lagged,
+    parameters,
+    run,
+    slow_sensor,
+    task,
+)
+from helpers.tasks import made
 from scipy.linalg import expm
 
 import fpirhc as fp
-from fpirhc.controllers.check import checked
-from fpirhc.describe import describe
-from fpirhc.errors import InvalidProblem, NotContractive, NotSupported
-from fpirhc.sensing.base import response_names
-
-TRACK = fp.Exponential(rate=6.0)
-PERIOD = 1e-3  # s
-TAU = 0.01  # s, lag of the actuator
-FPI = fp.Sigmoid(gain=-0.5, scale=50.0)
-
-CONTROLLERS = {
-    "computed torque": fp.ComputedTorque(TRACK),
-    "plain form": fp.ComputedTorque(TRACK, FPI),
-    "model-referenced form": fp.ComputedTorque(TRACK, fp.ModelReferenced(FPI)),
-    "receding horizon": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), FPI),
-}
-SENSING: dict[str, dict[str, Any]] = {
-    "ideal": {},
-    "estimated": {"sensing": fp.Sensing(estimator=fp.PositionDifference())},
-    "noisy": {"sensing": fp.Sensing(sensors={"y'": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.1)})},
-    "late": {"dead_time": fp.DeadTime(measurement=2.5 * PERIOD), "disturbances": {"y": fp.Sine(0.1, 2.0)}},
-}
-
-
-def parameters(gain: float = 2.0) -> dict[str, fp.Parameter]:
-    """The gain of the linear plant; the model believes in 1."""
-    return {"b": fp.Parameter(approximate=1.0, exact=gain, unit="1/kg")}
-
-
-def lagged(tau: float = TAU, gain: float = 2.0) -> fp.Plant:
-    """Y'' = b F behind an actuator, tau F' = u - F."""
-    return fp.Plant(
-        coordinates={"y": "m", "F": "N"},
-        inputs={"u": "N"},
-        order={"y": 2, "F": 1},
-        parameters=parameters(gain) | {"tau": fp.Parameter(approximate=tau, exact=tau, unit="s")},
-        response=lambda q, v, u, p: {"y": p.b * q.F, "F": (u.u - q.F) / p.tau},
-    )
-
-
-def slow_sensor(tau: float = TAU) -> fp.Plant:
-    """Y'' = b u, measured through tau s' = y - s."""
-    return fp.Plant(
-        coordinates={"y": "m", "s": "m"},
-        inputs={"u": "N"},
-        order={"y": 2, "s": 1},
-        parameters=parameters(),
-        response=lambda q, v, u, p: {"y": p.b * u.u, "s": (q.y - q.s) / tau},
-    )
-
-
-def task(**changes) -> fp.Problem:
-    """The linear plant along a sine."""
-    settings: dict[str, Any] = {
-        "plant": linear(2.0, 1.0),
-        "reference": fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
-        "start": {"y": 0.1},
-        "period": PERIOD,
-        "duration": 0.3,
-        "limits": fp.Limits(inputs={"u": (-50.0, 50.0)}),
-        "horizon": fp.Horizon(stages=5, step=1e-2),
-        "cost": fp.Quadratic(states={"y": 1e3, "y'": 1.0}, effort={"u": 1e-3}),
-    }
-    return fp.Problem(**{**settings, **changes})
-
-
-def run(problem: fp.Problem, controller: Any = CONTROLLERS["computed torque"]) -> fp.Run:
-    """A run in the virtual machine."""
-    return fp.simulate(problem, controller, seed=0, compiled=False)
-
-
-# What moves
-
-
-# The twin meets every way of sensing, every controller noisy sensors.
-PAIRS = [("model-referenced form", s) for s in SENSING] + [(c, "noisy") for c in CONTROLLERS if "referenced" not in c]
+from fpirhc.errors import NotContractive
 
 
 @pytest.mark.parametrize(("controller", "sensing"), PAIRS)
@@ -102,30 +41,20 @@ def test_reality_equal_to_the_model_changes_no_bit(controller, sensing):
     assert set(other.layout.names) == {*one.layout.names, "reality_state"}
 
 
-@pytest.mark.parametrize("name", ["two_mass", "noisy_motor", "leaking_tanks", "turbojet", "fishery"])
-def test_model_as_what_moves_shows_its_own_outputs_and_responses(name):
-    problem = fp.load_problem(name).problem
-    plant = problem.plant
-    assert problem.truth.plant is plant
-    generator = np.random.default_rng(0)
-    x, u = problem.start_state * generator.uniform(0.9, 1.1, plant.state.size), problem.inputs_before
-    at = x, u, problem.real_parameters
-    calm = np.zeros(len(plant.names))
-    shown = problem.truth.function(plant.output.elements)(*at, calm)
-    np.testing.assert_array_equal(shown, plant.equations.output(*at, calm))
-    answered = problem.truth.function(response_names(plant))(*at, calm)
-    np.testing.assert_array_equal(answered, plant.equations.controlled_response(*at))
-
-
-def test_no_reality_is_no_setting():
-    """A problem without one is described as before, so that its baselines stay valid."""
-    assert "reality" not in describe(task())
-    assert describe(task(reality=fp.Reality(lagged(), start={"F": 0.0})))["reality"]["is"] == "Reality"
-
-
-def test_table_of_a_problem_names_the_reality():
-    """A reader of a notebook sees what moves."""
-    assert "y of order 2, F of order 1" in task(reality=fp.Reality(lagged(), start={"F": 0.0}))._repr_html_()
+def test_an_output_in_place_of_a_coordinate_changes_no_signal():
+    """The lagged plant by its states, whose own names are others, shows the model's coordinate as an output."""
+    states = fp.Plant.of_states(
+        states={"place": "m", "speed": "m/s", "F": "N"},
+        inputs={"u": "N"},
+        parameters=lagged().parameters,
+        rates=lambda x, u, p: {"place": x.speed, "speed": p.b * x.F, "F": (u.u - x.F) / p.tau},
+        outputs={"y": fp.Output("m", lambda x, p: x.place)},
+    )
+    start = {"place": 0.1, "speed": 0.0, "F": 0.0}
+    realities = fp.Reality(lagged(), start={"F": 0.0}), fp.Reality(states, start=start)
+    one, other = (run(task(reality=r), CONTROLLERS["plain form"]) for r in realities)
+    for name in set(one.layout.names) - {"reality_state", "contraction"}:
+        np.testing.assert_allclose(other[name], one[name], rtol=1e-12, atol=1e-12, err_msg=name)
 
 
 def test_lagged_reality_moves_as_the_matrix_exponential_says():
@@ -200,12 +129,6 @@ def test_disturbance_of_a_state_that_the_model_does_not_have():
 # What "exact" means
 
 
-def test_exact_model_is_refused_where_the_reality_has_other_coordinates():
-    """The controller is given y and y' only, so it cannot have a model with a force."""
-    with pytest.raises(NotSupported, match="the coordinate F, which the controller is not given"):
-        run(task(reality=fp.Reality(lagged(), start={"F": 0.0})), fp.ExactModel(CONTROLLERS["computed torque"]))
-
-
 def test_contraction_is_that_of_a_whole_cycle():
     """Behind the lag a request has done b / b^ (1 - exp(-T / tau)) to the response by the end of its cycle."""
     result = run(task(reality=fp.Reality(lagged(), start={"F": 0.0})), fp.ComputedTorque(TRACK, FPI))
@@ -215,61 +138,8 @@ def test_contraction_is_that_of_a_whole_cycle():
 
 def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
     """The command has no effect at once, but its sign is known at the end of the cycle."""
-    problem = task(reality=fp.Reality(lagged(gain=-2.0), start={"F": 0.0}))
     with pytest.raises(NotContractive):
-        checked(problem, CONTROLLERS["plain form"])
-    checked(task(reality=fp.Reality(lagged(), start={"F": 0.0})), CONTROLLERS["plain form"])
-
-
-# Mistakes
-
-
-def missing() -> fp.Plant:
-    """A plant without y."""
-    return replace(linear(2.0, 1.0), coordinates={"z": "m"}, response=lambda q, v, u, p: {"z": p.b * u.u})
-
-
-MISTAKES = {
-    "no output": (lambda: fp.Reality(missing()), "no coordinate 'y', which the model has"),
-    "other unit": (
-        lambda: fp.Reality(replace(linear(2.0, 1.0), coordinates={"y": "mm"})),
-        "in mm, the model's 'y' in m;",
-    ),
-    "other input": (
-        lambda: fp.Reality(replace(linear(2.0, 1.0), inputs={"F": "N"}, response=lambda q, v, u, p: {"y": p.b * u.F})),
-        "inputs are F, the model's are u",
-    ),
-    "other unit of an input": (lambda: fp.Reality(replace(linear(2.0, 1.0), inputs={"u": "kN"})), "'u' is in kN"),
-    "other time": (lambda: fp.Reality(replace(linear(2.0, 1.0), time_unit="ms")), "time is in ms, the model's in s"),
-    "lower order": (
-        lambda: fp.Reality(fp.Plant({"y": "m"}, {"u": "N"}, parameters(), lambda q, u, p: {"y": p.b * u.u}, order=1)),
-        "y' jumps with the command",
-    ),
-    "out of reach": (
-        lambda: fp.Reality(replace(lagged(), response=lambda q, v, u, p: {"y": -q.y, "F": (u.u - q.F) / p.tau})),
-        "no input reaches its coordinate 'y'",
-    ),
-    "unknown start": (
-        lambda: fp.Reality(lagged(), start={"force": 1.0}),
-        "start: state 'force' is unknown. Valid: y, F, y'",
-    ),
-    "unknown sensor": (
-        lambda: fp.Reality(lagged(), start={"F": 0.0}, seen={"y": "Y"}),
-        "coordinate of the reality 'Y' is unknown",
-    ),
-    "no start": (lambda: fp.Reality(lagged()), r"does not have: F; give .* Reality\(start=\{'F': ...\}\)"),
-    "stiff": (
-        lambda: fp.Reality(lagged(tau=1e-4), start={"F": 0.0}),
-        r"pole -1e\+04 1/s, .* is 10, .*RungeKutta4\(substeps=5\)",
-    ),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_are_named(mistake):
-    make, message = MISTAKES[mistake]
-    with pytest.raises(InvalidProblem, match=f"(?s){message}"):
-        task(reality=make())
+        run(task(reality=fp.Reality(lagged(gain=-2.0), start={"F": 0.0})), CONTROLLERS["plain form"])
 
 
 def test_the_named_sub_steps_would_do():
@@ -280,7 +150,117 @@ def test_the_named_sub_steps_would_do():
     assert np.allclose(result["reality_state.F"][1:], np.asarray(result["command"])[:-1, 0], rtol=1e-3, atol=1e-3)
 
 
-def test_plant_in_place_of_a_reality_is_named():
-    """`Problem(reality=plant)` is refused with the class that is expected."""
-    with pytest.raises(InvalidProblem, match="Reality"):
-        task(reality=pendulum())
+def test_comparison_and_report_show_what_moves(tmp_path):
+    """Its own states are on the page, and the factor of the iteration is that of a whole cycle."""
+    problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}))
+    map_ = fp.Increment(fp.Affine(gain=-0.2), cycles=0)
+    pair = {"CTC": fp.ComputedTorque(TRACK), "CTC+FPI": fp.ComputedTorque(TRACK, map_)}
+    comparison = fp.compare(made(problem, pair, headline=("CTC", "CTC+FPI")), seed=0, compiled=False)
+    factor = comparison.entries[1].metrics["contraction.predicted"][""]
+    assert factor == pytest.approx(1 - 0.1 * 2.0 * (1 - np.exp(-PERIOD / TAU)), abs=1e-6)
+    fp.write_report(comparison, tmp_path / "report.html")
+    assert "reality: F" in (tmp_path / "report.html").read_text()
+
+
+# A reality with other states than the model needs only what is measured, controlled or judged; the rest is believed
+
+
+STEP, PARAMETERS = 0.05, {"b": fp.Parameter(approximate=1.0, exact=1.3, unit="1/l")}
+FILTER = fp.KalmanFilter(measured={"c1": 1e-4}, noise={"c1": 1.0, "c2": 0.01})
+BELIEVED = fp.Sensing(measured=["c1", "c1'"], observer=FILTER)
+BLOOD = fp.ComputedTorque(fp.Exponential(rate=1.0))
+DRUG = fp.Sigmoid(gain=-0.8, scale=20.0)
+
+
+def compartments(deep: str = "c2") -> fp.Plant:
+    """A drug in blood and in a tissue, whose name is free."""
+
+    def response(q: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {"c1": p.b * u.u - 0.5 * q.c1 + 0.2 * q[deep], deep: 0.3 * q.c1 - 0.2 * q[deep]}
+
+    return fp.Plant(
+        coordinates={"c1": "mg/l", deep: "mg/l"},
+        inputs={"u": "mg/min"},
+        order=1,
+        controlled=("c1",),
+        parameters=PARAMETERS,
+        response=response,
+        time_unit="min",
+    )
+
+
+def three() -> fp.Plant:
+    """The same drug with two tissues, neither of them the model's."""
+    return fp.Plant(
+        coordinates={"c1": "mg/l", "fast": "mg/l", "slow": "mg/l"},
+        inputs={"u": "mg/min"},
+        order=1,
+        controlled=("c1",),
+        parameters=PARAMETERS,
+        response=lambda q, u, p: {
+            "c1": p.b * u.u - 0.7 * q.c1 + 0.4 * q.fast + 0.05 * q.slow,
+            "fast": 0.3 * q.c1 - 0.4 * q.fast,
+            "slow": 0.1 * q.c1 - 0.05 * q.slow,
+        },
+        time_unit="min",
+    )
+
+
+def infusion(**changes: Any) -> fp.Problem:
+    """Blood along a sine; the tissue is nobody's to measure."""
+    settings: dict[str, Any] = {
+        "plant": compartments(),
+        "reference": fp.Trajectory(lambda t: {"c1": 2 + 0.3 * ca.sin(t / 2), "c2": 3 + 0 * t}),
+        "start": {"c1": 2.0, "c2": 3.0},
+        "period": STEP,
+        "duration": 20.0,
+        "sensing": BELIEVED,
+        "limits": fp.Limits(inputs={"u": (0.0, 20.0)}),
+        "horizon": fp.Horizon(stages=8, step=5 * STEP),
+        "cost": fp.Quadratic(states={"c1": 10.0}, rate={"u": 1e-3}),
+    }
+    return fp.Problem(**(settings | changes))
+
+
+def other(**changes: Any) -> fp.Problem:
+    """The task with the three compartments as reality, settled."""
+    return infusion(reality=fp.Reality(three(), start={"fast": 1.5, "slow": 4.0}), **changes)
+
+
+@pytest.mark.parametrize(
+    "controller",
+    [replace(BLOOD, deformation=DRUG), fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-4), DRUG)],
+    ids=["computed torque", "receding horizon"],
+)
+def test_what_nobody_measures_may_have_any_name(controller):
+    """The same equations with the tissue under another name: the controller is given the same, so every signal is the same."""
+    whole = run(infusion(duration=3.0, reality=fp.Reality(compartments())), controller)
+    renamed = run(infusion(duration=3.0, reality=fp.Reality(compartments("deep"), start={"deep": 3.0})), controller)
+    for name in set(renamed.layout.names) - {"plant_state", "reality_state", "cost"}:
+        np.testing.assert_array_equal(renamed[name], whole[name], err_msg=name)
+    assert renamed.layout["plant_state"].elements == ("c1",)
+    np.testing.assert_array_equal(renamed["plant_state.c1"], whole["plant_state.c1"])
+
+
+def test_the_belief_is_nobodys_state():
+    """Blood is given nearly as it is measured; the tissue follows from the model, and no tissue of the reality is like it."""
+    result = run(other(), BLOOD)
+    np.testing.assert_allclose(result["state.c1"], result["plant_state.c1"], atol=1e-3)
+    assert np.ptp(result["state.c2"]) > 0.1
+    for own in ("fast", "slow"):
+        assert np.abs(result["state.c2"] - result[f"reality_state.{own}"]).max() > 0.5
+
+
+def test_adaptation_helps_where_the_model_has_too_few_states():
+    """The response is measured, so the deformation sees what the model lacks: the error is four times smaller."""
+    problem = other(measure_from=2.0)
+    errors = [
+        fp.measure(problem, run(problem, replace(BLOOD, deformation=d))).rms_error["c1"] for d in (fp.Identity(), DRUG)
+    ]
+    assert errors[1] < 0.25 * errors[0]
+
+
+def test_no_cost_of_states_that_do_not_exist():
+    """A plan has the believed tissue; a run is judged by its error, and its cost is left out."""
+    assert "cost" not in run(other(duration=0.5), BLOOD).layout
+    assert "cost" in run(infusion(duration=0.5), BLOOD).layout

@@ -11,7 +11,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem, NotSupported
 
 PERIOD = 1 / 12  # min
 TRACK = fp.ComputedTorque(fp.Exponential(rate=1.5))
@@ -175,46 +174,6 @@ def test_a_flexible_joint_behind_a_rigid_model(estimator):
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_a_comparison_and_its_report(tmp_path):
-    """The page is as of every problem; what is exact is the patient."""
-    problem = task(duration=1.0)
-    other = problem.with_exact(1.1 * problem.real_plant.exact)
-    assert np.array_equal(other.real_plant.exact, 1.1 * problem.real_plant.exact)
-    pair = {"CTC": TRACK, "CTC+FPI": replace(TRACK, deformation=FPI)}
-    file = replace(fp.load_problem("two_mass"), problem=problem, controllers=pair, headline=("CTC", "CTC+FPI"))
-    comparison = fp.compare(file, seed=0, compiled=False)
-    fp.write_report(comparison, tmp_path / "report.html")
-    assert "reality: Ce" in (tmp_path / "report.html").read_text()
-
-
-MISTAKES = {
-    "no output": (lambda: fp.Reality(patient(output="depth"), start=FIRST), "no output 'bis', which the model has"),
-    "unit": (lambda: fp.Reality(patient(unit="%"), start=FIRST), "its 'bis' is in %, the model's in 1;"),
-    "start": (lambda: fp.Reality(patient(), start={"c": 1.0}), "start: state 'c' is unknown. Valid: C1, C2, C3, Ce"),
-}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_mistakes_of_a_reality_are_named(mistake):
-    make, message = MISTAKES[mistake]
-    with pytest.raises(InvalidProblem, match=f"(?s){message}"):
-        task(reality=make())
-
-
-def test_without_a_belief_the_states_are_needed():
-    """The controller would be given states that the patient does not have; the message says how they are believed."""
-    with pytest.raises(
-        InvalidProblem, match=r"(?s)no coordinate 'c'.*believed: Sensing\(measured=..., observer=KalmanFilter"
-    ):
-        task(sensing=fp.Sensing())
-
-
-def test_it_is_no_exact_model():
-    """A controller of one compartment is not given three."""
-    with pytest.raises(NotSupported, match="C1, which the controller is not given"):
-        run(task(duration=0.5), fp.ExactModel(TRACK))
-
-
 # A body outside
 
 
@@ -272,44 +231,3 @@ def test_a_body_with_outputs_is_the_reality_of_these_outputs(controller, estimat
     one, other = run(problem, controller), run(replace(problem, reality=body), controller)
     np.testing.assert_allclose(other["command"], one["command"], atol=1e-9 * np.abs(one["command"]).max())
     np.testing.assert_allclose(other["true_error"], one["true_error"], atol=1e-10)
-
-
-def test_a_body_must_measure_what_the_controller_is_given():
-    """Without an observer also the model's states; units are compared."""
-    body = Patient(tuple(UNITS))
-    with pytest.raises(InvalidProblem, match=r"(?s)does not measure c .*does not measure e"):
-        task(reality=fp.ExternalPlant(body, UNITS), sensing=fp.Sensing())
-    with pytest.raises(InvalidProblem, match="measures bis in %, the model has it in 1"):
-        task(reality=fp.ExternalPlant(body, {**UNITS, "bis": "%"}))
-    with pytest.raises(InvalidProblem, match="does not measure bis'' "):
-        task(reality=fp.ExternalPlant(body, {"bis": "1", "bis'": "1/min"}))
-
-
-def test_a_body_that_measures_states_and_outputs():
-    """Given as they are, without an observer: the model's plant outside, to rounding."""
-    problem = task(reality=None, sensing=fp.Sensing(), duration=2.0)
-    plant = problem.plant
-    x, u, p = plant.symbols()
-    outputs = plant.equations.output(x, u, p, np.zeros(2))
-    shown = ca.Function("shown", [x, u, p], [ca.vertcat(x, outputs, plant.equations.controlled_response(x, u, p))])
-    move = problem.integrator.step(plant, PERIOD)
-
-    class Own:
-        """The model's plant with its exact parameters."""
-
-        def reset(self, seed: int) -> np.ndarray:
-            del seed
-            self.x = problem.start_state
-            return np.asarray(shown(self.x, problem.inputs_before, plant.exact).full()).ravel()
-
-        def step(self, time: float, command: np.ndarray) -> np.ndarray:
-            del time
-            self.x = np.asarray(move(self.x, command, plant.exact, np.zeros(2)).full()).ravel()
-            return np.asarray(shown(self.x, command, plant.exact).full()).ravel()
-
-    measures = {"c": "mg/l", "e": "mg/l", **UNITS}
-    controller = replace(PLAN, deformation=FPI)
-    one, other = run(problem, controller), run(replace(problem, reality=fp.ExternalPlant(Own(), measures)), controller)
-    np.testing.assert_allclose(other["command"], one["command"], atol=1e-10 * np.abs(one["command"]).max())
-    np.testing.assert_allclose(other["plant_state"], one["plant_state"], atol=1e-12)
-    assert "cost" in other.layout
