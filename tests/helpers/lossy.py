@@ -67,8 +67,8 @@ class Lossy:
             else:
                 for i, j in enumerate(waiting if how == "interpolated" else ()):
                     last = samples[max(waiting[0] - 1 - self._waits[1], 0)]
-                    shown = last + (sample - last) * (i + 1) / (len(waiting) + 1)
-                    _, memory = self.stepper.step_measured(j * period, shown, memory)
+                    between = last + (sample - last) * (i + 1) / (len(waiting) + 1)
+                    _, memory = self.stepper.step_measured(j * period, between, memory)
                 waiting = []
                 row = np.full(sample.size, np.nan) if k in lost else shown(k, sample.copy())
                 command, memory = self.stepper.step_measured(k * period, row, memory)
