@@ -28,6 +28,7 @@ from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.summary import line, number, table
 from fpirhc.task.exogenous import previewed_values
+from fpirhc.task.problem import Problem
 
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
 _REMEMBERED = 4  # horizons whose Functions are kept
@@ -259,7 +260,8 @@ def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[s
     """Solve the horizon that begins at the start of the problem, with the approximate model.
 
     Args:
-        names: of optimisers, which solve it to `TOLERANCE`; 'all' among them stands for every one. None: each controller's own.
+        names: of optimisers, which solve it to `TOLERANCE`; 'all' among them stands for every one. Where a controller has one of
+            that kind it is that one, with its settings. None: each controller's own.
         controllers: names of those whose optimisers are meant; None: all that plan.
     """
     problem = task.problem
@@ -270,7 +272,10 @@ def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[s
             f"problem '{task.name}' has no horizon, or none of {', '.join(own)} plans with an optimiser"
         )
     if names:
-        wanted = {label: (build(TOLERANCE), problem.cost) for label, build in chosen_optimisers(names).values()}
+        some = [one.optimiser for one in planners.values()]
+        wanted = {
+            label: (_of_kind(made, TOLERANCE, some), problem.cost) for label, made in chosen_optimisers(names).values()
+        }
     else:
         alike: dict[object, list[str]] = {}
         for name, one in planners.items():
@@ -298,10 +303,7 @@ Choice = tuple[str, Callable[[float], Optimiser]]  # label, function of the tole
 
 
 def optimiser_choices() -> dict[str, Choice]:
-    """Return every optimiser of the command line: name -> (label, function of the tolerance).
-
-    The modules of the optimisers define them as `CHOICES`.
-    """
+    """Return every optimiser of the command line, which the modules of the optimisers define as `CHOICES`: name -> choice."""
     choices: dict[str, Choice] = {}
     for module in member_modules("optimisers"):
         choices |= getattr(module, "CHOICES", {})
@@ -317,25 +319,36 @@ def chosen_optimisers(names: Sequence[str]) -> dict[str, Choice]:
     return choices if "all" in names else {name: choices[name] for name in names}
 
 
+def _of_kind(build: Callable[[float], Optimiser], tolerance: float, own: Sequence[Optimiser]) -> Optimiser:
+    """The first of a file's own optimisers that is of this kind, to this tolerance; a new one where a kind has two names."""
+    fresh = build(tolerance)
+    names = sum(type(other(tolerance)) is type(fresh) for _, other in optimiser_choices().values())
+    alike = [one for one in own if type(one) is type(fresh)] if names == 1 else []
+    return replace(alike[0], tolerance=tolerance) if alike else fresh  # type: ignore[type-var]
+
+
 def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str] | None) -> Task:
     """Return the task with its planning controllers once per optimiser: the headline pair, or those named.
 
     A controller that is named and does not plan stays as it is.
     """
-    choices = list(chosen_optimisers(names).values())
-    sources = list(controllers or task.headline or task.controllers)
-    planning = [name for name in sources if task.controllers[name].planner is not None]
-    if not planning:
+    choices = chosen_optimisers(names).values()
+    sources = {name: task.controllers[name] for name in controllers or task.headline or task.controllers}
+    own = {name: one.planner.optimiser for name, one in task.controllers.items() if one.planner is not None}
+    if not own.keys() & sources:
         raise InvalidProblem(f"problem '{task.name}': none of {', '.join(sources)} plans with an optimiser")
     varied: dict[str, Controller] = {}
-    for name in sources if controllers else planning:
-        varied |= _varied(name, task.controllers[name], choices)
+    for name, controller in sources.items():
+        if name in own:
+            tolerance, kept = _tolerance_of(own[name], task.problem), [own[name], *own.values()]
+            varied |= {f"{name} ({n})": with_optimiser(controller, _of_kind(b, tolerance, kept)) for n, b in choices}
+        elif controllers:
+            varied[name] = controller
     return replace(task, controllers=varied, headline=None)
 
 
-def _varied(name: str, controller: Controller, optimisers: Sequence[Choice]) -> dict[str, Controller]:
-    """The controller by name, once per optimiser; unchanged where it does not plan."""
-    if controller.planner is None:
-        return {name: controller}
-    tolerance = float(getattr(controller.planner.optimiser, "tolerance", 1e-3))
-    return {f"{name} ({label})": with_optimiser(controller, build(tolerance)) for label, build in optimisers}
+def _tolerance_of(optimiser: Optimiser, problem: Problem) -> float:
+    """Its own, in the unit of the inputs; where it takes one by itself, 1e-4 of half the smallest range of an input."""
+    stated = getattr(optimiser, "tolerance", None)
+    low, high = problem.limits.input_bounds(problem.plant)
+    return stated or min((0.5e-4 * size for size in high - low if 0 < size < np.inf), default=1e-3)

@@ -76,6 +76,14 @@ DIVERGING = edited("- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.5001 - q.y)")
 TUNABLE = edited(
     "controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {'
 )
+PLAN = "fp.FixedPoint(iterations=1, tolerance=1e-3)"
+CHOSEN = edited(f"{PLAN}),\n", "fp.FixedPoint()),\n")  # its tolerance follows from the limits of the inputs
+OF_AN_END = edited(
+    'fp.Quadratic(states={"y": 100.0, "y\'": 1.0}, deviation={"u": 1e-2})',
+    """fp.CustomCost(
+        lambda v: {"u": v.input.u**2}, terminal=lambda v: -v.state.y**2)""",
+)  # bends down
+BENDS = edited(f"{PLAN},", f"{PLAN[:-1]}, hessian=fp.ExactHessian()),")
 WRONG_SIGN = edited("gain=-0.5", "gain=0.5, scale=1.0")
 WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.0}})\ncontrollers = {')
 MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
@@ -105,6 +113,12 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "compare line.py --plans --optimisers fixed-point ipopt", 0, "line, first horizon"),
         (None, "compare line.py --optimisers fixed-point ipopt --no-compile -c RHC", 0, MASS),
         (TIGHT, "compare line.py --plans", 4, "line, first horizon"),
+    ],
+    "optimisers by name": [
+        (lambda: (receding(), CHOSEN()), "compare line.py --optimisers ipopt --no-compile -c RHC", 0, MASS),
+        (OF_AN_END, "compare line.py --plans --optimisers fixed-point -c RHC", 2, "fpirhc: FixedPoint needs a cost that"),
+        (BENDS, "compare line.py --plans --optimisers fixed-point -c RHC+FPI", 0, "line, first horizon"),
+        (None, "compare line.py --optimisers fixed-point --no-compile -c RHC+FPI", 0, MASS),
     ],
     "run": [
         (None, "run line.py CTC --no-compile --out kept", 0, ""),
@@ -308,10 +322,12 @@ def test_what_comes_first_is_light(first, absent, tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
-def test_names_that_an_output_cannot_write_are_escaped(encoding, tmp_path):
-    (tmp_path / "mine.py").write_text(line_text("period=1e-2, duration=0.1").replace('"CTC"', '"θ"'), encoding="utf-8")
+@pytest.mark.parametrize("command", ["review mine.py -c θ", "run mine.py θ"])
+def test_names_that_an_output_cannot_write_are_escaped(command, encoding, tmp_path):
+    text = line_text("period=1e-2, duration=0.1").replace('"CTC"', '"θ"').replace('"y"', '"θ"').replace("q.y", "q.θ")
+    (tmp_path / "mine.py").write_text(text, encoding="utf-8")
     environment = {"PYTHONIOENCODING": encoding, "PYTHONPATH": str(ROOT), "FPIRHC_CC": "none"}
-    words = [sys.executable, "-m", "fpirhc", "review", "mine.py", "-c", "θ"]
+    words = [sys.executable, "-m", "fpirhc", *command.split()]
     done = subprocess.run(words, capture_output=True, cwd=tmp_path, env=environment, check=False, timeout=100)
     assert done.returncode in (0, 1)
     assert b"\\u03b8" in done.stdout

@@ -141,6 +141,9 @@ horizon by one number
 horizon of another tool
   stages=6, step=2e-2 -> n_horizon=20, t_step=2e-2
     no field 'n_horizon'. Did you mean 'stages'? ... no field 't_step'. Did you mean 'step'? ... Horizon needs stages, step
+terminal of a path
+  stages=6, step=2e-2 -> stages=6, step=2e-2, terminal=("end",)
+    mine.py, line 23: problem = fp.Problem( ... horizon: terminal: state 'end' is unknown. Valid: angle, angle'.
 step before stages
   fp.Horizon(stages=6, step=2e-2) -> fp.Horizon(2e-2, 6)
     Horizon.stages: expected a whole number from 1 to 1000000, got 0.02
