@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
 from typing import Any, cast
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
 from helpers.forms import FORMS
 
 import fpirhc as fp
-from fpirhc import simulator, tune
 from fpirhc.conformance import check_live
-from fpirhc.controllers.live_settings import live_settings
-from fpirhc.errors import CompileError, InvalidName, InvalidValue, NotContractive, NotSupported
-from fpirhc.problem_files.problem_file import with_numbers_of_all
-from fpirhc.simulation.loop import close_loop
-from fpirhc.symbolic.expression import holds_nan
-from fpirhc.symbolic.live import live_number
-from fpirhc.symbolic.paths import content_at
-from fpirhc.symbolic.program import generate
+from fpirhc.errors import CompileError, InvalidName, NotSupported
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.3, measure_from=0.0))
 by_torque = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
@@ -35,7 +25,7 @@ FIVE = ["deformation.gain", "cost.states.q1", "cost.states.q2'", "cost.deviation
 def rebuilt(ready, numbers, *, compiled):
     """The run of a loop that is built with these numbers."""
     problem, controller, _ = ready.live.changed(numbers)
-    return simulator(problem, controller, compiled=compiled).run(seed=0)
+    return fp.simulator(problem, controller, compiled=compiled).run(seed=0)
 
 
 def random_numbers(rng):
@@ -61,8 +51,8 @@ def test_a_changed_loop_is_the_rebuilt_one_bit_by_bit(compiled):
     in another order where a weight is no constant.
     """
     rng = np.random.default_rng(7)
-    torque = simulator(brief(), by_torque(), compiled=compiled, live=FOUR)
-    planned = simulator(brief(), by_plan(), compiled=compiled, live=FIVE)
+    torque = fp.simulator(brief(), by_torque(), compiled=compiled, live=FOUR)
+    planned = fp.simulator(brief(), by_plan(), compiled=compiled, live=FIVE)
     for k in range(3):
         four, five = random_numbers(rng)
         assert np.array_equal(torque.run(seed=0, settings=four).log, rebuilt(torque, four, compiled=compiled).log), four
@@ -78,7 +68,7 @@ def equal_to_rounding(one: np.ndarray, other: np.ndarray) -> bool:
 
 def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
     """Before the change the run is the one without it; a change at the start is a run with the number."""
-    ready = simulator(brief(), by_plan(), live=FIVE)
+    ready = fp.simulator(brief(), by_plan(), live=FIVE)
     numbers = {"deformation.gain": -0.9, "cost.states.q1": 400.0}
     changed, plain = ready.run(seed=0, changes={0.1234: numbers}), ready.run(seed=0)
     assert np.array_equal(changed.log[:124], plain.log[:124])
@@ -88,78 +78,29 @@ def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
     assert record[1][1]["deformation.gain"] == -0.9
 
 
-def test_nothing_live_is_the_same_c_text():
-    """The list of live settings is chosen at the build; the default loop has constants, as ever."""
-    for controller in (by_torque(), by_plan()):
-        plain = close_loop(brief(), live_settings(brief(), controller).controller)
-        empty = simulator(brief(), controller, compiled=False, live=()).loop
-        assert generate(plain.function) == generate(empty.function)
-        assert "#define SCALE_AT" not in "".join(generate(plain.function))
-
-
-WRONG = [
-    ("RHC+FPI", "deformation.gian", InvalidName, "gain"),
-    ("RHC+FPI", "start.q1", InvalidName, "data of every loop"),
-    ("RHC+FPI", "cost.states.q3", InvalidName, "q1"),
-    ("RHC+FPI", "optimiser.iterations", NotSupported, "what the loop is made of"),
-    ("RHC+FPI", "deformation", InvalidValue, "go on with one of"),
-    ("CTC", "cost.states.q1", NotSupported, "does not use it"),
-]
-
-
 @pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["VM", "C"])
 def test_tolerance_and_damping_of_the_plans_are_data(compiled):
     """They stand in the data of the stages beside the weights, so one compiled plan serves all of them."""
     short, controller = replace(brief(), duration=0.05), cast(Any, by_plan())
     damped = replace(controller, optimiser=replace(controller.optimiser, damping=0.1))
     paths = ["optimiser.tolerance", "optimiser.damping", "cost.states.q1"]
-    ready = simulator(short, damped, compiled=compiled, live=paths)
+    ready = fp.simulator(short, damped, compiled=compiled, live=paths)
     plain = ready.run(seed=0)
     numbers = {"optimiser.tolerance": 0.5, "optimiser.damping": 0.5, "cost.states.q1": 400.0}
     for settings in ({}, dict([*numbers.items()][:1]), numbers):
         changed = ready.run(seed=0, settings=settings)
         assert np.array_equal(changed.log, rebuilt(ready, settings, compiled=compiled).log), settings
         assert np.array_equal(changed["status"], plain["status"]) == (not settings)  # a loose tolerance is met
-    for wrong, words in (({"optimiser.tolerance": 1e-15}, "rounded"), ({"optimiser.damping": -1.0}, "at least 0")):
-        with pytest.raises(InvalidValue, match=words):
-            ready.run(seed=0, settings=wrong)
-
-
-@pytest.mark.parametrize(("name", "path", "error", "words"), WRONG, ids=[w[1] for w in WRONG])
-def test_what_cannot_be_live_is_refused_by_name(name, path, error, words):
-    """A setting that is needed as a number would become NaN in CasADi, without an error."""
-    with pytest.raises(error, match=words):
-        simulator(brief(), tasks.two_mass.controllers[name], live=[path])
-
-
-def test_numbers_are_checked_at_every_change():
-    """Unknown names, numbers outside a setting's range, infinite limits and gains that diverge."""
-    ready = simulator(brief(), by_plan(), live=FIVE, compiled=False)
-    cases: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
-        ({"deformation.gian": 1.0}, InvalidName, "deformation.gain"),
-        ({"deformation.shift": 0.2}, InvalidName, "not live"),
-        ({"deformation.gain": 0.0}, InvalidValue, "other than zero"),
-        ({"deformation.gain": 0.5}, NotContractive, "gain"),
-        ({"cost.states.q1": -1.0}, fp.errors.InvalidProblem, "at least 0"),
-        ({"limits.inputs.Q1.1": float("inf")}, InvalidValue, "use a large one"),
-        ({"limits.inputs.Q1.1": -400.0}, fp.errors.InvalidProblem, "above upper"),
-        ({"deformation.gain": "high"}, InvalidValue, "expected a number"),
-    )
-    for numbers, error, words in cases:
-        with pytest.raises(error, match=words):
-            ready.run(seed=0, settings=numbers)
-    with pytest.raises(InvalidValue, match="expected a time"):
-        ready.run(seed=0, changes={99.0: {"deformation.gain": -0.4}})
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
 def test_a_stepper_that_changes_is_the_one_that_is_rebuilt(compiled):
     """The same measurements through a changed and a rebuilt controller give the same commands; see the test of the loop."""
-    run = simulator(brief(), by_plan(), compiled=False).run(seed=0)
+    run = fp.simulator(brief(), by_plan(), compiled=False).run(seed=0)
     numbers = {"deformation.gain": -0.8, "cost.states.q1": 600.0, "limits.inputs.Q1.1": 25.0}
     live = fp.Stepper(brief(), by_plan(), compiled=compiled, live=FIVE)
     assert live.change(numbers)
-    problem, controller, _ = live_settings(brief(), by_plan(), FIVE).changed(numbers)
+    problem, controller, _ = fp.simulator(brief(), by_plan(), live=FIVE, compiled=False).live.changed(numbers)
     built = fp.Stepper(problem, controller, compiled=compiled)
     memories = live.start(), built.start()
     for k in range(60):
@@ -186,20 +127,9 @@ def test_a_stepper_refuses_numbers_and_keeps_the_old_ones():
         stepper.change({"deformation.gian": -0.3})
 
 
-def test_a_number_that_a_controller_has_itself_is_its_own_in_a_comparison():
-    """The others follow the problem's, as each would in a run; where all have their own the problem's stays."""
-    own = cast(Any, replace)(by_plan(), cost=brief().cost)
-    task = replace(tasks.two_mass, controllers={"own": own, "shared": by_plan(), "torque": by_torque()})
-    path = "cost.states.q1"
-    both, one = with_numbers_of_all(task, {path: 7.0}), with_numbers_of_all(task, {path: 7.0}, ["own"])
-    assert [content_at(t.controllers["own"], path) for t in (both, one)] == [7.0, 7.0]
-    assert [content_at(t.problem, path) for t in (both, one)] == [7.0, content_at(brief(), path)]
-    assert cast(Any, both.controllers["shared"]).cost is None
-
-
 def jumps(controller, numbers, signal):
     """Change of a signal by other numbers in the cycle of the change, and its largest change per cycle before."""
-    ready = simulator(replace(brief(), duration=1.5), controller, live=list(numbers))
+    ready = fp.simulator(replace(brief(), duration=1.5), controller, live=list(numbers))
     changed, plain = ready.run(seed=0, changes={1.0: numbers}), ready.run(seed=0)
     usual = np.abs(np.diff(plain[signal][500:1000], axis=0)).max()
     return (changed[signal] - plain[signal])[1000], usual, plain
@@ -236,66 +166,15 @@ def test_gains_scales_weights_and_limits_change_without_a_jump(name, numbers):
     assert np.abs(jump).max() <= 4 * usual
 
 
-def test_a_search_among_whole_numbers_builds_a_loop_for_each(tmp_path):
-    """Iterations decide what the code is."""
-    spans: dict[str, dict[str, fp.Span | fp.LogSpan]] = {
-        "RHC+FPI": {"optimiser.iterations": fp.Span(1, 3), "deformation.gain": fp.LogSpan(-1.0, -0.1)}
-    }
-    tuned = tune(replace(tasks.two_mass, problem=brief(), tuning=spans), trials=1, seed=0, folder=tmp_path)
-    best = tuned.settings()["RHC+FPI"]
-    assert best["optimiser.iterations"] in (1, 2, 3)
-    assert fp.with_settings(tasks.two_mass.controllers["RHC+FPI"], best) is not None  # is no fraction
-
-
 def test_a_compiler_that_fails_is_an_error(monkeypatch):
     """A loop without live settings runs in the virtual machine then; one with live settings must not hide what went wrong."""
     monkeypatch.setenv("FPIRHC_CC", "false")
     short = replace(brief(), duration=0.01)
-    assert not simulator(short, by_torque()).compiled
+    assert not fp.simulator(short, by_torque()).compiled
     with pytest.raises(CompileError):
-        simulator(short, by_torque(), live=["deformation.gain"])
+        fp.simulator(short, by_torque(), live=["deformation.gain"])
     monkeypatch.setenv("FPIRHC_CC", "none")
-    assert not simulator(short, by_torque(), live=["deformation.gain"]).compiled
-
-
-def test_nan_is_found_in_scalar_code_graphs_and_calls():
-    """The constant that CasADi makes of a symbol, wherever it stands."""
-    x, m = ca.SX.sym("x"), ca.MX.sym("m")
-    lost = ca.Function("lost", [x], [x + float("nan")])
-    assert holds_nan(lost)
-    assert holds_nan(ca.Function("graph", [m], [m + ca.MX(ca.DM([1.0, float("nan")]))]))
-    assert holds_nan(ca.Function("caller", [m], [2 * lost(m)]))
-    assert not holds_nan(ca.Function("fine", [m], [2 * m]))
-
-
-def test_a_live_number_refuses_to_be_a_number():
-    """Each way in which Python and numpy would take its number names the setting."""
-    number = live_number("deformation.gain", -0.5)
-    ways = (
-        float,
-        int,
-        bool,
-        round,
-        math.exp,
-        math.floor,
-        lambda n: n > 0,
-        lambda n: n == 0,
-        lambda n: n % 1,
-        lambda n: 2.0**n,
-        lambda n: n**0.5,
-        lambda n: f"{n:g}",
-        lambda n: range(n),
-        lambda n: np.array([n], dtype=float),
-        lambda n: np.array([1.0]) * n,
-        lambda n: float(2 * n + 1),
-    )
-    for way in ways:
-        with pytest.raises(NotSupported, match=r"'deformation\.gain'"):
-            way(number)
-    formula = 1 - 2 * number**2 / abs(number)
-    assert formula.value == 1 - 2 * 0.25 / 0.5
-    assert isinstance(formula * ca.MX.sym("m"), ca.MX)
-    assert isinstance(ca.SX.sym("x") - formula, ca.SX)
+    assert not fp.simulator(short, by_torque(), live=["deformation.gain"]).compiled
 
 
 MASS = "reality.plant.parameters.m.exact"
@@ -322,3 +201,29 @@ def test_a_plant_becomes_heavier_during_a_run():
         after = moves(run["reality_state"][k], run["command"][k], [1.5 if k >= at else 1.0, 3.0], [0.0, 0.0])
         np.testing.assert_allclose(run["reality_state"][k + 1], after.full().ravel(), rtol=1e-12)
     assert run.in_force[1][1][MASS] == 1.5
+
+
+CHANGED = {0.1: {"deformation.gain": -0.9}, 0.2: {"deformation.gain": -0.9, "deformation.scale": 3.0}}
+
+
+def test_limits_count_from_when_they_are_in_force():
+    """The share of cycles at a limit is that of cycles that were clipped, also where the limit comes during the run."""
+    problem = replace(tasks.two_mass.problem, duration=0.2, measure_from=0.05)
+    ready = fp.simulator(problem, tasks.two_mass.controllers["CTC"], live=["limits.inputs.Q1"], compiled=False)
+    free = ready.run(seed=0)["command.Q1"]
+    run = ready.run(seed=0, changes={0.1: {"limits.inputs.Q1": (-200.0, float(free[len(free) // 2 :].min()))}})
+    counts = run["clipped"][np.round(run.time / problem.period) >= round(0.05 / problem.period)]
+    assert fp.measure(problem, run).at_limit == counts.mean() > 0.2
+
+
+def test_a_run_knows_what_was_in_force_when(tmp_path):
+    """Times of cycles and all numbers; a run without live settings has none; a file keeps them."""
+    run = fp.simulate(brief(), by_torque(), seed=0, compiled=False, changes=CHANGED)
+    gain, scale = CHANGED[0.2]
+    first = {gain: by_torque().deformation.gain, scale: by_torque().deformation.scale}
+    expected = [(0.0, first), (0.1, first | CHANGED[0.1]), (0.2, CHANGED[0.2])]
+    assert [(time, dict(numbers)) for time, numbers in run.in_force] == expected
+    run.save(tmp_path / "run.npz")
+    assert fp.load_run(tmp_path / "run.npz").in_force == run.in_force
+    controllers = tasks.two_mass.controllers
+    assert fp.simulate(brief(), controllers["CTC"], seed=0, compiled=False).in_force == ()

@@ -11,9 +11,7 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import DeadTime, simulator
 from fpirhc.contracts import Controller
-from fpirhc.errors import InvalidProblem, InvalidValue
 
 LONGEST = {"Q1": 0.012, "Q2": 0.02, "measurement": 0.008}  # s; cycles of 1 ms
 queued = cache(
@@ -21,7 +19,7 @@ queued = cache(
         tasks.two_mass.problem,
         duration=0.2,
         measure_from=0.0,
-        dead_time=DeadTime(inputs={"Q1": 0.003, "Q2": 0.0}, measurement=0.002, longest=LONGEST),
+        dead_time=fp.DeadTime(inputs={"Q1": 0.003, "Q2": 0.0}, measurement=0.002, longest=LONGEST),
     )
 )
 PLANT = ["dead_time.inputs.Q1", "dead_time.inputs.Q2", "dead_time.measurement"]
@@ -47,39 +45,24 @@ def same_signals(one: fp.Run, other: fp.Run) -> bool:
 def test_a_dead_time_that_is_set_is_the_one_that_is_built(name, compiled):
     """Whole and broken cycles, none at all, and the longest; the rebuilt loop has queues of its own length."""
     controller, rng = tasks.two_mass.controllers[name], np.random.default_rng(3)
-    ready = simulator(queued(), controller, compiled=compiled, live=PLANT)
-    plain = simulator(queued(), controller, compiled=compiled).run(seed=0)
+    ready = fp.simulator(queued(), controller, compiled=compiled, live=PLANT)
+    plain = fp.simulator(queued(), controller, compiled=compiled).run(seed=0)
     assert same_signals(ready.run(seed=0), plain)
     cases = [(0.0, 0.0, 0.0), tuple(rng.uniform(0, 1, 3) * list(LONGEST.values())), (0.012, 0.02, 0.008)]
     cases = cases[:2] if name == "RHC+FPI" else [*cases, (0.005, 0.011, 0.003)]
     for q1, q2, seen in cases:
         numbers: dict[str, Any] = dict(zip(PLANT, map(float, (q1, q2, seen)), strict=True))
-        own = replace(queued(), dead_time=DeadTime(inputs={"Q1": float(q1), "Q2": float(q2)}, measurement=float(seen)))
-        rebuilt = simulator(own, controller, compiled=compiled).run(seed=0)
+        own = replace(
+            queued(), dead_time=fp.DeadTime(inputs={"Q1": float(q1), "Q2": float(q2)}, measurement=float(seen))
+        )
+        rebuilt = fp.simulator(own, controller, compiled=compiled).run(seed=0)
         assert same_signals(ready.run(seed=0, settings=numbers), rebuilt), numbers
         assert rebuilt.cycles == 200
 
 
-@pytest.mark.parametrize(
-    ("built", "second"), [(0.003, 0.003), (0.003, 0.007), (0.0, 0.0)], ids=["alike", "different", "none in the build"]
-)
-def test_a_form_that_leaves_its_dead_time_to_the_problem_follows_the_one_in_force(built, second):
-    """Also where all inputs had one dead time in the build, or none, and have several in the run."""
-    controller = fp.ComputedTorque(fp.Exponential(rate=3.0), fp.ModelReferenced(fp.Affine(gain=-0.2)))
-    longest = {} if built else {"Q1": LONGEST["Q1"]}
-    problem = replace(queued(), dead_time=DeadTime(inputs={"Q1": built, "Q2": second}, longest=longest))
-    ready = simulator(problem, controller, live=PLANT[:1], compiled=False)
-    for first in (0.003, 0.0045, 0.002, 0.006):
-        run = ready.run(seed=0, settings={PLANT[0]: first})
-        own = replace(problem, dead_time=DeadTime(inputs={"Q1": first, "Q2": second}, longest={}))
-        rebuilt = simulator(own, controller, compiled=False).run(seed=0)
-        assert same_signals(run, rebuilt), first
-        assert np.abs(run["command"]).max() > 1
-
-
 def test_a_dead_time_that_changes_during_a_run_reads_another_place_of_the_queue():
     """The command that acts is that of d cycles before, whatever d was earlier; before the run it is the one of the problem."""
-    ready = simulator(queued(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], live=PLANT[:1])
+    ready = fp.simulator(queued(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], live=PLANT[:1])
     run = ready.run(seed=0, changes={0.05: {PLANT[0]: 0.011}, 0.1: {PLANT[0]: 0.0}, 0.15: {PLANT[0]: 0.0025}})
     command, arriving = run["command"][:, 0], run["arriving"][:, 0]
     before = queued().inputs_before[0]
@@ -97,10 +80,10 @@ def test_an_estimator_waits_for_its_samples_behind_the_dead_time_in_force(compil
     sensing = fp.Sensing(estimator=fp.PositionDifference())
     problem = replace(queued(), sensing=sensing)
     controller = fp.ComputedTorque(fp.Exponential(rate=4.0), fp.Sigmoid(gain=-0.2, scale=20.0))
-    ready = simulator(problem, controller, compiled=compiled, live=PLANT[2:])
+    ready = fp.simulator(problem, controller, compiled=compiled, live=PLANT[2:])
     for late in (0.0, 0.0031, 0.008):
         own = replace(problem, dead_time=replace(problem.dead_time, measurement=late))
-        rebuilt = simulator(own, controller, compiled=compiled).run(seed=0)
+        rebuilt = fp.simulator(own, controller, compiled=compiled).run(seed=0)
         assert same_signals(ready.run(seed=0, settings={PLANT[2]: late}), rebuilt), late
 
 
@@ -142,14 +125,14 @@ def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
     own, path, values = BELIEFS[name]
     shipped = cast(Any, tasks.delayed_mass.controllers)
     controller = replace(shipped[own], longest=0.08) if isinstance(own, str) else own
-    dead_time = DeadTime(inputs={"Q": 0.06}, longest={"Q": 0.1})
+    dead_time = fp.DeadTime(inputs={"Q": 0.06}, longest={"Q": 0.1})
     problem = replace(tasks.delayed_mass.problem, duration=0.15, measure_from=0.0, dead_time=dead_time)
-    ready = simulator(problem, controller, compiled=compiled, live=[path, "dead_time.inputs.Q"])
-    assert same_signals(ready.run(seed=0), simulator(problem, controller, compiled=compiled).run(seed=0))
+    ready = fp.simulator(problem, controller, compiled=compiled, live=[path, "dead_time.inputs.Q"])
+    assert same_signals(ready.run(seed=0), fp.simulator(problem, controller, compiled=compiled).run(seed=0))
     for k, value in enumerate(values):
         numbers: dict[str, Any] = {path: value, "dead_time.inputs.Q": 0.045 + 0.01 * k}
         changed, own, _ = ready.live.changed(numbers)
-        rebuilt = simulator(changed, own, compiled=compiled).run(seed=0)
+        rebuilt = fp.simulator(changed, own, compiled=compiled).run(seed=0)
         assert same_signals(ready.run(seed=0, settings=numbers), rebuilt), numbers
         assert np.ptp(rebuilt["command"]) > 0
 
@@ -175,54 +158,11 @@ def test_what_learns_or_shifts_a_target_follows_a_dead_time_that_is_set(name):
     def late(which: int) -> fp.Problem:
         times = {path: both[which] * problem.period for path, both in cycles.items()}
         inputs = {path.removeprefix("inputs."): value for path, value in times.items() if path != "measurement"}
-        return replace(problem, dead_time=DeadTime(inputs, times.get("measurement", 0.0)))
+        return replace(problem, dead_time=fp.DeadTime(inputs, times.get("measurement", 0.0)))
 
     paths = {f"dead_time.{path}": both[1] * problem.period for path, both in cycles.items()}
-    ready = simulator(late(0), controller, compiled=False, live=list(paths))
+    ready = fp.simulator(late(0), controller, compiled=False, live=list(paths))
     first, run = ready.run(seed=0), ready.run(seed=0, settings=paths)
-    assert same_signals(first, simulator(late(0), controller, compiled=False).run(seed=0))
-    assert same_signals(run, simulator(late(1), controller, compiled=False).run(seed=0))
+    assert same_signals(first, fp.simulator(late(0), controller, compiled=False).run(seed=0))
+    assert same_signals(run, fp.simulator(late(1), controller, compiled=False).run(seed=0))
     assert not np.array_equal(first["command"], run["command"])
-
-
-def test_a_dead_time_is_live_up_to_its_stated_longest():
-    """Without a longest one there is room for twice the dead time; beyond it a number is refused before a run begins."""
-    late = tasks.delayed_mass.problem.dead_time.inputs["Q"]
-    for name, path, value in (
-        ("CTC", "dead_time.inputs.Q", late),
-        ("CTC+FPI paired", "deformation.cycles", 60.0),
-        ("RHC", "inputs", late),
-    ):
-        short = replace(tasks.delayed_mass.problem, duration=0.15, measure_from=0.0)
-        roomy = simulator(short, tasks.delayed_mass.controllers[name], compiled=False, live=[path])
-        roomy.run(seed=0, settings={path: 2 * value}, variant=replace(short, duration=0.1))
-        with pytest.raises((InvalidValue, InvalidProblem), match="longest"):
-            roomy.run(seed=0, settings={path: 2.1 * value})
-    ready = simulator(queued(), tasks.two_mass.controllers["CTC"], compiled=False, live=PLANT)
-    for value, words in (
-        (0.0123, "longer than its stated longest"),
-        (-0.001, "at least 0"),
-        (float("inf"), "cannot become"),
-    ):
-        with pytest.raises((InvalidProblem, InvalidValue), match=words):
-            ready.run(seed=0, settings={PLANT[0]: value})
-    with pytest.raises(InvalidValue, match="the variant states"):
-        ready.run(seed=0, variant=replace(queued(), dead_time=DeadTime(longest={"Q1": 0.1})))
-    with pytest.raises(InvalidProblem, match="longest"):
-        replace(queued(), dead_time=DeadTime(longest={"Q1": 0.0}))
-    with pytest.raises(InvalidProblem, match=r"longest.*'Q3'"):
-        replace(queued(), dead_time=DeadTime(longest={"Q3": 0.1}))
-    with pytest.raises(InvalidValue, match=r"Paired.*longest"):
-        fp.Paired(SIGMOID, cycles=60, longest=50)
-    with pytest.raises(InvalidValue, match=r"Predicted\(longest"):
-        fp.Predicted(fp.ComputedTorque(LAW), inputs=0.06, longest=0.05)
-
-
-def test_a_device_keeps_its_belief_where_another_is_refused():
-    controller = fp.ComputedTorque(LAW, fp.Paired(SIGMOID, cycles=5, longest=9))
-    stepper = fp.Stepper(tasks.delayed_mass.problem, controller, compiled=False, live=["deformation.cycles"])
-    assert stepper.change({"deformation.cycles": 7.5})
-    assert not stepper.change({"deformation.cycles": 9.5})
-    assert not stepper.change({"deformation.cycles": -1.0})
-    assert stepper.refused == 2
-    assert stepper.numbers == {"deformation.cycles": 7.5}

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from fractions import Fraction
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import simulator
-from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, InvalidShape, InvalidValue
-from fpirhc.fields.kinds import real_number
+from fpirhc.errors import (
+    InvalidField,
+    InvalidName,
+    InvalidProblem,
+    InvalidShape,
+    InvalidValue,
+    NotContractive,
+    NotSupported,
+)
 
 aimed = cache(
     lambda: replace(
@@ -35,27 +41,6 @@ def sample(stepper):
     """Arguments of a step at rest."""
     size = stepper.signals["desired"].size
     return 0.0, np.array(aimed().start_state), np.zeros(size), stepper.start()
-
-
-NUMBERS: list[tuple[object, float | None]] = [
-    (3, 3.0),
-    (0.5, 0.5),
-    (np.float32(0.5), 0.5),
-    (np.int8(-3), -3.0),
-    (np.array([[2.0]]), 2.0),
-    (Fraction(1, 4), 0.25),
-    (float("inf"), float("inf")),
-]
-NO_NUMBERS: list[object] = [HUGE, True, np.bool_(False), "1", None, 1j, [1.0], {}, np.zeros(2), Fraction(HUGE)]
-NO_NUMBERS += [np.timedelta64(1, "s"), np.datetime64("2020-01-01"), np.ma.array([1.0], mask=True)]
-
-
-@pytest.mark.parametrize(
-    ("value", "number"), [*NUMBERS, *((no, None) for no in NO_NUMBERS)], ids=lambda v: repr(v)[:20]
-)
-def test_what_counts_as_one_real_number(value, number):
-    """What Python and numpy have as real numbers, and nothing that only converts to one."""
-    assert real_number(value) == number
 
 
 REFUSED = [
@@ -154,7 +139,7 @@ RUNS = [
 @pytest.fixture(scope="module")
 def loop():
     """A loop with a gain that is live."""
-    return simulator(aimed(), adaptive(), compiled=False, live=[GAIN])
+    return fp.simulator(aimed(), adaptive(), compiled=False, live=[GAIN])
 
 
 @pytest.mark.parametrize(("given", "error", "words"), RUNS, ids=lambda v: str(v)[:30])
@@ -163,3 +148,42 @@ def test_wrong_numbers_of_a_run_are_named(given, error, words, loop):
     for run in (lambda: loop.run(seed=0, **given), lambda: fp.simulate(aimed(), adaptive(), seed=0, **given)):
         with pytest.raises(error, match=words):
             run()
+
+
+LIVE = [
+    ("RHC+FPI", "deformation.gian", InvalidName, "gain"),
+    ("RHC+FPI", "start.q1", InvalidName, "data of every loop"),
+    ("RHC+FPI", "cost.states.q3", InvalidName, "q1"),
+    ("RHC+FPI", "optimiser.iterations", NotSupported, "what the loop is made of"),
+    ("RHC+FPI", "deformation", InvalidValue, "go on with one of"),
+    ("CTC", "cost.states.q1", NotSupported, "does not use it"),
+    ("CTC", "referense.rate", InvalidName, "reference"),
+]
+
+
+@pytest.mark.parametrize(("name", "path", "error", "words"), LIVE, ids=[w[1] for w in LIVE])
+def test_what_cannot_be_live_is_refused_by_name(name, path, error, words):
+    """A setting that is needed as a number would become NaN in CasADi, without an error."""
+    with pytest.raises(error, match=words):
+        fp.simulator(aimed(), tasks.two_mass.controllers[name], compiled=False, live=[path])
+
+
+def test_numbers_are_checked_at_every_change():
+    """Unknown names, numbers outside a setting's range, infinite limits and gains that diverge."""
+    live = ["deformation.gain", "cost.states.q1", "limits.inputs.Q1.1", "optimiser.tolerance"]
+    ready = fp.simulator(aimed(), tasks.two_mass.controllers["RHC+FPI"], live=live, compiled=False)
+    cases: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
+        ({"deformation.gian": 1.0}, InvalidName, "deformation.gain"),
+        ({"deformation.shift": 0.2}, InvalidName, "not live"),
+        ({"deformation.gain": 0.0}, InvalidValue, "other than zero"),
+        ({"deformation.gain": 0.5}, NotContractive, "gain"),
+        ({"cost.states.q1": -1.0}, InvalidProblem, "at least 0"),
+        ({"limits.inputs.Q1.1": float("inf")}, InvalidValue, "use a large one"),
+        ({"limits.inputs.Q1.1": -400.0}, InvalidProblem, "above upper"),
+        ({"optimiser.tolerance": 1e-15}, InvalidValue, "rounded"),
+    )
+    for numbers, error, words in cases:
+        with pytest.raises(error, match=words):
+            ready.run(seed=0, settings=numbers)
+    with pytest.raises(InvalidValue, match="expected a time"):
+        ready.run(seed=0, changes={99.0: {"deformation.gain": -0.4}})
