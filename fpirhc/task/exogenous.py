@@ -19,6 +19,7 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
@@ -194,17 +195,15 @@ def signals_of_models() -> Iterator[None]:
         _OF_MODELS.reset(token)
 
 
-_LOOKS = 8  # at a signal within a step
+_LOOKS = 8, 128  # at a signal within a step: fewest and most, a pulse between two of which nobody sees
 _MOST_STEPS = 20_000  # that are looked at
-_HELD_WELL = 0.1  # share of a signal's range by which its mean over a step may differ from the value in its middle, which is held
+_HELD_WELL = 0.1  # share of the range of its means over steps by which one may differ from the value in the middle, which is held
 
 
-def check_held(plant: Plant, signals: Mapping[str, Exogenous], duration: float, period: float, steps: int) -> None:
-    """Raise for a signal that changes within a step of what moves: the value in the middle of every step acts all through it.
-
-    Args:
-        plant: that moves.
-        steps: of its own in a cycle.
+def check_held(
+    plant: Plant, signals: Mapping[str, Exogenous], duration: float, period: float, steps: int, own: Integrator
+) -> None:
+    """Raise for a signal that changes within one of the `steps` of what moves in a cycle: the value in its middle acts all through.
 
     Raises:
         InvalidProblem: names the signal, and the first such cycle.
@@ -215,19 +214,22 @@ def check_held(plant: Plant, signals: Mapping[str, Exogenous], duration: float, 
     places = [plant.parameter.elements.index(name) for name in names]
     count, step, mistakes = round(duration / period) * steps, period / steps, Mistakes("")
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).astype(int))
-    inside = (np.append(np.arange(_LOOKS), (_LOOKS - 1) / 2) + 0.5) / _LOOKS  # and the middle
-    looks = rows_of(values, ((chosen[:, None] + inside) * step).ravel(), plant.exact)[:, places]
-    looks = looks.reshape(len(chosen), len(inside), len(places))
-    off = np.abs(looks[:, :-1].mean(axis=1) - looks[:, -1]) / np.maximum(np.ptp(looks, axis=(0, 1)), 1e-300)
+    many = int(np.clip(_LOOKS[0] * _MOST_STEPS / len(chosen), *_LOOKS))
+    inside = (np.append(np.arange(many), (many - 1) / 2) + 0.5) / many  # and the middle
+    rows = rows_of(values, ((chosen[:, None] + inside) * step).ravel(), plant.exact)
+    looks = rows[:, places].reshape(len(chosen), len(inside), len(places))
+    means, range_ = looks[:, :-1].mean(axis=1), np.ptp(looks, axis=(0, 1))
+    arrives = np.maximum(np.ptp(means, axis=0), (1e-2 if len(chosen) > 1 else 1.0) * range_)  # a short pulse is high
+    off = np.abs(means - looks[:, -1]) / np.maximum(arrives, 1e-9 * np.abs(looks).max(axis=(0, 1)) + 1e-300)
     for k, name in enumerate(names):
         if off[:, k].max() > _HELD_WELL:
             first = chosen[int(np.argmax(off[:, k] > _HELD_WELL))]
             cycle, unit = first // steps, plant.time_unit
-            shorter = f"Reality(..., integrator=RungeKutta4(substeps={2 * steps}))"
+            finer = f"{type(own).__name__ if hasattr(own, 'substeps') else 'Collocation'}(substeps={2 * steps})"
             mistakes.add(
                 f"signals: '{name}' changes within the step of {step:g} {unit} at t = {first * step:g} {unit} (cycle {cycle}), and "
                 "the value in its middle would act all through it; let it change between steps, or give a reality finer steps, "
-                + ("a map with a shorter step" if plant.step else shorter)
+                + ("a map with a shorter step" if plant.step else f"Reality(..., integrator={finer})")
             )
     mistakes.raise_if_any()
 

@@ -132,6 +132,7 @@ class Problem(Checked):
         mistakes.unknown(f"disturbances: {disturbed(plant)}", self.disturbances, names)
         instants = np.array([0.0, self.period])
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
+        held = self.duration, self.period, self.signal_steps, self.real_integrator
         checks = (
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
@@ -141,9 +142,7 @@ class Problem(Checked):
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.reality.check(plant, *self._needed) if self.reality else None,
-            lambda: check_held(
-                self.real_plant, {} if self.foreign else self.signals, self.duration, self.period, self.signal_steps
-            ),
+            lambda: check_held(self.real_plant, {} if self.foreign else self.signals, *held),
         )
         for name, one in self.disturbances.items():
             with mistakes.caught(f"disturbances: '{name}': "):

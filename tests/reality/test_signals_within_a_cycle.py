@@ -43,7 +43,12 @@ def flowing():
     )
 
 
-def problem(plant, reality, signal=pulse):
+def short(t):
+    """The same in nine seconds of the cycle from 5 to 10, between whole shares of it."""
+    return 200.0 / 3 * ca.logic_and(t >= 8.2, t < 8.35)
+
+
+def problem(plant, reality, signal=pulse, **more):
     return fp.Problem(
         plant=plant,
         reality=reality,
@@ -52,6 +57,7 @@ def problem(plant, reality, signal=pulse):
         period=PERIOD,
         duration=60.0,
         signals={"eaten": fp.Unknown(signal)},
+        **more,
     )
 
 
@@ -61,8 +67,9 @@ def problem(plant, reality, signal=pulse):
         problem(stored(PERIOD), fp.Reality(stored(1.0))),
         problem(flowing(), fp.Reality(flowing(), integrator=fp.RungeKutta4(substeps=5))),
         problem(flowing(), fp.Reality(flowing(), integrator=fp.Euler(substeps=10))),
+        problem(flowing(), fp.Reality(flowing(), integrator=fp.Collocation(substeps=5))),
     ],
-    ids=["map", "Runge-Kutta", "Euler"],
+    ids=["map", "Runge-Kutta", "Euler", "collocation"],
 )
 def test_what_is_stated_is_what_arrives(task):
     """All 10 units, in the cycle in which they come; the signal that is shown is the mean over the cycle."""
@@ -79,6 +86,13 @@ def test_what_is_stated_is_what_arrives(task):
         (lambda: problem(stored(PERIOD), None), "a map with a shorter step"),
         (lambda: problem(flowing(), None), r"substeps=2"),
         (lambda: problem(flowing(), fp.Reality(flowing(), integrator=fp.RungeKutta4(substeps=2))), r"substeps=4"),
+        (lambda: problem(flowing(), None, short), r"substeps=2"),
+        (lambda: problem(flowing(), None, integrator=fp.Cvodes()), r"integrator=Collocation\(substeps=2\)"),
+        (
+            lambda: problem(flowing(), fp.Reality(flowing(), integrator=fp.Cvodes())),
+            r"integrator=Collocation\(substeps=2\)",
+        ),
+        (lambda: problem(flowing(), None, integrator=fp.Collocation(3)), r"integrator=Collocation\(substeps=2\)"),
     ],
 )
 def test_a_signal_that_changes_within_a_step_is_named_with_its_cycle(task, fix):
