@@ -10,7 +10,6 @@ import pytest
 from helpers.plants import pendulum
 
 import fpirhc as fp
-from fpirhc.errors import InvalidValue
 
 
 def _after(integrator, period, cycles):
@@ -119,11 +118,3 @@ def test_work_of_collocation_grows_as_the_coupling_of_the_states():
     once, thrice = (step(20, newton)(x, [2.0], [], [0.0] * 20).full() for newton in (1, 3))
     np.testing.assert_allclose(once, thrice, rtol=1e-10)
     np.testing.assert_allclose(once.mean(), x.mean() + 0.1 * 2.0 / 20, rtol=1e-10)  # the heat stays in the rod
-
-
-@pytest.mark.parametrize("method", [fp.Euler, fp.RungeKutta4, fp.Collocation])
-def test_counts_are_checked(method):
-    with pytest.raises(InvalidValue, match="expected a whole number from 1 to"):
-        method(0)
-    assert method(3).finer(2) == method(6)
-    assert method(600).finer(2) is None  # beyond what there may be

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 
 import fpirhc as fp
-from fpirhc.errors import NotInvertible
 
 EFFECT = np.array([[1.0, 1.0, 1.0], [-0.5, 0.5, 0.2]])
 DEARNESS = np.array([1.0, 1.0, 4.0])
@@ -75,16 +73,3 @@ def test_the_loop_is_that_of_numpy_and_scipy():
         np.testing.assert_allclose(run["state"][k], state, rtol=1e-7, atol=1e-9)
         pushed = EFFECT @ (STRENGTH[1] * thrusts) / inertias[:, 1]
         state = solve_ivp(lambda _, x, a=pushed: [*x[2:], *a], (0, PERIOD), state, rtol=1e-10, atol=1e-12).y[:, -1]
-
-
-def test_the_message_says_how():
-    """Of three inputs for two coordinates: the refusal names them, and the page that has the formula."""
-    plant = fp.Plant(
-        coordinates={"x": "m", "heading": "rad"},
-        inputs={"left": "N", "right": "N", "bow": "N"},
-        order=2,
-        response=lambda q, v, u, p: {"x": u.left + u.right + u.bow, "heading": u.right - u.left},
-        parameters={},
-    )
-    with pytest.raises(NotInvertible, match=r"3 inputs \(left, right, bow\).*by weights.*docs/plants.md"):
-        _ = plant.controlled_names

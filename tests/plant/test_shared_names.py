@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc import Run
-from fpirhc.conformance import check_plant
+from fpirhc.conformance import check_plant, examples
 from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError, InvalidProblem, NotContractive
-from fpirhc.horizon.transcription import transcribe
-from fpirhc.members import examples
-from fpirhc.probing.recording import read_recording
-from fpirhc.task.external_plant import Body
 
 JOINTS = ("shoulder", "elbow")
 CONTROLLER = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.ModelReferenced(fp.Affine(gain=-0.5)))
@@ -69,7 +62,7 @@ FORMS = {
     "encoder": lambda one: replace(one, sensing=fp.Sensing(estimator=fp.PositionDifference())),
     "another plant": lambda one: replace(one, reality=fp.Reality(one.plant)),
 }
-MAPS = examples("deformations", fp.Affine(gain=-0.3))
+MAPS = examples("deformations", fp.Affine(gain=-0.3))[::4]
 
 
 @pytest.mark.parametrize(
@@ -93,26 +86,12 @@ def test_a_run_is_that_of_other_names(form):
             assert np.array_equal(shared[name], other[name], equal_nan=True), name
 
 
-def outcome(problem: fp.Problem, controller: Controller) -> Run | type[FpirhcError]:
+def outcome(problem: fp.Problem, controller: Controller) -> fp.Run | type[FpirhcError]:
     """The run, or the class of the refusal."""
     try:
         return fp.simulate(problem, controller, seed=0, compiled=False)
     except FpirhcError as error:
         return type(error)
-
-
-def test_a_problem_shows_the_limits_of_motor_and_joint():
-    """As many intervals as with names of their own, each in its unit."""
-    pages = [one._repr_html_() for one in (SHARED, OTHER)]
-    for interval in ("-5 to 5 N m<", "-2 to 2 rad<", "-60 to 60 N m/s<"):
-        assert pages[0].count(interval) == pages[1].count(interval) > 0
-
-
-@pytest.mark.parametrize(("what", "unit"), [("command.shoulder", "N m s"), ("error.shoulder", "rad s")])
-def test_a_figure_has_the_unit_of_motor_or_joint(what, unit):
-    metric = fp.figures.Total(what)
-    assert callable(metric.unit)
-    assert metric.unit(SHARED, "") == unit
 
 
 def test_limits_inside_a_stage_of_several_steps_are_those_of_the_state():
@@ -140,16 +119,12 @@ def test_limits_inside_a_stage_of_several_steps_are_those_of_the_state():
             duration=1.0,
             horizon=fp.Horizon(stages=2, step=0.3),
             cost=fp.Quadratic(outputs={"depth": 1.0}),
-            limits=fp.Limits(states={"level": (-1.0, 2.0)}),
+            limits=fp.Limits(states={"level": (-1.0, 1.05)}),
         )
-        assert one.horizon is not None
-        assert one.cost is not None
-        ocp = transcribe(one.plant, one.reference, one.horizon, one.cost, one.limits, start=one.start_state)
-        assert ocp.state.elements[2:] == ("level, step 1", "level, step 2")
-        s, data = np.array([0.5, 3.0, 0.0, 0.0]), ocp.nodes[2][:, 0]
-        stages.append(np.asarray(ocp.dynamics(s, np.array([-7.0]), data).full()).ravel())
-    np.testing.assert_array_equal(stages[0], stages[1])
-    assert stages[0][2:] == pytest.approx([0.8, 1.03])
+        stages.append(fp.simulate(one, fp.RecedingHorizon(fp.FixedPoint(10, 1e-6)), seed=0, compiled=False))
+    for name in ("state", "command", "planned"):
+        np.testing.assert_array_equal(stages[0][name], stages[1][name])
+    assert stages[0]["state.level"].max() < 1.05 + 1e-4  # 1.2 without the limit
 
 
 def test_disturbances_act_where_they_are_said_to():
@@ -178,38 +153,6 @@ def test_disturbances_act_where_they_are_said_to():
 def test_a_bare_name_is_refused_where_it_is_ambiguous(changes, message):
     with pytest.raises(InvalidProblem, match=message):
         replace(SHARED, **changes)
-
-
-def unused(parameters: Mapping[str, float], seed: int) -> Body:
-    """Nothing runs."""
-    raise AssertionError
-
-
-def test_the_model_of_an_external_plant_takes_what_the_body_has():
-    """Nothing but inputs of a body can be disturbed: the bare name is the input's, and its model is still a problem."""
-    measures = {**dict.fromkeys(JOINTS, "rad"), **{f"{name}'": "rad/s" for name in JOINTS}}
-    measures |= {f"{name}''": "rad/s^2" for name in JOINTS}
-    body = fp.ExternalPlant(make=unused, measures=measures)
-    step = fp.Step(at=0.1, size=1.0)
-    problem = replace(SHARED, reality=body, disturbances={"elbow": step})
-    assert problem.of_model.disturbances == {"input elbow": step}
-
-
-def test_a_recording_names_the_commands(tmp_path: Path):
-    """Columns of commands are 'input NAME' beside the coordinate's own; without them they are asked for by that name."""
-    run = fp.simulate(SHARED, CONTROLLER, seed=0, compiled=False)
-    columns = {"time": run.time, **{e: run["state"][:, k] for k, e in enumerate(SHARED.plant.state.elements)}}
-    commands = {f"input {name}": run["command"][:, k] for k, name in enumerate(JOINTS)}
-
-    def written(values: dict[str, np.ndarray]) -> Path:
-        path = tmp_path / "run.csv"
-        np.savetxt(path, np.column_stack(list(values.values())), delimiter=",", header=",".join(values), comments="")
-        return path
-
-    record = read_recording(written({**columns, **commands}), SHARED)
-    assert record.usable.any()
-    with pytest.raises(fp.FpirhcError, match="lacks columns for input shoulder, input elbow"):
-        read_recording(written(columns), SHARED)
 
 
 def test_a_box_of_a_plant_has_both():

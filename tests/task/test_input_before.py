@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.describe import describe
 from fpirhc.errors import InvalidProblem
 
 MASS, PERIOD = 2.0, 1e-2
@@ -99,9 +98,3 @@ def test_the_response_before_the_first_cycle_is_that_of_this_input():
     np.testing.assert_allclose(run["realised.y"][:3], 3.0 / MASS, rtol=1e-12)
     seen = replace(late, sensing=fp.Sensing(sensors={"y": fp.Sensor(quantum=1e-9)}))
     np.testing.assert_allclose(fp.simulate(seen, COMPUTED, seed=0, compiled=False)["realised.y"][:3], 1.5, rtol=1e-9)
-
-
-def test_a_problem_that_does_not_give_it_has_the_settings_that_it_had():
-    """Baselines of earlier versions stay valid; a given input makes them stale."""
-    assert "input_before" not in describe(PROBLEM)
-    assert describe(replace(PROBLEM, input_before={"u": 3.0}))["input_before"] == {"u": 3.0}

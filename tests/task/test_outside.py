@@ -11,8 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fpirhc as fp
-from fpirhc.errors import InvalidField, InvalidProblem, InvalidShape, InvalidValue
-from fpirhc.symbolic.expression import expression
+from fpirhc.errors import InvalidProblem
 
 PERIOD, DURATION = 0.25, 30.0  # h
 
@@ -148,24 +147,6 @@ def test_a_preview_lowers_the_cost_of_a_known_load():
     assert costs["measured"] < 0.8 * costs["unknown"]
 
 
-def test_stages_have_values_of_their_own():
-    """Every stage of the data has the value of its middle; without preview all have that of the cycle."""
-    from fpirhc.horizon.stage_data import data_layout, stage_data
-    from fpirhc.task.exogenous import previewed_values
-
-    for preview in (True, False):
-        problem = task(room(OUTSIDE), {"ambient": fp.Known(NIGHT, preview=preview)})
-        ahead = previewed_values(problem.plant, problem.signals)
-        horizon, cost = problem.horizon, problem.cost
-        assert horizon is not None
-        assert cost is not None
-        data_of = stage_data(problem.plant, problem.reference, horizon, cost, signals=ahead)
-        table = np.asarray(data_of(5.0, problem.plant.approximate).full())
-        row = table[data_layout(problem.plant, horizon).slice("parameters")][1]
-        middles = 5.0 + (np.arange(13) + 0.5) * 2 * PERIOD
-        assert row == pytest.approx(_weather(middles) if preview else np.full(13, 283.0))
-
-
 LATE: dict[str, tuple[dict[str, Any], fp.ModelReferenced]] = {
     "ideal": ({}, fp.ModelReferenced(fp.Affine(gain=-0.5))),
     "dead time": (
@@ -265,66 +246,6 @@ def test_the_contraction_is_that_of_the_weather_of_the_cycle():
     assert logged["contraction"].ravel() == pytest.approx(expected, abs=1e-9)
 
 
-def test_values_are_looked_up_as_stated():
-    """Zero: until the next sample; linear: between them; the nearest one outside."""
-    at = ca.MX.sym("t")
-    zero, line = (
-        fp.Samples([0.0, 1.0, 3.0], [5.0, 7.0, 1.0]),
-        fp.Samples([0.0, 1.0, 3.0], [5.0, 7.0, 1.0], hold="linear"),
-    )
-    of = ca.Function("f", [expression(at)], [zero(expression(at)), line(expression(at))])
-    times = np.array([-1.0, 0.0, 0.5, 1.0, 2.0, 3.0, 9.0])
-    values = np.array([[float(v) for v in of(t)] for t in times])
-    assert values[:, 0].tolist() == [5.0, 5.0, 5.0, 7.0, 7.0, 1.0, 1.0]
-    assert values[:, 1].tolist() == [5.0, 5.0, 6.0, 7.0, 4.0, 1.0, 1.0]
-
-
-BAD = {
-    "no values": ({}, r"'ambient' \[K\] has no values"),
-    "too short": (
-        {"ambient": fp.Known(fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear"))},
-        "stated from 0 to 9, the run is from 0 to 30",
-    ),
-    "too late": ({"ambient": fp.Unknown(fp.Samples([2.0], [1.0]))}, "stated from 2 to inf"),
-    "of the model too short": (
-        {"ambient": fp.Believed(280.0, fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear"))},
-        "values of the model of 'ambient'",
-    ),
-    "unknown name": ({"ambient": fp.Known(1.0), "ambiant": fp.Known(1.0)}, "'ambiant' is unknown.*'ambient'"),
-    "a parameter": ({"ambient": fp.Known(1.0), "loss": fp.Known(1.0)}, "'loss' is a parameter; declare it as outside"),
-    "not finite": ({"ambient": fp.Known(lambda t: ca.sqrt(t - 15))}, "not finite at t = 0"),
-    "raises": ({"ambient": fp.Known(lambda t: t / (1 // 0))}, "ZeroDivisionError"),
-    "a vector": ({"ambient": fp.Known(lambda t: ca.vertcat(t, t))}, "one scalar"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_a_problem_says_what_is_wrong_with_its_signals(name):
-    signals, text = BAD[name]
-    with pytest.raises(InvalidProblem, match=text):
-        task(room(OUTSIDE), signals)
-
-
-def test_samples_say_what_is_wrong_with_them():
-    with pytest.raises(InvalidShape, match="one value per time"):
-        fp.Samples([0.0, 1.0], [1.0])
-    with pytest.raises(InvalidShape, match="at least 2"):
-        fp.Samples([0.0], [1.0], hold="linear")
-    with pytest.raises(InvalidValue, match="must increase"):
-        fp.Samples([0.0, 0.0], [1.0, 2.0])
-    with pytest.raises(InvalidField, match="expected a number"):
-        fp.Samples([0.0], [np.nan])
-
-
-def test_scenarios_do_not_draw_signals():
-    """Their values are those of the problem; the other parameters are drawn."""
-    from fpirhc.plant.plant import exact_ranges
-
-    ranges = exact_ranges(room(OUTSIDE), 20.0)
-    assert ranges["ambient"] == (283.0, 283.0)
-    assert ranges["loss"] == pytest.approx((0.24, 0.36))
-
-
 def priced(cost: Any) -> fp.Problem:
     """The room with a price of heat, which is known ahead: ten times as high from 10 h to 14 h."""
     plant = room(fp.outside(276.5, "K"))
@@ -353,9 +274,43 @@ def test_a_cost_sees_signals_from_outside():
     assert bought["economic"][1] < 0.9 * bought["flat"][1]
 
 
-def test_a_cost_asks_for_signals_by_name():
-    """Parameters of the model that are no signals are not among them."""
-    with pytest.raises(InvalidProblem, match=r"signal from outside 'prize' is unknown\. Did you mean 'price'\?"):
-        priced(fp.CustomCost(lambda view: {"heat": view.outside.prize * view.input.heat**2}))
-    with pytest.raises(InvalidProblem, match="signal from outside 'loss' is unknown"):
-        priced(fp.CustomCost(lambda view: {"heat": view.outside.loss * view.input.heat**2}))
+BAD = {
+    "no values": (lambda: task(room(OUTSIDE)), r"'ambient' \[K\] has no values"),
+    "too short": (
+        lambda: known(fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear")),
+        "stated from 0 to 9, the run is from 0 to 30",
+    ),
+    "too late": (lambda: known(fp.Samples([2.0], [1.0])), "stated from 2 to inf"),
+    "of the model too short": (
+        lambda: task(room(OUTSIDE), {"ambient": fp.Believed(280.0, fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear"))}),
+        "values of the model of 'ambient'",
+    ),
+    "unknown name": (lambda: known(1.0, ambiant=fp.Known(1.0)), "'ambiant' is unknown.*'ambient'"),
+    "a parameter": (lambda: known(1.0, loss=fp.Known(1.0)), "'loss' is a parameter; declare it as outside"),
+    "not finite": (lambda: known(lambda t: ca.sqrt(t - 15)), "not finite at t = 0"),
+    "raises": (lambda: known(lambda t: t / (1 // 0)), "ZeroDivisionError"),
+    "a vector": (lambda: known(lambda t: ca.vertcat(t, t)), "one scalar"),
+    "sizes": (lambda: fp.Samples([0.0, 1.0], [1.0]), "one value per time"),
+    "one sample": (lambda: fp.Samples([0.0], [1.0], hold="linear"), "at least 2"),
+    "order": (lambda: fp.Samples([0.0, 0.0], [1.0, 2.0]), "must increase"),
+    "no number": (lambda: fp.Samples([0.0], [np.nan]), "expected a number"),
+    "in a cost": (
+        lambda: priced(fp.CustomCost(lambda view: {"heat": view.outside.prize * view.input.heat**2})),
+        r"signal from outside 'prize' is unknown\. Did you mean 'price'\?",
+    ),
+    "a parameter in a cost": (
+        lambda: priced(fp.CustomCost(lambda view: {"heat": view.outside.loss * view.input.heat**2})),
+        "signal from outside 'loss' is unknown",
+    ),
+}
+
+
+def known(course: Any, **more: Any) -> fp.Problem:
+    return task(room(OUTSIDE), {"ambient": fp.Known(course), **more})
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_problem_says_what_is_wrong_with_its_signals(name):
+    make, text = BAD[name]
+    with pytest.raises(fp.FpirhcError, match=text):
+        make()
