@@ -32,7 +32,7 @@ class Row:
     """One row of a table."""
 
     cells: Sequence[str]  # a text for every column; '' where there is none
-    style: str = ""  # of a terminal
+    style: str = ""  # of a terminal, and a class of a page
     best: frozenset[int] = frozenset()  # places of the columns in which it is the best
 
 

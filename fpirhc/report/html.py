@@ -25,7 +25,7 @@ from fpirhc.report.figures import colours_of, contraction_figure
 from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
-from fpirhc.studies.comparison.verdict import Outcome
+from fpirhc.studies.comparison.verdict import IN_FULL, Outcome
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -124,7 +124,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     every = [Markup(script) for script in scripts]
     styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")] + [Markup(planar.styles())]
     template = _environment().get_template(name)
-    others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome is not None)
+    others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome not in IN_FULL)
     said = ", ".join(f"{count} {outcome}" for outcome, count in others.items())
     digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in scripts)
     hashes = " ".join(f"'sha256-{one}'" for one in digests)
@@ -132,7 +132,8 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    return template.render(view=view, others=said, policy=Markup(policy), styles=styles, scripts=every, **context)
+    context |= {"in_full": IN_FULL, "policy": Markup(policy)}
+    return template.render(view=view, others=said, styles=styles, scripts=every, **context)
 
 
 @cache

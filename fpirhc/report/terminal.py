@@ -27,7 +27,7 @@ from rich.text import Text
 from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
-from fpirhc.studies.comparison.verdict import Outcome
+from fpirhc.studies.comparison.verdict import IN_FULL, Outcome
 from fpirhc.summary import Column, Table, number, printable, written_out
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ STYLES = {
     Outcome.DOUBTFUL: "yellow",
     Outcome.NO_DIFFERENCE: "",
     Outcome.NOT_COMPARABLE: "dim",
+    Outcome.LIMIT_LEFT: "bold red",
     None: "",  # a remark
 }
 _IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, and what no line breaks at in their place
@@ -75,11 +76,11 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
     shown = sentences if verbose else sentences[:1]
     show_sentences(shown)
     if others := sentences[len(shown) :]:
-        outcomes = Counter(str(outcome) for _, outcome in others if outcome is not None)
+        outcomes = Counter(str(outcome) for _, outcome in others if outcome not in IN_FULL)
         say(
             f"other pairs: {', '.join(f'{count} {outcome}' for outcome, count in outcomes.items())}"
         ) if outcomes else None
-        show_sentences(one for one in others if one[1] is None)
+        show_sentences(one for one in others if one[1] in IN_FULL)
     for table in view.tables:
         if table.rows:
             narrow = replace(table.narrow, title="" if table.title == view.title else table.title)
@@ -291,7 +292,8 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
         say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
         for one in shown:
             evidence = f" ({one.evidence})" if one.evidence else ""
-            say(f"  {one.verdict:7s} {one.question}{evidence} {one.change}".rstrip())
+            text = f"  {one.verdict:7s} {one.question}{evidence} {one.change}".rstrip()
+            say(text, STYLES[Outcome.WORSE] if one.verdict == "no" else "")
     say(", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
 
 

@@ -23,7 +23,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import relative_order
 from fpirhc.review.experiments import LATENCY, PLACES, Bench
 from fpirhc.review.points import StateSlopes, needed_commands, state_slopes, whole_turns, zero_dynamics
-from fpirhc.simulation.hard_limits import hard_limits
+from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
@@ -159,6 +159,15 @@ def _inverse(case: Case) -> Fact:
     return Fact(graded(worst, 1e6, 1e12), {"condition": worst})
 
 
+def _ranges(case: Case) -> Fact | None:
+    if not case.outside:
+        return None
+    sensing = case.problem.sensing
+    shown = sensing.measures(case.problem.plant)
+    free = [n for n in shown if n not in sensing.sensors or sensing.sensors[n].range is None]
+    return Fact(Verdict.CAUTION if free else Verdict.YES, {"without": len(free), "of": len(shown)}, ", ".join(free))
+
+
 # Of a loop
 
 
@@ -185,14 +194,8 @@ def _returns(case: Case) -> Fact:
     calm = back.left <= GOOD and far.left <= GOOD and worst < 1 and step <= 0.1
     lost = back.left >= 1.05 and (far.left >= 1.05 or back.left >= 2)  # else a small cycle about the run
     verdict = Verdict.YES if calm else Verdict.NO if lost else Verdict.CAUTION
-    numbers = {
-        "left": back.left,
-        "left_of_ten_times": far.left,
-        "factor": back.factor,
-        "largest_factor": worst,
-        "mean_step": step,
-    }
-    return _mended(case, Fact(verdict, numbers))
+    numbers = {"left": back.left, "left_of_ten_times": far.left, "factor": back.factor, "largest_factor": worst}
+    return _mended(case, Fact(verdict, {**numbers, "mean_step": step}))
 
 
 def _plans(case: Case) -> Fact | None:
@@ -282,8 +285,8 @@ def _left(case: Case) -> Fact | None:
     if not followed:
         return None
     worst = max(followed, key=lambda one: float(one.beyond.max()))
-    share, most = float((worst.beyond > SLIGHT).mean()), float(worst.beyond.max())
-    verdict = Verdict.YES if most <= SLIGHT else Verdict.NO if most > 0.05 and share > 0.01 else Verdict.CAUTION
+    share, most = float((worst.beyond > TOLERANCE).mean()), float(worst.beyond.max())
+    verdict = Verdict.YES if most <= TOLERANCE else Verdict.NO
     return Fact(verdict, {"beyond": most, "share_of_cycles": share}, worst.name)
 
 
@@ -306,12 +309,12 @@ def _noise(case: Case) -> Fact | None:
     span = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.ptp(quiet["command"], axis=0), 1e-300))
     chatter = np.sqrt((steps**2).mean(axis=0)) / span
     worst = int(chatter.argmax())
-    shares = {"error_without_noise": case.bench.share(quiet), "error": case.bench.share(noisy)}
-    return Fact(
-        graded(chatter[worst], 0.01, math.inf),
-        {"rms_step": chatter[worst], **shares},
-        list(case.problem.plant.inputs)[worst],
-    )
+    numbers = {
+        "rms_step": chatter[worst],
+        "error_without_noise": case.bench.share(quiet),
+        "error": case.bench.share(noisy),
+    }
+    return Fact(graded(chatter[worst], 0.01, math.inf), numbers, list(case.problem.plant.inputs)[worst])
 
 
 # Of adaptation
@@ -417,6 +420,8 @@ QUESTIONS = (
              "Write the response as the derivative that the input acts on.", "problem"),
     Question("inverse", "Can the response be inverted where it goes?", _inverse,
              "Keep the plant away from states where inputs lose their effect.", "problem"),
+    Question("ranges", "Is it stated what working sensors show?", _ranges,
+             "State it, so that a failed sensor is not believed: Sensor(range=(lower, upper)).", "problem"),
     Question("plans", "Are its plans good enough?", _plans,
              "Give the optimiser more iterations, or a smaller tolerance, before anything else."),
     Question("gain", "Is the gain admissible?", gain_by_run, "Use the recommended gain; without one, another form.", "adaptive"),

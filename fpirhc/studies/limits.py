@@ -21,6 +21,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import AboveZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.sensing.sensing import Sensor
+from fpirhc.simulation.hard_limits import hard_limits
 from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.compare import check_gains, select
@@ -34,7 +35,7 @@ from fpirhc.task.problem import Problem
 FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
 PLANTS = 100  # drawn for every percent of 'plants'
 _NEAR, _HALVINGS = 1.05, 14
-_OUTSIDE = 0.02  # of a limit's width: a state farther outside has left it
+_OUTSIDE = 0.02  # of a limit's range: what is farther outside has left it
 _FARTHEST = 128  # cycles of latency
 
 
@@ -162,13 +163,12 @@ class Limits(Study):
         for row in rows:
             holds = "none" if math.isnan(row.holds) else number(row.holds)
             fails = "as it stands" if math.isnan(row.holds) and row.unit else number(row.fails)
-            shown.add(
-                [row.controller, f"{row.quantity} [{row.unit}]" if row.unit else row.quantity, holds, fails, row.why]
-            )
+            what = f"{row.quantity} [{row.unit}]" if row.unit else row.quantity
+            shown.add([row.controller, what, holds, fails, row.why])
         tried = self.table.loc[self.table.unit != ""]
         said = [_most(str(name), some) for name, some in tried.groupby("quantity", sort=False)]
         about = (
-            f"A run fails if it ends early, leaves a limit of a state by {in_percent(_OUTSIDE)} of its width, or has a relative "
+            f"A run fails if it ends early, leaves a hard limit by {in_percent(_OUTSIDE)} of its range, or has a relative "
             f"rms error above {in_percent(self.fails)}."
         )
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
@@ -240,15 +240,9 @@ def limits(
 
 
 def _outside(problem: Problem, run: Run) -> float:
-    """By how much a state leaves its limits, as a share of their width."""
-    signal = "plant_state" if "plant_state" in run.layout else "state"
-    late, worst = measured_cycles(problem, run), 0.0
-    for name, (lower, upper) in problem.limits.states.items() if late.any() else ():
-        values = run[f"{signal}.{name}"][late]
-        width = upper - lower if math.isfinite(upper - lower) else abs(upper if math.isfinite(upper) else lower)
-        width = width or float(np.abs(values).max()) or 1.0  # the only limit may be zero
-        worst = max(worst, float(max(lower - values.min(), values.max() - upper)) / width)
-    return worst
+    """By how much a hard limit is left where errors count, as a share of its range."""
+    late = measured_cycles(problem, run)
+    return max((float(one.beyond[late].max(initial=0.0)) for one in hard_limits(problem, run)), default=0.0)
 
 
 def _why(row: Row, fails: float) -> str:
@@ -256,7 +250,7 @@ def _why(row: Row, fails: float) -> str:
     if row["why"]:
         return str(row["why"]).partition(";")[0]
     if row["outside"] > _OUTSIDE:
-        return "a state leaves its limits"
+        return "a hard limit is left"
     return "" if row["error"] <= fails else f"error of {in_percent(row['error'])}"
 
 

@@ -85,20 +85,9 @@ class Study(ABC):
         skipped: Mapping[str, str] | None = None,
     ) -> View:
         """Return the view of these sentences, tables, lists and facts under the study's circumstances, see `View`."""
-        return View(
-            self.title,
-            self.description,
-            sentences,
-            conditions,
-            tables,
-            self.settings,
-            self.versions,
-            self.command,
-            self.elapsed,
-            facts,
-            {heading: texts for heading, texts in (lists or {}).items() if texts},
-            skipped or {},
-        )
+        own = self.settings, self.versions, self.command, self.elapsed
+        filled = {heading: texts for heading, texts in (lists or {}).items() if texts}
+        return View(self.title, self.description, sentences, conditions, tables, *own, facts, filled, skipped or {})
 
     def _repr_html_(self) -> str:
         """Verdict and first table, for notebooks."""

@@ -20,6 +20,7 @@ NAMES = {  # of numbers by key, which scripts read
     "posed": {"share_finite"},
     "orders": {"order", "stated"},
     "inverse": {"condition"},
+    "ranges": {"without", "of"},
     "plans": {"not_converged", "error", "error_with_more_iterations"},
     "gain": {"error", "error_at_half", "error_at_twice", "error_at_four_times", "recommended_times"},
     "follows": {"error", "at_a_limit", "left_with_more_iterations"},

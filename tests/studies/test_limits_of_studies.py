@@ -143,7 +143,7 @@ def test_a_state_that_leaves_its_limits_has_failed():
         duration=40.0,
         measure_from=0.0,
     )
-    assert limit_of("latency", problem).why == "a state leaves its limits"
+    assert limit_of("latency", problem).why == "a hard limit is left"
     touching = fp.Trajectory(lambda t: {"y": 0.4 * (1 - ca.cos(t))})
     above = replace(problem, reference=touching, limits=fp.Limits(states={"y": (0.0, math.inf)}))
     assert limit_of("latency", above).holds > 0

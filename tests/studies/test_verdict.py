@@ -18,6 +18,7 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
+from fpirhc.__main__ import main
 from fpirhc.contracts import Block, Controller, Deformation, Layout, closing_blocks, reference_block, scalar
 
 PERIOD, CYCLES, LIMIT = 1e-2, 400, 10.0
@@ -246,9 +247,60 @@ def test_a_hard_limit_that_a_run_breaks_is_told():
         plan = fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))
         return [n for n in fp.compare(tasks.made(one, {"p": plan}), seed=0, compiled=False)["p"].notes if "hard" in n]
 
-    assert notes(1.0) == ["q' reaches -1.5 m/s, beyond its hard limit of -1 m/s"]
-    assert notes(1e-8, 1e-8) == ["q' reaches -1.5e-08 m/s, beyond its hard limit of -1e-08 m/s"]
+    assert notes(1.0) == ["q' reaches -1.5 m/s, beyond its hard limit of -1 m/s, in 5 % of the cycles"]
+    assert notes(1e-8, 1e-8) == ["q' reaches -1.5e-08 m/s, beyond its hard limit of -1e-08 m/s, in 5 % of the cycles"]
     assert notes(2.0) == notes(1.0, **{"q'": 10.0}) == []
+
+
+SLOW = '''"""A cart twice as heavy as its model, whose speed is limited."""
+import casadi as ca
+import fpirhc as fp
+
+plant = fp.Plant({"x": "m"}, {"F": "N"}, {"mass": fp.Parameter(1.0, 2.0, "kg")}, lambda q, v, u, p: {"x": u.F / p.mass})
+limits = fp.Limits(inputs={"F": (-20.0, 20.0)}, states={"x'": (-1.5, 1.5)})
+problem = fp.Problem(plant, fp.Trajectory(lambda t: {"x": 1 - ca.cos(2 * t)}), {"x": 0.0}, period=0.01, duration=4.0,
+    limits=limits, horizon=fp.Horizon(stages=10, step=0.05), cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}))
+law, adapted = fp.ComputedTorque(fp.Exponential(6.0)), fp.ModelReferenced(fp.Affine(gain=-0.8))
+controllers = {"law": law, "law+FPI": law.with_deformation(adapted), "plan": fp.RecedingHorizon(fp.FixedPoint())}
+'''
+
+
+def test_a_hard_limit_that_is_left_is_red_for_every_controller(tmp_path, monkeypatch, capsys):
+    """The plan keeps the speed, and the laws do not know it: told first, by the run's own numbers, in every output."""
+    (tmp_path / "slow.py").write_text(SLOW)
+    monkeypatch.chdir(tmp_path)
+    task = fp.load_problem("slow.py")
+    found = fp.compare(task, seed=0, compiled=False)
+    left = [name for name in task.controllers if np.abs(found[name].run["plant_state.x'"]).max() > 1.5 * 1.002]
+    assert left == ["law", "law+FPI"]
+    assert [row.style for row in found.view.tables[0].rows] == ["red", "red", ""]
+    first, speeds = found.findings[0], found["law"].run["plant_state.x'"]
+    assert (str(first.outcome), first.ratios["x"] < 0.1) == ("hard limit left", True)
+    assert first.text.startswith(f"law leaves a limit: x' reaches {speeds[np.abs(speeds).argmax()]:.4g} m/s, beyond")
+    assert main(["compare", "slow.py", "--no-compile", "-c", "plan", "law"]) == 0
+    assert "law leaves a limit: x' reaches" in " ".join(capsys.readouterr().out.split())
+    page = next(tmp_path.rglob("report.html")).read_text()
+    assert "<tr class='red'><th scope='row'>law</th>" in page
+    assert "class='outcome-hard-limit-left'>law leaves a limit" in page
+    assert main(["review", "slow.py", "-c", "law"]) == 1
+    assert "no Do states, rates and paths keep their limits? (x', beyond" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_noise_of_the_response_costs_is_what_it_costs():
+    """One sentence about the headline; a run with a sensor of that noise has the same movement, and then nothing is said."""
+    one = tasks.van_der_pol
+    names = [*one.headline]
+    [told] = [f for f in fp.compare(one, seed=0, controllers=names).findings if "measured without noise" in f.text]
+    said = float(re.findall(r"the command moves (\S+) times", told.text)[0])
+    quiet = fp.simulate(one.problem, one.controllers[names[1]], seed=0).first(1000)
+    noise = fp.Noise(1e-3 * float(np.ptp(quiet["realised"])))
+    noisy = replace(one.problem, sensing=fp.Sensing({"q''": fp.Sensor(noise=noise)}))
+    runs = fp.simulate(noisy, one.controllers[names[1]], seed=3).first(1000), quiet
+    moved = [np.abs(np.diff(run["command"], axis=0)).sum() for run in runs]
+    assert said == pytest.approx(moved[0] / moved[1], rel=0.02)
+    assert not any(
+        "without noise" in text for text in fp.compare(replace(one, problem=noisy), seed=0, controllers=names).verdict
+    )
 
 
 # --- Plants that are not shipped ------------------------------------------------------------------------------------------

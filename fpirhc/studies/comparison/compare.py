@@ -19,9 +19,11 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
+from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
+from fpirhc.sensing.base import response_names
 from fpirhc.simulation.changes import Changes
-from fpirhc.simulation.hard_limits import hard_limits
+from fpirhc.simulation.hard_limits import Followed, limits_left
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant
@@ -34,7 +36,7 @@ from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, 
 from fpirhc.studies.comparison.verdict import Finding, Outcome, Yardstick, findings
 from fpirhc.studies.objective import objective
 from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
-from fpirhc.summary import Column, Table
+from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compiling_ahead
 from fpirhc.task.problem import Problem
@@ -66,9 +68,6 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
     mistakes.raise_if_any()
 
 
-_SLIGHT = 1e-3  # of a limit's range
-
-
 @dataclass(frozen=True)
 class Contraction:
     """The factor by which the iteration shrinks an error per cycle."""
@@ -94,6 +93,8 @@ class Entry:
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
     cycle: tuple[float, float] | None = None  # median and largest time of a cycle, us
+    left: tuple[Followed, ...] = ()  # hard limits that it leaves, the worst first
+    noise: Finding | None = None  # what noise of its response costs, where that has none
     notes: tuple[str, ...] = ()
 
     @property
@@ -147,7 +148,9 @@ class Comparison(Study):
             marked = [k for k, c in enumerate(shown, 1) if best.get(c) is not None and c.number(e.metrics) == best[c]]
             texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
             status = f"ended early: {e.run.stop}" if e.run.stop else status_shares(e.metrics.statuses)
-            table.add([e.name, *texts, f"{e.cycle[0]:.3g}" if e.cycle else "", status], best=marked)
+            status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
+            cycle = f"{e.cycle[0]:.3g}" if e.cycle else ""
+            table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
         about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
         notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
@@ -231,6 +234,8 @@ class _Rows:
         self.composed: dict[str, tuple[ComposedLoop, ComposedStep | None]] = {}
         self._loops: dict[str, Simulator] = {}
         self._model = ModelAsPlant(task.problem, seed=seed)
+        adaptive = [n for n, one in controllers.items() if one.deformation.adapts and pair_of(controllers, n)]
+        self._asked = task.headline[1] if task.headline and task.headline[1] in adaptive else next(iter(adaptive), None)
 
     def compose(self, name: str, changes: Changes, compiling: Callable[..., None]) -> None:
         """Compose a loop, and its step by hand, and start the compiler for them."""
@@ -263,20 +268,13 @@ class _Rows:
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
         cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-        notes = (*broken_limits(problem, run), *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
-        return Entry(
-            name=name,
-            run=run,
-            metrics=metrics,
-            adaptive=ready.deformation.adapts,
-            pair=pair,
-            weighed=judged,
-            exact=_has_exact_model(problem, ready),
-            contraction=contraction,
-            null=null,
-            cycle=cycle,
-            notes=notes,
-        )
+        asked = name == self._asked and not changes
+        noise = part("the run with noise", cost_of_noise, problem, ready, run) if asked else None
+        left = limits_left(problem, run)
+        told = [one.sentence for one in left]
+        notes = (*told, *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
+        adapts, exact = ready.deformation.adapts, _has_exact_model(problem, ready)
+        return Entry(name, run, metrics, adapts, pair, judged, exact, contraction, null, cycle, left, noise, notes)
 
     def _null(self, pair: str, name: str, judged: frozenset[str] | None) -> ErrorPair:
         return errors_of(*self._model.pair((self._loop(pair), self._loop(name))), judged)
@@ -296,6 +294,31 @@ def _has_exact_model(problem: Problem, controller: Controller) -> bool:
     wrong = problem.reality is not None or not np.array_equal(model.plant.approximate, model.plant.exact)
     fixed = not controller.deformation.adapts and not controller.learns
     return bool(wrong and fixed and model.plant is real and np.array_equal(model.parameters(model.plant), real.exact))
+
+
+NOISE = 1e-3  # rms of white noise, of the range of every response in the run
+
+
+def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding | None:
+    """Return what white noise of the response costs in as many cycles as a review runs; None where it has some."""
+    names, sensing = {*response_names(problem.plant)}, problem.sensing
+    right = names <= {*sensing.measures(problem.plant)} - {n for n, sensor in sensing.sensors.items() if sensor.acts}
+    if not right or not problem.equations_known or controller.deforms == "target" or run.stop is not None:
+        return None
+    bench = Bench(problem, controller, short=True)
+    quiet = run.first(bench.cycles)
+    noise = np.random.default_rng(run.seed).standard_normal(quiet["realised"].shape) * np.ptp(quiet["realised"], axis=0)
+    other = bench.run(bias=NOISE * noise, seed=run.seed)
+    before, after = bench.errors(quiet), bench.errors(other)
+    moves = bench.steps(other) / max(bench.steps(quiet), 1e-300)
+    ratios = {n: after[n] / max(e, 1e-300) for n, e in before.items()}
+    name = max(ratios, key=ratios.__getitem__)
+    return Finding(
+        f"The response of {run.controller} is measured without noise: with noise of {in_percent(NOISE)} of its range the rms error "
+        f"is {name} {before[name]:.3g} -> {after[name]:.3g}{with_space(run.unit(f'error.{name}'))}, and the command moves "
+        f"{written_out(moves)} times as much.",
+        ratios=ratios,
+    )
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
@@ -319,17 +342,6 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
     return float(np.median(taken[1:])) / 1e3, float(taken[1:].max()) / 1e3
-
-
-def broken_limits(problem: Problem, run: Run) -> tuple[str, ...]:
-    """Return by how much the run leaves each hard limit: of a state, a rate, an expression."""
-    texts = []
-    for one in hard_limits(problem, run):
-        unit = with_space(one.unit)
-        for value, limit in ((one.values.min(), one.lower), (one.values.max(), one.upper)):
-            if abs(value - min(max(value, one.lower), one.upper)) > 0 and one.beyond.max() > _SLIGHT:
-                texts.append(f"{one.name} reaches {value:.4g}{unit}, beyond its hard limit of {limit:g}{unit}")
-    return tuple(texts)
 
 
 def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -37,6 +37,10 @@ class Outcome(StrEnum):
     DOUBTFUL = "doubtful"  # a smaller error, and a reason why it is no success
     NO_DIFFERENCE = "no difference"
     NOT_COMPARABLE = "not comparable"
+    LIMIT_LEFT = "hard limit left"  # of whatever error, and of every controller
+
+
+IN_FULL = None, Outcome.LIMIT_LEFT  # of the sentences that short outputs show beside the first one
 
 
 @dataclass(frozen=True)
@@ -174,29 +178,15 @@ class Flag:
 
 
 FLAGS = (
-    Flag(_left_alone, 1.0, "its error is {0} times that of the plant left alone", doubts=True),
-    Flag(
-        _growth,
-        8.0,
-        "its error grows {0} times from the first quarter of the run to the last, as in an unstable loop",
-        doubts=True,
-    ),
-    Flag(
-        _unsolved, 0.05, "a share of {0} of its plans did not converge: give the optimiser more iterations", doubts=True
-    ),
-    Flag(
-        _at_limit,
-        0.2,
-        "its command stands at a limit for a share of {0} of the run, where no adaptation can act",
-        doubts=True,
-    ),
-    Flag(_chatters, 10.0, "its command chatters: it moves {0} times as much", doubts=True),
+    Flag(_left_alone, 1.0, "its error is {0} times that of the plant left alone", True),
+    Flag(_growth, 8.0, "its error grows {0} times from the first quarter of the run to the last, as in an unstable loop", True),
+    Flag(_unsolved, 0.05, "a share of {0} of its plans did not converge: give the optimiser more iterations", True),
+    Flag(_at_limit, 0.2, "its command stands at a limit for a share of {0} of the run, where no adaptation can act", True),
+    Flag(_chatters, 10.0, "its command chatters: it moves {0} times as much", True),
     Flag(_moves, 2.0, "its command moves {0} times as much"),
-    Flag(
-        _grows, 0.05, "its iteration is no contraction in a share of {0} of the cycles: see the gain in fpirhc review"
-    ),
-    Flag(_null, 0.0, "it makes the error of a right model {0} times as large", doubts=True),
-)
+    Flag(_grows, 0.05, "its iteration is no contraction in a share of {0} of the cycles: see the gain in fpirhc review"),
+    Flag(_null, 0.0, "it makes the error of a right model {0} times as large", True),
+)  # fmt: skip
 
 
 def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
@@ -266,6 +256,18 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     return Finding(text, outcome, names, {aim.column: ratio})
 
 
+def _limits_first(finding: Finding, *entries: Entry) -> Finding:
+    """The finding that says first who leaves a hard limit; where the last of them does, its error is no success."""
+    text = " ".join([*(leaves(e) for e in entries if e.left), finding.text])
+    kept = not entries[-1].left or finding.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)
+    return replace(finding, text=text, outcome=finding.outcome if kept else Outcome.LIMIT_LEFT)
+
+
+def leaves(entry: Entry) -> str:
+    """Return which hard limit a controller leaves, of several the worst."""
+    return f"{entry.name} leaves a limit: {entry.left[0].sentence}."
+
+
 def findings(
     entries: Sequence[Entry],
     headline: tuple[str, str] | None,
@@ -277,10 +279,13 @@ def findings(
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     pairs.sort(key=lambda p: ((p[0].name, p[1].name) != headline, "solve" not in p[1].run.layout))
-    judged = [judge_by(aim, *pair) for pair in pairs] if aim.metric is not None else []
-    judged += [judge(*pair, yard) for pair in pairs]
+    judged = [_limits_first(judge_by(aim, *pair), *pair) for pair in pairs] if aim.metric is not None else []
+    judged += [_limits_first(judge(*pair, yard), *pair) for pair in pairs]
     if not judged:
         judged = [Finding("No controller is here both with and without adaptation.", Outcome.NOT_COMPARABLE)]
+    told = {n for f in judged if f is judged[0] or f.outcome is Outcome.LIMIT_LEFT for n in f.pair or ()}
+    judged += [Finding(leaves(e), Outcome.LIMIT_LEFT) for e in entries if e.left and e.name not in told]
+    judged += [e.noise for e in entries if e.noise is not None]
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {name} ({why}).") for name, why in skipped.items()))
 
