@@ -13,12 +13,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.of_outputs import affine
+from helpers.plants import simulated
 from scipy.optimize import least_squares
-from test_cascade import affine, simulated
 
 import fpirhc as fp
 from fpirhc.contracts import Controller
-from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
 
 STATIC = fp.FeedforwardOnly()
 AT_ONCE = fp.ThroughModel(lag=0.0)
@@ -174,38 +174,6 @@ def test_a_static_map_has_no_error_once_it_is_right() -> None:
     assert np.abs(iterated["error"][50:]).max() < 0.2 * np.abs(wrong["error"][50:]).max()
 
 
-def test_an_output_of_order_zero_may_be_judged_beside_a_controlled_one() -> None:
-    """The temperature is controlled by computed torque; the power is measured and judged."""
-    plant = element(COLD, WARMER, inverse=None)
-    outputs = {"theta": fp.Output("K", lambda x, p: x.theta), **plant.outputs}
-    squared = replace(
-        plant,
-        outputs={**outputs, "power": fp.Output("W", lambda x, u, p: u.u / resistance(x, p))},
-        response=lambda x, u, p: {"theta": (u.u / resistance(x, p) - LOSS * x.theta) / HEAT},
-        controlled=("theta",),
-    )
-    problem = heated(
-        squared,
-        reference=fp.Trajectory(lambda t: {"theta": 30 + 0 * t, "power": 60.0 + 0 * t}),
-        judged=("theta", "power"),
-        input_before={},
-    )
-    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.5)))
-    assert abs(run["error.theta"][-1]) < 1e-3
-    assert run["error.power"][-1] == pytest.approx(0.0, abs=1e-2)
-    cost = fp.Quadratic(outputs={"theta": 1.0}, rate={"u": 1e-3})
-    planned = replace(problem, horizon=fp.Horizon(stages=4, step=0.5), cost=cost)
-    alone = replace(
-        planned,
-        plant=replace(squared, outputs={"theta": outputs["theta"]}),
-        reference=fp.Trajectory(lambda t: {"theta": 30 + 0 * t}),
-        judged=("theta",),
-    )
-    plans, without = (simulated(p, fp.RecedingHorizon(OPTIMISER)) for p in (planned, alone))
-    assert np.array_equal(plans["command"], without["command"])
-    assert np.ptp(plans["command"]) > 1
-
-
 # Plans
 
 OPTIMISER = fp.FixedPoint(iterations=20, tolerance=1e-10)
@@ -242,23 +210,6 @@ def test_a_plan_on_an_output_of_order_zero_is_the_minimum_by_hand() -> None:
         assert run["command.u"][k] == pytest.approx(by_hand, abs=1e-6)
 
 
-def test_plans_hold_the_emission_of_a_freeway() -> None:
-    """On the settled map of a wrong model, the mainstream's swing unknown: no worse than a gentle iteration on targets."""
-    task = fp.load_problem("freeway")
-    gentle = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), fp.ThroughModel(lag=1 / 60))
-    cost = fp.Quadratic(outputs={"emission": 1.0}, rate={"r": 10.0})
-    planned = replace(task.problem, horizon=fp.Horizon(stages=5, step=1 / 60), cost=cost)
-    run = simulated(planned, fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-4)))
-    error = rms_of(planned, run, "emission")
-    assert error == pytest.approx(3.2, abs=0.1)
-    assert error < rms_of(planned, simulated(planned, gentle), "emission")
-
-
-def test_the_end_of_a_horizon_has_no_command() -> None:
-    with pytest.raises(InvalidProblem, match=r"terminal: the command moves 'power' at once"):
-        planned_power(cost=fp.Quadratic(outputs={"power": 1.0}, rate={"u": 1.0}, terminal={"power": 1.0}))
-
-
 def test_the_integral_of_order_zero_removes_a_constant_error() -> None:
     """The law is y^N + rate e_int with measured errors: e_{k+1} = e_k - J rate T e_{k-1}."""
     problem = heated(element(), reference=fp.Trajectory(lambda t: {"power": 200.0 + 0 * t}), start={"theta": 100.0})
@@ -286,45 +237,47 @@ def test_rivals_control_an_output_of_order_zero(name: str) -> None:
     assert rms(heated(element()), controller) < limit
 
 
-REFUSED: dict[str, tuple[Callable[[], Controller], dict[str, Any], str]] = {
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "slot": (
-        lambda: fp.Slotted([fp.Slot("power", LAWLESS)], fp.Periodic({"power": 1.0}), blend=0.1),
-        {},
+        lambda: simulated(
+            heated(element()), fp.Slotted([fp.Slot("power", LAWLESS)], fp.Periodic({"power": 1.0}), blend=0.1)
+        ),
         r"the command moves 'power' at once \(order 0\)",
     ),
     "estimator": (
-        lambda: STATIC,
-        {"sensing": fp.Sensing(estimator=fp.PositionDifference())},
+        lambda: simulated(heated(element(), sensing=fp.Sensing(estimator=fp.PositionDifference())), STATIC),
         "need none; leave the estimator out",
     ),
-}
+    "terminal": (
+        lambda: planned_power(cost=fp.Quadratic(outputs={"power": 1.0}, rate={"u": 1.0}, terminal={"power": 1.0})),
+        "terminal: the command moves 'power' at once",
+    ),
+    "feedforward of order one": (
+        lambda: simulated(
+            heated(
+                replace(element(), outputs={"hot": fp.Output("K", lambda x, p: x.theta**2)}, inverse=None),
+                reference=fp.Trajectory(lambda t: {"hot": 100.0 + 0 * t}),
+            ),
+            STATIC,
+        ),
+        "hot.*: without feedback their errors would add up",
+    ),
+    "no state": (
+        lambda: fp.Plant.of_states(
+            states={}, inputs={"u": "1"}, parameters={}, rates=lambda x, u, p: {},
+            outputs={"y": fp.Output("1", lambda x, u, p: u.u)},
+        ),
+        r"a static map y = h\(u\) may have one that stands still",
+    ),
+    "arguments": (
+        lambda: replace(element(), outputs={"power": fp.Output("W", lambda x: x.theta)}),
+        r"called as function\(x, p\), or as function\(x, u, p\)",
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_has_no_meaning_for_order_zero_is_refused(name: str) -> None:
-    make, settings, words = REFUSED[name]
-    with pytest.raises(FpirhcError, match=words):
-        simulated(heated(element(), **settings), make())
-
-
-def test_feedforward_alone_is_refused_where_errors_would_add_up() -> None:
-    plant = replace(element(), outputs={"hot": fp.Output("K", lambda x, p: x.theta**2)}, inverse=None)
-    problem = heated(plant, reference=fp.Trajectory(lambda t: {"hot": 100.0 + 0 * t}))
-    with pytest.raises(NotSupported, match=r"hot.*: without feedback their errors would add up"):
-        simulated(problem, STATIC)
-
-
-def test_a_static_map_needs_a_state_that_stands_still() -> None:
-    with pytest.raises(InvalidProblem, match="a static map y = h\\(u\\) may have one that stands still"):
-        fp.Plant.of_states(
-            states={},
-            inputs={"u": "1"},
-            parameters={},
-            rates=lambda x, u, p: {},
-            outputs={"y": fp.Output("1", lambda x, u, p: u.u)},
-        )
-
-
-def test_an_expression_with_other_arguments_is_named() -> None:
-    with pytest.raises(InvalidProblem, match=r"called as function\(x, p\), or as function\(x, u, p\)"):
-        replace(element(), outputs={"power": fp.Output("W", lambda x: x.theta)})
+    make, words = REFUSED[name]
+    with pytest.raises(fp.FpirhcError, match=words):
+        make()

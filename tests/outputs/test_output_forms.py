@@ -8,12 +8,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.of_outputs import ARM, arm, circle
 from helpers.plants import simulated
-from test_outputs import ARM, arm, circle, hill, sedated
 
 import fpirhc as fp
 from fpirhc.contracts import Controller, Deformation
-from fpirhc.errors import InvalidProblem, NotSupported
 
 FORMS: dict[str, Deformation] = {
     "plain": fp.Affine(-0.6),
@@ -181,33 +180,6 @@ def test_every_form_lowers_the_error_of_a_wrong_model(name: str, kind: str) -> N
     assert max(errors["increment"], errors["model-referenced"]) < 0.2 * bare
 
 
-FIGURES = {
-    ("CTC", "increment"): 0.0175,
-    ("CTC", "model-referenced"): 0.0200,
-    ("RHC", "increment"): 0.0100,
-    ("RHC", "model-referenced"): 0.00783,
-    ("RHC", "plain, whole"): 0.0130,
-    ("RHC", "plain, half"): 0.147,
-    ("RHC", "model-referenced, half"): 0.0154,
-}
-
-
-@pytest.mark.parametrize(("kind", "form"), FIGURES)
-def test_the_forms_on_the_patient(kind: str, form: str) -> None:
-    """Rms error of bis; .142 and .356 without adaptation. Half of a plain map's error is left for the next cycle, a limit cycle."""
-    task = fp.load_problem("anaesthesia")
-    sigmoid = task.controllers["CTC+FPI"].deformation
-    forms = {
-        "increment": fp.Increment(sigmoid, cycles=0, uncertainty=0),
-        "model-referenced": fp.ModelReferenced(sigmoid),
-        "plain, whole": fp.Affine(-2.0),
-        "plain, half": fp.Affine(-1.0),
-        "model-referenced, half": fp.ModelReferenced(fp.Affine(-1.0)),
-    }
-    run = simulated(task.problem, task.controllers[kind].with_deformation(forms[form]))
-    assert fp.measure(task.problem, run).rms_error["bis"] == pytest.approx(FIGURES[kind, form], rel=0.02)
-
-
 # Rivals on plants with outputs: those whose idea is about errors follow outputs; the others say why they do not
 
 
@@ -223,16 +195,3 @@ def test_an_increment_by_hand_on_the_hand_of_an_arm() -> None:
     change = run["desired"][k] - run["realised"][k]
     request = respond(x, u, p).full().ravel() + change - problem.period * drift
     assert np.allclose(run["command"][k], plant.equations.inverse(x, request, p).full().ravel(), atol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["AID", "Slotine-Li"])
-def test_learning_inverse_dynamics_of_other_outputs_says_why_not(name: str) -> None:
-    with pytest.raises(NotSupported, match=r"mechanics in its own coordinates.* x, y are other functions of the state"):
-        simulated(circle(arm()), fp.load_problem("planar_arm").controllers[name])
-
-
-def test_gains_are_named_by_outputs() -> None:
-    with pytest.raises(InvalidProblem, match="controlled coordinate 'deep' is unknown"):
-        simulated(sedated(hill(5.5)), fp.PID({"deep": -1.0}))
-    with pytest.raises(InvalidProblem, match="has relative order 2, but rates has 1"):
-        simulated(sedated(hill(5.5)), fp.rivals.BacksteppingMRAC(1.0, (1.0,), fp.Affine(-1.0)))

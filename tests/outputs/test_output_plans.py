@@ -1,6 +1,4 @@
-"""Plans on outputs under a wrong model, beside a controller of CasADi's Opti and IPOPT that shares nothing with the library;
-plans that start where the model has the measured outputs keep the limits of the measured state, and are optima from there.
-"""
+"""Plans that start where the model has the measured outputs keep the limits of the measured state."""
 
 from __future__ import annotations
 
@@ -12,13 +10,6 @@ import pytest
 from helpers.plants import simulated
 
 import fpirhc as fp
-
-# One plant of every relative order from 1 to 4, and one with two outputs of different orders. The slow study has all fifteen.
-"""Rms errors with the model-referenced deformation; without adaptation 28 (growth) to 3 300 (flexible joint) times as large."""
-
-
-# Plans that start where the model has the measured outputs keep the limits of the measured state, and are optima from there
-
 
 ADAPTIVE = fp.ModelReferenced(fp.Affine(-1.6))
 SOLVED = fp.FixedPoint(iterations=20, tolerance=1e-4)  # V

@@ -9,13 +9,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.of_outputs import OPTIMISER, hill, planned, sedated
 from helpers.plants import simulated
-from helpers.reviewed import answers
-from test_outputs import OPTIMISER, arm, circle, hill, planned, sedated
 
 import fpirhc as fp
-from fpirhc import simulator
-from fpirhc.controllers.wrappers.predicted import output_ahead
 from fpirhc.errors import NotSupported
 
 LAW = fp.Exponential(rate=1.0)
@@ -70,16 +67,6 @@ def test_outputs_ahead_of_a_right_model_are_those_that_come() -> None:
     assert np.abs(run["output_ahead"] - run["output"]).max() > 0.5
 
 
-def test_the_distance_of_a_wrong_model_moves_as_a_polynomial() -> None:
-    """Y + d' tau of a plant whose outputs differ from the model's by d and d'; d'' of the model is zero."""
-    plant = hill(5.5)
-    shift = np.array([2.0, -0.3])
-    x, later, tau = np.array([3.0, 2.0]), np.array([3.1, 2.1]), 0.25
-    own, ahead = (plant.equations.output(s, 0.0, 5.5, np.zeros(2)).full().ravel() for s in (x, later))
-    y = output_ahead(plant)(own + shift, x, later, 5.5, tau).full().ravel()
-    assert np.allclose(y, ahead + np.array([2.0 - 0.3 * tau, -0.3]))
-
-
 def test_a_prediction_helps_behind_dead_time_and_leaves_no_error_at_rest() -> None:
     """A law that is too fast for the dead time; the prediction keeps it, with the wrong curve too."""
     problem, fast = late(sedated(hill(5.5)), 0.5), fp.ComputedTorque(fp.Exponential(rate=1.5))
@@ -116,22 +103,3 @@ def test_what_is_not_covered_says_so() -> None:
         NotSupported, match=r"ByDesired\(\) does not predict C, which no desired response moves; use ByModel\(\)"
     ):
         simulated(late(planned()), desired)
-
-
-def test_a_prediction_comes_back_as_its_run_converges() -> None:
-    """A wrong model predicts other outputs, and these are in the loop that is asked."""
-    controller = fp.Predicted(fp.ComputedTorque(LAW, fp.Paired(fp.Affine(-0.4), cycles=12)), inputs=LATE)
-    problem = late(sedated(hill(5.5)))
-    assert answers(problem, controller)["returns"].numbers["left"] < 1
-    error = np.abs(simulated(problem, controller)["true_error"])
-    assert error[-1] < 0.1 * error.max()
-
-
-def test_live_dead_times_of_outputs_are_those_that_are_built() -> None:
-    times = fp.DeadTime(inputs={"A": 4e-3, "B": 4e-3})
-    problem = replace(circle(arm(), dead_time=times), duration=0.2, measure_from=0.0)
-    law = fp.ComputedTorque(fp.Exponential(6.0))
-    built = simulated(problem, fp.Predicted(law, inputs=4e-3))
-    ready = simulator(problem, fp.Predicted(law, inputs=2e-3, longest=8e-3), compiled=False, live=["inputs"])
-    opened = ready.run(seed=0, settings={"inputs": 4e-3})
-    assert np.allclose(built["output"], opened["output"], atol=1e-12)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.of_outputs import curve, hill, sedated
 from helpers.plants import simulated
 from helpers.reviewed import answers
-from test_outputs import arm, circle, curve, hill, sedated
 
 import fpirhc as fp
 
@@ -43,11 +43,3 @@ def test_the_factor_of_a_plan_is_the_decay_of_a_small_deviation() -> None:
     told = answers(problem, controller)["returns"]
     assert told.verdict == "yes"
     assert told.numbers["factor"] == pytest.approx(decay, abs=0.03)
-
-
-def test_plans_on_the_hand_of_an_arm_come_back() -> None:
-    cost = fp.Quadratic(outputs={"x": 1e3, "y": 1e3, "x'": 1.0, "y'": 1.0}, rate={"A": 1e-3, "B": 1e-3})
-    problem = circle(arm(), horizon=fp.Horizon(stages=10, step=0.02), cost=cost)
-    told = answers(problem, replace(CONVERGED, deformation=fp.Affine(-0.5)))
-    assert told["returns"].numbers["left"] < 0.5
-    assert told["orders"].verdict == told["posed"].verdict == "yes"

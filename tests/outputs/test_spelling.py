@@ -23,9 +23,8 @@ from helpers.on_problem import on_problem
 from helpers.plants import simulated
 
 import fpirhc as fp
+from fpirhc.conformance import examples
 from fpirhc.contracts import Controller
-from fpirhc.members import examples
-from fpirhc.plant.motion import followed_units
 
 # Coordinates as outputs
 
@@ -58,6 +57,7 @@ LOOPS: dict[str, Callable[[], tuple[Controller, fp.Problem]]] = {
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
             ("set-points", "CTC+FPI (eq 6)", AIMS),
             ("plans to set-points", "RHC+FPI", AIMS),
+            ("estimated", fp.ComputedTorque(TRACK), PUSHED | {"sensing": fp.Sensing(estimator=fp.PositionDifference())}),
             ("reality", fp.ComputedTorque(TRACK, fp.ModelReferenced(MAP)), {"reality": None}),
         )
     },
@@ -154,7 +154,8 @@ def in_outputs(plant: fp.Plant) -> fp.Plant:
         return dict(zip(plant.outputs, ca.vertsplit(values), strict=True))
 
     with_arguments(response, [f"d{k}" for k in range(max(plant.chains.values()))] + ["u", "p"])
-    return fp.Plant(followed_units(plant), plant.inputs, plant.parameters, response, order=plant.chains)
+    units = {name: one.unit for name, one in plant.outputs.items()}
+    return fp.Plant(units, plant.inputs, plant.parameters, response, order=plant.chains)
 
 
 def both(plant: fp.Plant, start: Mapping[str, float] | None = None, **settings: Any) -> tuple[fp.Problem, fp.Problem]:

@@ -85,17 +85,6 @@ def test_under_a_prediction_the_twin_sees_what_is_measured():
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
 
 
-@pytest.mark.parametrize("waits", [0.4e-3, 1.5e-3])
-def test_samples_late_by_a_fraction_move_as_the_mean_of_two(waits):
-    """An interpolated state moves with the mean of the commands: exact but for the second order in the cycle."""
-    late = fp.DeadTime(inputs={"u": 1e-3}, measurement=waits)
-    problem = task(fp.PositionDifference(), exact=True, dead_time=late)
-    one, other = run(problem, PLAIN), run(problem, referenced(problem))
-    np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-7)
-    moved = np.abs(other["deformed"] - other["desired"]).max()
-    assert moved < 1e-5 * np.abs(other["desired"]).max()
-
-
 @pytest.mark.parametrize("cycles", [1, 2])
 def test_a_map_is_left_alone_behind_a_late_measurement(cycles):
     """State and outputs of a map arrive equally late, so the model answers from the state of the same cycle."""
