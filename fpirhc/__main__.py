@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from typing import Any
@@ -20,6 +22,10 @@ _INTERRUPTED = "interrupted; finished results are kept, and the same command goe
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    for one in (getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")):
+        # A service that is stopped and a terminal that is closed end a run as Ctrl-C does: a machine is left at rest.
+        if one and signal.getsignal(one) == signal.SIG_DFL and threading.current_thread() is threading.main_thread():
+            signal.signal(one, signal.default_int_handler)
     # Matrices of loops are small: threads of the linear algebra wait for one another. NumPy reads this when it is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):  # names of a user that the encoding of an output does not have are escaped

@@ -178,8 +178,8 @@ def run_variants(
     Args:
         controllers: names; None: all.
         metrics: None: those of the task.
-        processes: number of processes; None: what a `joblib.parallel_config` around the call says, else 1. With
-            `joblib.parallel_config(backend="dask")` and a Dask client the runs go to its cluster.
+        processes: number of processes, one for a machine; None: what a `joblib.parallel_config` around the call says, else 1.
+            With `joblib.parallel_config(backend="dask")` and a Dask client the runs go to its cluster.
         compiled: whether loops are compiled; those that run once are so where the run is long.
         judged: whether runs have the signals that judge them.
         keep: file of JSON lines; rows that it holds are not run again, and new ones are added as they come.
@@ -194,6 +194,8 @@ def run_variants(
     chosen = replace(task, controllers=select(task, controllers))
     metrics = task.metrics if metrics is None else metrics
     every = variants.of(chosen)
+    if task.problem.foreign is not None and task.problem.foreign.rest is not None:
+        processes = 1  # a machine would have two loops that command it
     with Kept(keep, header_of(chosen, {**variants.same, "judged": judged}, metrics)) as kept:
         titles = {one: k for k, one in enumerate(one.name for one in every)}
         rows = {(r["controller"], r["variant"]): r for r in kept.rows}

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
+import subprocess
+import sys
 import warnings
 from contextlib import suppress
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -170,3 +175,66 @@ def test_a_body_has_the_period_that_it_was_made_with():
     with pytest.raises(InvalidProblem, match=r"one step of it takes 0\.1, and the problem's period is 0\.2"):
         body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.2)
     body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.1)
+
+
+HEATER = """
+import os, signal
+from pathlib import Path
+import fpirhc as fp
+
+class Heater:
+    def note(self, what):
+        with Path("log").open("a") as file:
+            file.write(f"{what} ")
+
+    def reset(self, seed):
+        self.T, self.steps = 0.0, 0
+        self.note("open")
+        return [self.T]
+
+    def step(self, time, command):
+        self.steps += 1
+        self.note(float(command[0]))
+        if self.steps == 5 and (name := os.environ.get("ENDED_BY")):
+            os.kill(os.getpid(), getattr(signal, name))
+        self.T += (0.8 * float(command[0]) - self.T) / 20
+        return [self.T]
+
+    def close(self):
+        self.note("close")
+
+plant = fp.Plant({"T": "K"}, {"Q": "%"}, {}, lambda q, u, p: {"T": (0.8 * u.Q - q.T) / 20}, order=1)
+problem = fp.Problem(
+    plant, fp.Trajectory(lambda t: {"T": 60.0 + 0 * t}), start={"T": 0.0}, period=1.0, duration=8.0,
+    reality=fp.ExternalPlant(Heater(), ["T"], rest={"Q": 0.0}), sensing=fp.Sensing(estimator=fp.PositionDifference()),
+)
+controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=0.2))}
+"""
+
+
+def by_command(folder: Path, words: str, **environment: str) -> tuple[int, list[str]]:
+    """Exit code of a command in a process of its own, and what the heater noted."""
+    (folder / "heater.py").write_text(HEATER)
+    there = {**os.environ, "PYTHONPATH": str(Path(fp.__file__).parents[1]), **environment}
+    call = [sys.executable, "-m", "fpirhc", *shlex.split(words), "--no-compile"]
+    heard = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL) if os.name == "posix" else None  # under nohup, too
+    done = subprocess.run(call, cwd=folder, env=there, capture_output=True, check=False, preexec_fn=heard)
+    return done.returncode, (folder / "log").read_text().split()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("ended_by", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_command_that_is_ended_from_outside_leaves_a_machine_at_rest(ended_by, tmp_path):
+    """Ctrl-C, a service that is stopped, a terminal that is closed."""
+    code, log = by_command(tmp_path, "run heater.py CTC", ENDED_BY=ended_by)
+    assert code == 130
+    assert log[0] == "open"
+    assert float(log[5]) > 50
+    assert log[6:] == ["0.0", "close"]
+
+
+def test_a_machine_is_commanded_by_one_run_at_a_time(tmp_path):
+    """Two processes of a study would have two loops on one heater."""
+    code, log = by_command(tmp_path, "study heater.py --over tracking.rate=0.1:0.3:21 --processes 2")
+    assert code == 0
+    assert [what for what in log if what in ("open", "close")] == 21 * ["open", "close"]
