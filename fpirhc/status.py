@@ -77,8 +77,8 @@ _REMEDIES = {
     "actuator, the sign of its gain, and whether the limits allow the task.",
     Status.NOT_CONTRACTING: "the measured response errors grow from cycle to cycle: the gain is too large or has the wrong sign "
     "for this plant; lower it.",
-    Status.BRIDGED: "cycles without a sample came before this one, lost or not called: estimators and queues were moved over the "
-    "gap; look at the sensor's connection, or at what delays the cycles.",
-    Status.SETTLING: "more cycles than are bridged went by without a sample: estimators began anew, and what was learned is held "
-    "until their windows are full again; look at the sensor's connection, or at what delays the cycles.",
+    Status.BRIDGED: "cycles without a sample came before this one, lost or not called: the step was run once more for each; "
+    "look at the sensor's connection, or at what delays the cycles.",
+    Status.SETTLING: "more cycles than are bridged went by without a sample: windows were filled anew, on samples between those "
+    "around the gap; look at the sensor's connection, or at what delays the cycles.",
 }

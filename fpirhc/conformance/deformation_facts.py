@@ -133,17 +133,6 @@ def shown_is_remembered(trial: _Cycles, generator: np.random.Generator) -> None:
         hold(scalar, f"it shows '{source}' as '{name}', which is no scalar of its memory {list(trial.layout.names)}")
 
 
-def held_keeps_the_memory(trial: _Cycles, generator: np.random.Generator) -> None:
-    """After a cycle in which the request was held every remembered signal is finite and of its own size."""
-    memory = trial.layout.split(ca.SX(trial.calm_memory()))
-    after = trial.deformation.held(ca.SX(float(generator.normal())), memory)
-    for name, value in after.items():
-        hold(name in trial.layout, f"held() gives '{name}', and it remembers {list(trial.layout.names)}")
-        numbers = np.asarray(ca.evalf(ca.SX(value)).full())
-        fits = numbers.size == trial.layout[name].size and bool(np.isfinite(numbers).all())
-        hold(fits, f"held() gives {numbers.ravel()} for '{name}', which has {trial.layout[name].size} entries")
-
-
 def automatic_settings_are_chosen(trial: _Cycles, generator: np.random.Generator) -> None:
     """`with_scale_for` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
     deformation = trial.deformation
@@ -255,5 +244,4 @@ LAWS = (
     gain_is_proportional_to_its_field,
     exact_model_is_left_alone,
     shown_is_remembered,
-    held_keeps_the_memory,
 )

@@ -22,13 +22,14 @@ from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
-from fpirhc.symbolic.block import GAP, SETTLING, Block, Delay, Step, is_long
-from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar, vector
-from fpirhc.symbolic.live import nominal, numbers
+from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
+_REQUEST = LastRequest.request
 _ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
 
 
@@ -41,14 +42,7 @@ def fed(block: Block, name: str, source: Signal) -> Block:
     def step(s: Signals) -> Mapping[str, Value]:
         return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
 
-    waits, lossy = block.waits, block.bridged
-    return replace(
-        block,
-        reads=Layout(reads),
-        step=step,
-        waits=None if waits is None else fed(waits, name, source),
-        bridged=None if lossy is None else lambda: fed(lossy(), name, source),
-    )
+    return replace(block, reads=Layout(reads), step=step)
 
 
 def under_names(block: Block, names: Mapping[str, str]) -> Block:
@@ -63,16 +57,8 @@ def under_names(block: Block, names: Mapping[str, str]) -> Block:
         later = {f"{n}_next": f"{names.get(n, n)}_next" for n in block.memory.names}
         return {later.get(n, names.get(n, n)): value for n, value in values.items()}
 
-    waits, lossy = block.waits, block.bridged
-    return replace(
-        block,
-        reads=other(block.reads),
-        writes=other(block.writes),
-        memory=other(block.memory),
-        step=step,
-        waits=None if waits is None else under_names(waits, names),
-        bridged=None if lossy is None else lambda: under_names(lossy(), names),
-    )
+    reads, writes, memory = map(other, (block.reads, block.writes, block.memory))
+    return replace(block, reads=reads, writes=writes, memory=memory, step=step)
 
 
 def reference_block(problem: Problem) -> Block:
@@ -120,19 +106,7 @@ def closing_blocks(
     before, remembered = (
         ([], [Delay(last, "deformed")]) if last.name in deform.reads else mirror_blocks(problem, deformation)
     )
-    blocks = [
-        *before,
-        with_held_deformation(
-            plant,
-            deformation,
-            deform,
-            settles=problem.sensing.estimates,
-            answered=math.inf if problem.dead_time.queued else problem.warm_up_cycles,
-        ),
-        invert_block(plant),
-        *closing,
-    ]
-    return blocks, [*delays, *remembered]
+    return [*before, deform, invert_block(plant), *closing], [*delays, *remembered]
 
 
 def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
@@ -301,97 +275,6 @@ def command_before(problem: Problem) -> Signal:
 def like(signal: Signal, name: str) -> Signal:
     """Return a signal of the same shape and units under another name."""
     return Signal(name, signal.elements, signal.units)
-
-
-_REQUEST, _HELD, _LAST = LastRequest.request, "deformation_held", "step_of_last_sample"
-_SMALL = 1e-6  # effective gain below which the formulas lose their digits
-
-
-def with_held_deformation(
-    plant: Plant, deformation: Deformation, block: Block, *, settles: bool, answered: float
-) -> Block:
-    """Return the block deform with what becomes of it where samples may be lost.
-
-    Args:
-        settles: whether responses are estimated.
-        answered: number of cycles after which a response answers the last request; infinite where something is late.
-    """
-    block = replace(block, waits=_waiting(plant, deformation, block))
-    repeats = math.isfinite(answered) and deformation.adapts and _REQUEST in block.reads and not block.memory.names
-    repeats = repeats and deformation.iteration.weights is None  # its steps are those of one number
-    lossy = _repeated(plant, deformation, block, answered) if repeats else block
-    if settles:
-        return replace(block, bridged=lambda: _settling(plant, deformation, lossy))
-    return replace(block, bridged=lambda: lossy) if repeats else block
-
-
-def _repeated(plant: Plant, deformation: Deformation, block: Block, answered: float) -> Block:
-    """The block of a map without memory that takes the steps of missing cycles at once; after a long gap it takes one.
-
-    With q = 1 - a, the step h of now and h_0 of the last sample, after which q h_0 was left, the errors in between are on a line:
-
-        r+ = r + [S h - M (h - q h_0) / (g + 1)] / a,      S = 1 - q^(g + 1),      M = a sum_{m <= g} m q^m.
-    """
-    last, gain = plant.response_signal(_LAST), deformation.effective_gain()
-
-    def step(s: Signals) -> dict[str, Expression]:
-        values = {name: expression(value) for name, value in block.step(s).items()}
-        request, before = values["_deformed_unclipped"], getattr(s, _REQUEST)
-        pairs, now = s.warm_up > answered - 0.5, request - before
-        several = ca.logic_and(pairs, ca.logic_and(s.gap > 0.5, ca.logic_not(is_long(s.gap))))
-        step, left = numbers([gain]), 1 - numbers([gain])
-        gap = ca.if_else(several, s.gap, 1)
-        share = 1 - ca.power(left, gap + 1)
-        moment = left * (1 - (gap + 1) * ca.power(left, gap) + gap * ca.power(left, gap + 1)) / step
-        all_at_once = (share * now - moment / (gap + 1) * (now - left * getattr(s, _LAST))) / step
-        repeats = ca.logic_and(several, ca.logic_and(step > _SMALL, left > -1))
-        request = ca.if_else(repeats, before + all_at_once, request)
-        return {
-            **values,
-            "_deformed_unclipped": request,
-            "_deformation": request - s.desired,
-            f"{_LAST}_next": ca.if_else(pairs, now, 0),
-        }
-
-    return replace(block, reads=block.reads + Layout((GAP,)), memory=Layout((last,)), step=step)
-
-
-def _waiting(plant: Plant, deformation: Deformation, block: Block) -> Block | None:
-    """Block of a cycle without a sample; None where the map has no memory of the passing time."""
-    names = deformation.memory(plant.controlled_names).names
-    request = plant.response_signal(_REQUEST)
-
-    def step(s: Signals) -> dict[str, Expression]:
-        before = {m: getattr(s, m) for m in names}
-        return {f"{m}_next": v for m, v in (before | deformation.held(getattr(s, _REQUEST), before)).items()}
-
-    symbols = {m.name: ca.SX.sym(m.name, m.size) for m in block.memory.signals}
-    changed = deformation.held(ca.SX.sym("r", request.size), symbols)
-    return Block("deform_waits", Layout((request,)), Layout(), step, block.memory) if changed else None
-
-
-def _settling(plant: Plant, deformation: Deformation, block: Block) -> Block:
-    """The block that holds the deformation while responses settle."""
-    names, held = deformation.memory(plant.controlled_names).names, plant.response_signal(_HELD)
-
-    def step(s: Signals) -> dict[str, Expression]:
-        values = {name: expression(value) for name, value in block.step(s).items()}
-        settling = s.settling > 0.5
-        before = {m: getattr(s, m) for m in names}
-        stays = before | deformation.held(getattr(s, block.reads.names[0]), before)
-        held = {f"{m}_next": v for m, v in stays.items()}
-        held |= {"_deformed_unclipped": s.desired + getattr(s, _HELD), "_deformation": getattr(s, _HELD)}
-        values |= {name: ca.if_else(settling, value, values[name]) for name, value in held.items()}
-        return {**values, f"{_HELD}_next": values["_deformation"]}
-
-    own = block.memory + Layout((held,))
-    waits = None if block.waits is None else replace(block.waits, memory=own, step=_keeping(block.waits, _HELD))
-    return replace(block, reads=block.reads + Layout((SETTLING,)), memory=own, step=step, waits=waits, bridged=None)
-
-
-def _keeping(block: Block, name: str) -> Step:
-    """The step of a block, and a further signal that stays."""
-    return lambda s: {**block.step(s), f"{name}_next": getattr(s, name)}
 
 
 def bounded(problem: Problem, tracking: Tracking) -> Tracking:

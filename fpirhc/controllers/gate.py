@@ -5,108 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip
 from fpirhc.status import Status
-from fpirhc.symbolic.block import GAP, GAPS, LONG, SETTLING, Block, Composite, call
+from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.driver import every_finite, finite, kept_if_finite
-from fpirhc.symbolic.expression import FINITE, Signals, expression, kind
+from fpirhc.symbolic.expression import FINITE, Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import Derived, Values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 AGAIN = 100 * FINITE  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
-BRIDGED = 50  # cycles: the longest gap that is bridged, where nobody states another
-# In the memory: cycles since the last sample; -1 before the first one.
+# In the memory: cycles since the last good sample, which whoever calls the step replays (`fpirhc.simulation.replay`); -1 before the
+# first one.
 MISSING = Signal("missing_cycles", start=(-1.0,))
-_STILL = Signal("still_settling")  # in the memory: cycles for which what was learned is held
-
-
-Counts: TypeAlias = dict[str, Expression]
-
-
-@dataclass(frozen=True)
-class Gap:
-    """How many cycles went by without a sample, and what the next sample is told.
-
-        sample missing      the count goes up, and what is a memory of the passing time goes on: queues, filters, observers
-        the next sample     estimators and queues are moved over the gap (`fpirhc.symbolic.block`); status BRIDGED
-        after a long gap    estimators begin anew with their derivatives, and what was learned is held until their windows hold
-                            samples of now alone, as after a start; status SETTLING
-
-    Args:
-        bridged: number of missing cycles up to which a gap is bridged.
-        settles: number of samples after a long gap that a response needs: that of the start, and what a filter forgets in.
-    """
-
-    bridged: int
-    settles: float
-
-    @property
-    def memory(self) -> tuple[Signal, ...]:
-        """Cycles since the last sample, and cycles for which what was learned is held."""
-        return (MISSING, _STILL)
-
-    def counts(self, s: Signals, *, trusted: bool) -> Counts:
-        """Return the remembered counts; those that a memory cannot have held are those of the start.
-
-        Args:
-            s: signals of the cycle.
-            trusted: whether nobody else can have written the memory.
-        """
-        missing, still = getattr(s, MISSING.name), getattr(s, _STILL.name)
-        if trusted:
-            return {MISSING.name: missing, _STILL.name: still}
-        good = ca.logic_and(ca.fabs(missing) <= self.bridged + 1, ca.fabs(still) <= self.settles)
-        return {MISSING.name: ca.if_else(good, missing, -1), _STILL.name: ca.if_else(good, still, 0)}
-
-    def passes(self, counts: Counts, time: Expression) -> Expression:
-        """Return whether a cycle without a sample is one of a gap: there has been a sample, and the cycle is a new one."""
-        return ca.logic_and(counts[MISSING.name] > -0.5, ca.logic_not(time >= AGAIN))
-
-    def seen(self, counts: Counts) -> Counts:
-        """Return what the step is told, by name of its signal."""
-        missing = counts[MISSING.name]
-        long = missing > self.bridged + 0.5
-        settling = ca.if_else(long, self.settles, ca.fmax(counts[_STILL.name] - 1, 0)) if self.settles else 0.0
-        return {GAP.name: ca.if_else(long, LONG, ca.fmax(missing, 0)), SETTLING.name: expression(settling)}
-
-    def status(self, status: Expression, told: Counts) -> Expression:
-        """Return the status of a cycle with a sample: that of the step, unless it is OK and a gap came before."""
-        bridged = ca.if_else(told[GAP.name] > 0.5, int(Status.BRIDGED), status)
-        gap = ca.if_else(told[SETTLING.name] > 0.5, int(Status.SETTLING), bridged)
-        return ca.if_else(status == int(Status.OK), gap, status)
-
-    def remembered(self, fits: Expression, passes: Expression, counts: Counts, told: Counts) -> Counts:
-        """Return the counts one cycle later, by name."""
-        missing = counts[MISSING.name]
-        more = ca.if_else(passes, ca.fmin(missing + 1, self.bridged + 1), missing)
-        still = ca.if_else(fits, told[SETTLING.name], counts[_STILL.name])
-        return {MISSING.name: ca.if_else(fits, 0, more), _STILL.name: still}
-
-
-def gap_of(problem: Problem, bridged: int) -> Gap:
-    """Return the gap counter of a problem's steps.
-
-    `problem`: of the steps; where state and response are measured as they are, nothing settles.
-    """
-    if not problem.sensing.estimates:
-        return Gap(bridged, 0.0)
-    settling = problem.sensing.settling_cycles(problem.plant, problem.period)
-    return Gap(bridged, float(problem.longest_warm_up + settling))
-
-
-def across_gaps(step: Composite) -> Composite:
-    """Return a controller's step as it is where samples may be lost."""
-    lossy = step.bridged_if_any
-    return step if lossy is None else lossy()
-
-
+MOST_MISSING = 1e6
 FAILED = "not_finite"  # in the memory: steps in a row that were not finite, of samples that fit
 PATIENCE = 10  # such steps before one is tried with the memory of the start
 
@@ -153,6 +70,7 @@ def was_skipped(status: Expression) -> Expression:
 
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 TAKEN = "taken"  # time stamp of a sample
+REPLAYS = Signal("replays")  # in the memory of a loop: whether its sample is that of `replayed_...`
 LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a machine is one that is not finite
 _SAMPLE = ("time", "state", "output", "realised", "measured", "arrived", TAKEN, LOST.name)
 INNER = "controller_memory"  # in the memory: that of a graph as one signal
@@ -165,9 +83,7 @@ class _Judged:
     fits: ca.SX  # whether the sample fits
     held: ca.SX  # the last command
     stored: ca.SX  # of the last good sample, which may be this one
-    counts: Counts  # of gaps, by name; none where no sample can be lost
-    told: Counts  # what the step is told, by name
-    passes: Expression  # whether a cycle without a sample is one of a gap
+    missing: Expression  # cycles since the last good sample, of the next cycle
 
 
 def _scalar(name: str, symbols: Sequence[ca.SX], results: Sequence[Expression]) -> ca.Function:
@@ -188,12 +104,13 @@ class Gate:
     # s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
     # not later than the time, and not older than this. None: time stamps are not looked at.
     max_age: float | None = None
-    gap: Gap | None = None  # counts missing cycles; None: no sample can be lost
+    # number of last good samples that are kept for whoever replays missing cycles, which are then counted; 0: nobody does
+    samples: int = 0
 
     @cached_property
     def reads(self) -> Layout:
         """What the step reads: as the controller, and the time stamp of the sample where its age counts."""
-        own = Layout((*(s for s in self.inner.reads.signals if s not in GAPS), *([LOST] if self.loses else [])))
+        own = self.inner.reads + Layout((LOST,)) if self.loses else self.inner.reads
         return own if self.max_age is None else own + Layout((scalar(TAKEN, "s"),))
 
     @cached_property
@@ -203,13 +120,14 @@ class Gate:
 
     @cached_property
     def stored(self) -> Layout:
-        """The signals of the last good sample that are kept: all for a graph, and the time stamp that the next one must exceed."""
-        return Layout(tuple([s for s in self.sample.signals if self.inner.opaque or s.name == TAKEN]))
+        """The signals of the last good sample that are kept: all for a graph or a replay, and the last time stamp."""
+        every = self.inner.opaque or self.samples
+        return Layout(tuple(s for s in self.sample.signals if (every or s.name == TAKEN) and s.name != LOST.name))
 
     @property
     def memory(self) -> Layout:
         """What the gate keeps, and the controller's memory."""
-        return self.kept + self.controller_memory
+        return self.kept + self.replayed + self.controller_memory
 
     @cached_property
     def kept(self) -> Layout:
@@ -221,8 +139,15 @@ class Gate:
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
         failed = [] if "memory" in self.trusted else [scalar(FAILED)]
-        counts = self.gap.memory if self.gap is not None else ()
-        return Layout((held, *good, *failed, *counts))
+        older = [replace(s, name=f"{s.name}@{k}") for k in range(2, self.samples + 1) for s in good]
+        return Layout((held, *good, *failed, *older, *([MISSING] if self.samples else [])))
+
+    @cached_property
+    def replayed(self) -> Layout:
+        """Whether a cycle is a replay, and its sample; nothing where a caller gives the samples."""
+        own = [s for s in self.reads.signals if s.name in ("time", *self.stored.names)]
+        given = not self.samples or "memory" not in self.trusted
+        return Layout(() if given else (REPLAYS, *(Signal(f"replayed_{s.name}", s.elements, s.units) for s in own)))
 
     @cached_property
     def controller_memory(self) -> Layout:
@@ -243,21 +168,25 @@ class Gate:
         status = ["status"] if "status" in trace else []
 
         def step(s: Signals) -> dict[str, Expression]:
+            replayed = {m.name.removeprefix("replayed_"): getattr(s, m.name) for m in self.replayed.signals[1:]}
+            given = {n: ca.if_else(s.replays, value, getattr(s, n)) for n, value in replayed.items()}
+            s = Signals({**vars(s), **given})
             now, own = ca.vertcat(*(getattr(s, n) for n in self.sample.names)), self.kept.join(vars(s))
-            fits, column, passes = before(now, own, s.time if self.gap is not None else 0)
-            told = self._told.split(column)
-            sample = [told[r] if r in told else getattr(s, r) for r in self.inner.reads.names]
+            fits, column = before(now, own, s.time if self.samples else 0)
+            told = self.stored.split(column)
+            sample = [told[r] if r in told and self.inner.opaque else getattr(s, r) for r in self.inner.reads.names]
             memory = self.controller_memory.join(vars(s))
             usable = expression(1.0)
             if "memory" not in self.trusted:
                 failed = is_trial(getattr(s, FAILED))
                 usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(failed))
-            memory_next, shown, command, fine = self._stepped(fits, usable, memory, sample, passes)
+            memory_next, shown, command, fine = self._stepped(fits, usable, memory, sample)
             values = trace.split(shown)
             said = ca.vertcat(*(values[n] for n in status))
-            ended, own_next = after(now, own, s.time if self.gap is not None else 0, usable, fine, said, command)
+            ended, own_next = after(now, own, s.time if self.samples else 0, usable, fine, said, command)
             kept = self.kept.split(own_next)
             remembered = {**self.controller_memory.split(memory_next), **kept}
+            remembered |= {m.name: expression(ca.DM.zeros(m.size)) for m in self.replayed.signals}
             values |= dict.fromkeys(status, ended)
             return {**values, "command": kept[HELD], **{f"{m}_next": v for m, v in remembered.items()}}
 
@@ -272,24 +201,18 @@ class Gate:
             return inner
         return replace(inner, memory=lambda: {INNER: self.inner.memory.pack(inner.memory())})
 
-    @cached_property
-    def _told(self) -> Layout:
-        """What the step is told in place of what it reads: the last good sample where it is a graph, and how long a gap was."""
-        last = self.stored.signals if self.inner.opaque else ()
-        return Layout((*last, *(GAPS if self.gap is not None else ())))
-
     def _before(self) -> ca.Function:
-        """Function (sample, kept, time) -> (whether the sample fits, what the step is told, whether time passes).
+        """Function (sample, kept, time) -> (whether the sample fits, the last good sample).
 
         This and `_after` are scalar code: a graph would pass over these few numbers one operation after the other.
         """
         symbols, judged = self._judged
-        return _scalar("before", symbols, [judged.fits, self._told.join(judged.told), judged.passes])
+        return _scalar("before", symbols, [judged.fits, judged.stored])
 
     def _after(self) -> ca.Function:
         """Function (sample, kept, time, usable, fine, status, command) -> (status, kept one cycle later)."""
         symbols, judged = self._judged
-        own, status, gap = self.kept.split(symbols[1]), ca.SX.sym("status", int("status" in self.inner.trace)), self.gap
+        own, status = self.kept.split(symbols[1]), ca.SX.sym("status", int("status" in self.inner.trace))
         usable, fine, command = (
             ca.SX.sym(n, k) for n, k in (("usable", 1), ("fine", 1), ("command", judged.held.numel()))
         )
@@ -299,11 +222,17 @@ class Gate:
             f"good_{n}": ca.if_else(fine, v, own[f"good_{n}"]) for n, v in self.stored.split(judged.stored).items()
         }
         following |= {FAILED: counted(own[FAILED], fits, fine)} if FAILED in own else {}
-        ended = status
-        if gap is not None:
-            ended = gap.status(status, judged.told) if status.numel() else status
-            following |= gap.remembered(ran, judged.passes, judged.counts, judged.told)
-        ended = ca.if_else(usable, ended, int(Status.RESTARTED))
+        for k in range(2, self.samples + 1):
+            for n in self.stored.names:  # a memory that is not finite is forgotten
+                kept = ca.if_else(ran, own[f"good_{n}" if k == 2 else f"good_{n}@{k - 1}"], own[f"good_{n}@{k}"])
+                start = ca.DM(self.kept[f"good_{n}"].start_vector())
+                following[f"good_{n}@{k}"] = ca.if_else(every_finite(kept), kept, start)
+        if self.samples:
+            before = ca.if_else(
+                fits, own[MISSING.name], judged.missing
+            )  # a good sample that the step cannot use is not missing
+            following[MISSING.name] = ca.if_else(ran, 0, before)
+        ended = ca.if_else(usable, status, int(Status.RESTARTED))
         ended = ca.if_else(fits, ca.if_else(fine, ended, int(Status.NON_FINITE)), int(Status.BAD_SAMPLE))
         return _scalar("after", [*symbols, usable, fine, status, command], [ended, self.kept.join(following)])
 
@@ -327,10 +256,13 @@ class Gate:
         fits = ca.logic_and(self._possible(sample, last), self._inside(sample))
         now = ca.vertcat(ca.SX(0, 1), *(sample[self.sample.slice(n)] for n in self.stored.names))
         stored = ca.if_else(fits, now, last)
-        counts: Counts = {} if self.gap is None else self.gap.counts(Signals(values), trusted=trusted)
-        told = self.stored.split(stored) | ({} if self.gap is None else self.gap.seen(counts))
-        passes = ca.SX(0) if self.gap is None else self.gap.passes(counts, time)
-        return [sample, own, time], _Judged(fits, command, stored, counts, told, passes)
+        missing: Expression = ca.SX(0)
+        if self.samples:
+            before = values[MISSING.name]
+            before = ca.if_else(ca.fabs(before) <= MOST_MISSING, before, -1)
+            passes = ca.logic_and(before > -0.5, ca.logic_not(time >= AGAIN))
+            missing = ca.if_else(passes, ca.fmin(before + 1, MOST_MISSING), before)
+        return [sample, own, time], _Judged(fits, command, stored, missing)
 
     def _possible(self, sample: Expression, good: Expression) -> Expression:
         """Whether every entry is finite, and the time stamp is new."""
@@ -353,7 +285,7 @@ class Gate:
         return inside
 
     def _stepped(
-        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression], passes: Expression
+        self, fits: Expression, usable: Expression, memory: Expression, sample: Sequence[Expression]
     ) -> tuple[Expression, Expression, Expression, Expression]:
         """(memory to keep, trace, command, whether the step is fine); scalar code is evaluated, and its results are selected."""
         inner, opaque, remembered = self.inner, self.inner.opaque, memory
@@ -361,28 +293,5 @@ class Gate:
             # Of a graph it is copied as a whole.
             remembered = ca.if_else(usable, memory, ca.DM(inner.memory.start()), opaque)
         memory_next, trace, command = inner.function.call([remembered, *sample], opaque, False)
-        skipped = memory if opaque else self._waited(memory, sample, passes)
-        after, fine = outcome(memory_next, skipped, command, trace, inner.trace, fits, opaque=opaque)
-        if opaque and self.gap is not None and inner.waits is not None:
-            after = self._waiting()(ca.logic_and(fits, fine), after, passes, memory, *sample)
+        after, fine = outcome(memory_next, memory, command, trace, inner.trace, fits, opaque=opaque)
         return after, trace, command, fine
-
-    def _waiting(self) -> ca.Function:
-        """Function (whether the step was kept, its memory, whether time passes, memory, sample...) -> memory of a graph."""
-        step = self.inner.function
-        symbols = [kind(opaque=True).sym(step.name_in(k), step.size1_in(k)) for k in range(step.n_in())]
-        new, passes = (kind(opaque=True).sym(n, k) for n, k in (("new", symbols[0].numel()), ("passes", 1)))
-        arguments = [new, passes, *symbols]
-        takes = ca.Function("fpirhc_gate_takes", arguments, [new])
-        waits = ca.Function("fpirhc_gate_waits", arguments, [self._waited(symbols[0], symbols[1:], passes)])
-        return ca.Function.if_else("fpirhc_gate_kept", takes, waits)
-
-    def _waited(self, memory: Expression, sample: Sequence[Expression], passes: Expression) -> Expression:
-        """The controller's memory after a cycle without a sample: as it was, but for what is a memory of the passing time."""
-        waits = self.inner.waits
-        if self.gap is None or waits is None:
-            return memory
-        known = {**self.inner.memory.split(memory), **dict(zip(self.inner.reads.names, sample, strict=True))}
-        following: dict[str, Expression] = {}
-        call(waits, known, following)
-        return ca.if_else(passes, self.inner.memory.join(following), memory)

@@ -16,13 +16,13 @@ from typing import NamedTuple, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.model_inputs import MEASURED, MEASURED_OUTPUT, CommandPath, measured_output, measured_state
+from fpirhc.controllers.model_inputs import MEASURED, CommandPath, measured_output, measured_state
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names, values_of
-from fpirhc.symbolic.block import GAP, Block, Delay, straightened, unseen
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.dead_time import Queue
@@ -61,16 +61,14 @@ def _controlled(plant: Plant) -> Answers:
     return Answers(plant.equations.controlled_response, orders, plant.response_signal("_modelled"))
 
 
-def instant_mirror(path: CommandPath, answers: Answers | None = None, *, lost: bool = False) -> Block:
+def instant_mirror(path: CommandPath, answers: Answers | None = None) -> Block:
     """Return the block (measured state, last command, parameters) -> the model's response that is measured in this cycle.
 
     There is no twin that could drift. The model answers from the measured state, or on a map from that of the cycle before. A
     response of relative order r of a map is complete r cycles after its command, so the model's waits as long:
     modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then according to the beliefs.
 
-    Args:
-        answers: of the model; None: the controlled responses.
-        lost: whether samples may be lost; the state of the last cycle is then on the line over the gap.
+    `answers`: of the model; None: the controlled responses.
     """
     plant = path.problem.plant
     response, orders, written = answers or _controlled(plant)
@@ -84,7 +82,6 @@ def instant_mirror(path: CommandPath, answers: Answers | None = None, *, lost: b
     def step(s: Signals) -> dict[str, Expression]:
         acting, _, remembered = path.acted(s)
         at = getattr(s, last if age else MEASURED)
-        at = straightened(at, getattr(s, MEASURED), s.gap) if lost else at
         parameters, signals = path.parameters(s)
         past = ca.vertsplit(getattr(s, queued)) if waiting else []
         modelled, later = [], []
@@ -98,14 +95,7 @@ def instant_mirror(path: CommandPath, answers: Answers | None = None, *, lost: b
         return {written.name: ca.vertcat(*modelled), **remembered}
 
     reads = measured_state(plant), *path.reads
-    block = Block(path.owner, Layout(reads), Layout((written,)), step, Layout((*path.memory, *before, *queues)))
-    if not age:
-        return replace(block, waits=unseen(block, (MEASURED,))) if path.memory else block
-    if not lost:
-        return replace(block, bridged=lambda: instant_mirror(path, answers, lost=True))
-    unmoved = unseen(instant_mirror(path, answers), (MEASURED,))
-    held = replace(unmoved, step=lambda s: {**unmoved.step(s), f"{last}_next": getattr(s, last)})
-    return replace(block, reads=Layout((*reads, GAP)), waits=held)
+    return Block(path.owner, Layout(reads), Layout((written,)), step, Layout((*path.memory, *before, *queues)))
 
 
 BEFORE = "_deformation_before"
@@ -142,8 +132,7 @@ def _twin(path: CommandPath, motion: _States | _Outputs) -> Block:
 
     reads, memory = Layout((*motion.reads, *path.reads)), Layout((*path.memory, *motion.memory, *own))
     writes = Layout((plant.response_signal("_modelled"),))
-    block = Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
-    return replace(block, waits=unseen(block, (MEASURED, MEASURED_OUTPUT)))
+    return Block("mirror", reads, writes, step, memory, opaque=problem.integrator.opaque)
 
 
 class _States:

@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, straightened
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import ceil, larger, left_after, left_in_mean, nominal, numbers, stays
@@ -94,8 +94,7 @@ class KnownSignals:
         parameter, opaque = self.plant.parameter, not values.is_a("SXFunction")
         writes = Layout((Signal(NOW, parameter.elements, parameter.units), *((acted,) if remembers else ())))
         memory = Layout((last,)) if remembers else Layout()
-        block = Block("signals", Layout((time_signal(self.plant), parameter)), writes, step, memory, opaque)
-        return replace(block, waits=block)  # time goes on
+        return Block("signals", Layout((time_signal(self.plant), parameter)), writes, step, memory, opaque)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,28 +284,6 @@ class ResponsePairs:
             return (*states, *commands)
         outputs = self._states.memory(_OUTPUTS, problem.plant.output.elements, problem.start_output.tolist())
         return (*states, *commands, *outputs)
-
-    @property
-    def gaps(self) -> bool:
-        """Whether past states or outputs wait, which a gap moves."""
-        return self._states.length > 1
-
-    def moved(self, s: Signals) -> Signals:
-        """Return the signals of a cycle after a gap: past states and outputs on the line from the last ones to these."""
-        if not self.gaps:
-            return s
-        now = {_STATES: getattr(s, self.state.name)}
-        now |= {_OUTPUTS: getattr(s, self.seen.name)} if self.with_outputs else {}
-        return Signals({**vars(s), **{n: straightened(getattr(s, n), value, s.gap) for n, value in now.items()}})
-
-    def waited(self, s: Signals, newest: Expression) -> tuple[Expression, dict[str, Expression]]:
-        """Return the command of the response in a cycle without a sample, and what is remembered: the last state once more."""
-        command, remembered = self._commands.arrived(s, _COMMANDS, newest)
-        plant = self.problem.plant
-        for name, size in ((_STATES, plant.state.size), (_OUTPUTS, plant.output.size)):
-            if self.gaps and (name == _STATES or self.with_outputs):
-                remembered |= self._states.arrived(s, name, getattr(s, name)[:size])[1]
-        return command, remembered
 
     def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
         """Return state and command of the response, and what is remembered."""

@@ -8,7 +8,7 @@ The state has each entry from where it is known best: believed entries from the 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import cast
 
@@ -25,8 +25,8 @@ from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Evidence, Model, StateObserver, members, slowest, unobservable, values_of
-from fpirhc.symbolic.block import GAP, Block, Delay, bridged, call
-from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import Queue
@@ -40,18 +40,15 @@ class Believing:
     problem: Problem  # whose sensing has an observer
     raw: Signal  # signal of the raw measurements
     shown: np.ndarray  # first state, or outputs, that the sensors see; the estimator begins there
-    lost: bool = False  # whether samples may be lost
 
     @property
     def block(self) -> Block:
         """Block (raw measurements, parameters, last command) -> (state, [output], realised)."""
         plant = self.problem.plant
-        reads = Layout((self.raw, *self._path.reads, *((GAP,) if self.lost else ())))
+        reads = Layout((self.raw, *self._path.reads))
         writes = Layout((*measured_signals(plant), plant.response_signal("realised")))
         own = Layout((*self._path.memory, *self.observer.memory(self.model).signals)) + self._estimator.memory
-        lossy = None if self.lost else lambda: replace(self, lost=True).block
-        waits = Block("believe_waits", Layout((*self._path.reads, GAP)), Layout(), self._wait, own)
-        return Block("believe", reads, writes, self._step, own, waits=waits if self.lost else None, bridged=lossy)
+        return Block("believe", reads, writes, self._step, own)
 
     @property
     def delay(self) -> Delay:
@@ -80,8 +77,7 @@ class Believing:
     def _estimator(self) -> Block:
         plant, sensing = self.problem.plant, self.problem.sensing
         completed = Signal("_completed", sensing.estimator.measures(plant))
-        block = sensing.estimator.block(plant, self.problem.period, self.shown, completed)
-        return bridged(block) if self.lost else block
+        return sensing.estimator.block(plant, self.problem.period, self.shown, completed)
 
     def _step(self, s: Signals) -> dict[str, Expression]:
         plant = self.problem.plant
@@ -95,19 +91,6 @@ class Believing:
         results |= {plant.output.name: motion, "state": state, "realised": realised}
         results |= {f"{m}_next": v for m, v in next_memory.items()}
         return results | {f"{m.name}_next": v for m, v in zip(self._estimator.memory.signals, remembered, strict=True)}
-
-    def _wait(self, s: Signals) -> dict[str, Expression]:
-        """Memory after a cycle without a sample: the prediction with nothing to correct it."""
-        evidence, results = self._evidence(s, dict.fromkeys(self.raw.elements, expression(0.0)))
-        memory = {m: getattr(s, m) for m in self.observer.memory(self.model).names}
-        predicted = self.observer.predict(self.model)(evidence, memory)
-        _, next_memory = self.observer.correct(self.model)(replace(evidence, counts=expression(0.0)), memory, predicted)
-        results |= {f"{m}_next": v for m, v in next_memory.items()}
-        remembered = {m: getattr(s, m) for m in self._estimator.memory.names}
-        waits = self._estimator.waits
-        if waits is not None:
-            call(waits, dict(vars(s)), remembered)
-        return results | {f"{m}_next": v for m, v in remembered.items()}
 
     def _evidence(self, s: Signals, shown: Mapping[str, Expression]) -> tuple[Evidence, dict[str, Expression]]:
         """What the observer is told, with no state known yet, and what is remembered for the next cycle."""
@@ -127,8 +110,7 @@ class Believing:
         """State or outputs, response, and memory of the estimator."""
         names = self.problem.sensing.estimator.measures(self.problem.plant)
         completed = ca.vertcat(*(seen[n] for n in names))
-        gap = [s.gap] if self.lost and GAP.name in self._estimator.reads else []
-        results = self._estimator.function(completed, *gap, *(getattr(s, m) for m in self._estimator.memory.names))
+        results = self._estimator.function(completed, *(getattr(s, m) for m in self._estimator.memory.names))
         return tuple(results)
 
 

@@ -7,13 +7,13 @@ A machine gives the step what its sensors show; a skipped cycle leaves the estim
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, fed, like
+from fpirhc.controllers.base import Controller, like
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.model_inputs import ACTED, NOW, KnownSignals, measured_reads, with_measured_state
@@ -26,7 +26,7 @@ from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.symbolic.block import GAP, Block, Composite, Delay, bridged, compose, straightened
+from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
@@ -179,15 +179,11 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
         return {_MEASURED if name == plant.output.name else name: value for name, value in estimate.step(s).items()}
 
     writes = Layout(tuple(measured if w.name == plant.output.name else w for w in estimate.writes.signals))
-    lossy = None if estimate.bridged is None else lambda: with_steps_ahead(plant, bridged(estimate))[0]
-    return [replace(estimate, step=step, writes=writes, bridged=lossy), _ahead_block(plant, measured)]
+    return [replace(estimate, step=step, writes=writes), _ahead_block(plant, measured)]
 
 
-def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block:
-    """Block (differences of the last cycles, state, parameters) -> outputs and their differences at this cycle.
-
-    Over a gap the expected outputs of the last cycles are on the line from the last ones to those of now.
-    """
+def _ahead_block(plant: Plant, measured: Signal) -> Block:
+    """Block (differences of the last cycles, state, parameters) -> outputs and their differences at this cycle."""
     elements = plant.output.elements
     powers = [e.count("'") for e in elements]
     x, u, p = plant.symbols()
@@ -201,10 +197,7 @@ def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block
         before, count, at = getattr(s, _PAST), getattr(s, _COUNT), 0
         outputs, remembered = [], []
         for k, power in enumerate(powers):
-            past_outputs = [before[at + i] for i in range(power)]
-            if lost and power:
-                past_outputs = ca.vertsplit(straightened(ca.vertcat(*past_outputs), now[k], s.gap))
-            queue = [now[k], *past_outputs]
+            queue = [now[k], *(before[at + i] for i in range(power))]
             at += power
             brought = now[k] + ca.if_else(count > power - 0.5, arrived[k] - queue[-1], 0)
             outputs.append(brought if power else arrived[k])
@@ -217,19 +210,7 @@ def _ahead_block(plant: Plant, measured: Signal, *, lost: bool = False) -> Block
 
     reads = Layout((measured, plant.state, plant.parameter))
     writes, memory = Layout((plant.output,)), Layout((past, counted))
-    if not lost:
-        lossy = lambda: _ahead_block(plant, measured, lost=True)  # noqa: E731
-        return Block("steps_ahead", reads, writes, step, memory, bridged=lossy)
-
-    def wait(s: Signals) -> dict[str, Expression]:
-        before, at, again = getattr(s, _PAST), 0, list[Expression]()
-        for power in powers:
-            again += [before[at + max(i - 1, 0)] for i in range(power)]
-            at += power
-        return {f"{_PAST}_next": ca.vertcat(*again), f"{_COUNT}_next": getattr(s, _COUNT)}
-
-    waits = Block("steps_wait", Layout(), Layout(), wait, memory)
-    return Block("steps_ahead", reads + Layout((GAP,)), writes, step, memory, waits=waits)
+    return Block("steps_ahead", reads, writes, step, memory)
 
 
 def controller_reads(problem: Problem, controller: Controller) -> Layout:
@@ -317,7 +298,6 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
         return {**composite.trace.split(trace), **remembered}
 
-    lossy = composite.bridged_if_any
     return Block(
         name,
         Layout(reads),
@@ -326,13 +306,4 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         composite.memory,
         opaque=composite.opaque,
         derived=composite.derived_if_any,
-        waits=None if composite.waits is None else fed_by(composite.waits, feeds),
-        bridged=None if lossy is None else lambda: embedded(name, lossy(), feeds),
     )
-
-
-def fed_by(block: Block, feeds: Mapping[str, Signal]) -> Block:
-    """Return the block with other signals in place of those that `feeds` names."""
-    for name, source in feeds.items():
-        block = fed(block, name, source)
-    return block

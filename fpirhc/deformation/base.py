@@ -214,17 +214,6 @@ class Deformation(Checked, ABC):
         del elements
         return Layout()
 
-    def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
-        """Return what the map remembers one cycle later, where the request was held and no response is known, by name.
-
-        Signals that are not named stay as they are; by default all.
-
-        Args:
-            request: that was held, a column.
-            memory: the signals of `memory`, by name.
-        """
-        return {} if self.inner is None else self.inner.held(request, memory)
-
     def shown(self) -> Mapping[str, str]:
         """Signals to log: name of the signal -> name of the scalar in the memory."""
         return {}

@@ -80,9 +80,6 @@ class ModelReferenced(Wrapper):
         """The pole p in use."""
         return chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
 
-    def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:  # noqa: ARG002
-        return {}
-
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         return Layout((Signal("own_deformation", past),)) + self.map.memory(elements)

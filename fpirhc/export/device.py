@@ -14,11 +14,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.gate import BRIDGED
 from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.problem_files.settings import unit_of_setting
-from fpirhc.simulation.clock import most_missed
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import PREFIX
@@ -90,11 +88,6 @@ class Device:
                 "stay as it was; export without live settings, or with gains, limits and rates alone"
             )
         return dict(self.stepper.bounds())
-
-    @cached_property
-    def most_missed(self) -> int:
-        """Number of missed cycles that a step makes up for."""
-        return most_missed(self.problem, BRIDGED)
 
     @cached_property
     def sources(self) -> tuple[str, ...]:

@@ -78,10 +78,6 @@ class DerivativeEstimator(Checked, ABC):
     def fills(self, order: int) -> int:
         """Number of the first cycle (from 0) whose response depends on this run's samples alone."""
 
-    def settles(self, order: int, period: float) -> int:  # noqa: ARG002
-        """Number of further cycles in which a jump of what is measured decays, where it begins anew in it; by default none."""
-        return 0
-
     def check(self, plant: Plant) -> None:
         """Raise if the estimator cannot serve the plant.
 

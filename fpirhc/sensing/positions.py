@@ -21,7 +21,7 @@ from fpirhc.fields.kinds import Count, whole
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, OfPositions, backward_difference, combine, spline_weights
-from fpirhc.symbolic.block import GAP, Block, ahead, continued, is_long, shares
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -47,13 +47,7 @@ class _Finite(OfPositions, ABC):
         return int(self.coefficients(order).shape[1]) - 1
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
-        """Block (positions) -> (state, response).
-
-        Over a gap the positions go on by the polynomial of the plant's order through the last ones.
-        """
-        return self._block(plant, period, start, seen, lost=False)
-
-    def _block(self, plant: Plant, period: float, start: Array, seen: Signal, *, lost: bool) -> Block:
+        """Block (positions) -> (state, response)."""
         rows = [self.coefficients(r) / period ** np.arange(r + 1)[:, None] for r in plant.chains.values()]
         queue = _queue(plant, period, start, [row.shape[1] - 1 for row in rows])
         realised = plant.response_signal("realised")
@@ -65,8 +59,7 @@ class _Finite(OfPositions, ABC):
             responses: list[Expression] = []
             for k, ((name, order), row) in enumerate(zip(plant.chains.items(), rows, strict=True)):
                 count = row.shape[1] - 1
-                older = [past[at + i] for i in range(count)]
-                samples = [newest[k], *(_moved(older, newest[k], order, s.gap) if lost else older)]
+                samples = [newest[k], *(past[at + i] for i in range(count))]
                 at += count
                 past_next += samples[:count]
                 known |= {name + "'" * d: combine(row[d], samples) for d in range(order)}
@@ -75,37 +68,7 @@ class _Finite(OfPositions, ABC):
             realised = ca.vertcat(*(responses[k] for k in controlled_places(plant)))
             return {plant.output.name: state, "realised": realised, "estimate_past_next": ca.vertcat(*past_next)}
 
-        reads, writes, memory = (
-            Layout((seen, GAP) if lost else (seen,)),
-            Layout((plant.output, realised)),
-            Layout((queue,)),
-        )
-        if lost:
-            return Block("estimate", reads, writes, step, memory, waits=_waiting(plant, rows, memory))
-        return Block(
-            "estimate", reads, writes, step, memory, bridged=lambda: self._block(plant, period, start, seen, lost=True)
-        )
-
-
-def _moved(older: list[Expression], newest: Expression, order: int, gap: Expression) -> list[Expression]:
-    """Positions of the past on the polynomial that ends in the newest one; without a gap as they are."""
-    away = newest - continued(ahead(len(older), order), older)
-    return [q + share * away for q, share in zip(older, shares(gap, len(older), order), strict=True)]
-
-
-def _waiting(plant: Plant, rows: Sequence[Array], memory: Layout) -> Block:
-    """Block that goes on by the polynomial through the past positions; a gap that is not bridged keeps them."""
-
-    def step(s: Signals) -> dict[str, Expression]:
-        past, at, past_next = s.estimate_past, 0, list[Expression]()
-        for row, order in zip(rows, plant.chains.values(), strict=True):
-            count = row.shape[1] - 1
-            older = [past[at + i] for i in range(count)]
-            at += count
-            past_next += [continued(ahead(count, order), older), *older[:-1]]
-        return {"estimate_past_next": ca.if_else(is_long(s.gap), past, ca.vertcat(*past_next))}
-
-    return Block("estimate_waits", Layout((GAP,)), Layout(), step, memory)
+        return Block("estimate", Layout((seen,)), Layout((plant.output, realised)), step, Layout((queue,)))
 
 
 def _queue(plant: Plant, period: float, start: Array, counts: list[int]) -> Signal:

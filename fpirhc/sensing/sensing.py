@@ -189,10 +189,6 @@ class Sensing(Checked):
             return 1
         return ceil(late) + max(self.estimator.fills(plant.chains[name]) for name in plant.controlled_names)
 
-    def settling_cycles(self, plant: Plant, period: float) -> int:
-        """Number of further cycles after a long gap until estimates are those of later samples alone."""
-        return max((self.estimator.settles(plant.chains[name], period) for name in plant.controlled_names), default=0)
-
     @property
     def drawn(self) -> tuple[Signal, ...]:
         """The signal of all random series; empty where there is none."""

@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.fields.kinds import Range
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, AtOnce, DerivativeEstimator
-from fpirhc.symbolic.block import GAP, Block, is_long, straightened
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
@@ -92,10 +92,8 @@ def _highest(plant: Plant) -> tuple[str, ...]:
     return tuple(name + "'" * (plant.chains[name] - 1) for name in plant.controlled_names)
 
 
-def _difference_block(
-    plant: Plant, period: float, start: Array, seen: Signal, pole: float, *, lost: bool = False
-) -> Block:
-    """Block (state) -> (state, p f + (1 - p) difference over the period); over a gap the difference is the mean one."""
+def _difference_block(plant: Plant, period: float, start: Array, seen: Signal, pole: float) -> Block:
+    """Block (state) -> (state, p f + (1 - p) difference over the period)."""
     places = [plant.output.elements.index(e) for e in _highest(plant)]
     before = Signal("estimate_before", tuple(seen.elements[p] for p in places), start=tuple(map(float, start[places])))
     realised, smooth = plant.response_signal("realised"), Signal("estimate_smooth", plant.controlled_names)
@@ -103,33 +101,17 @@ def _difference_block(
 
     def step(s: Signals) -> dict[str, Expression]:
         state = getattr(s, seen.name)
-        newest, before = state[places], s.estimate_before
-        if lost:
-            before = straightened(before, newest, s.gap)
-        response = (newest - before) / period
+        newest = state[places]
+        response = (newest - s.estimate_before) / period
         results = {plant.output.name: state, "realised": response, "estimate_before_next": newest}
         if not pole:
             return results
         smooth, cycles = s.estimate_smooth, s.estimate_cycles
-        if lost:
-            left = ca.power(pole, s.gap)
-            smooth = ca.if_else(s.gap > 0.5, left * smooth + (1 - left) * response, smooth)
-            cycles = ca.if_else(is_long(s.gap), 0, cycles)
         response = ca.if_else(cycles < 1.5, response, pole * smooth + (1 - pole) * response)
         cycles_next = ca.fmin(cycles + 1, 2)
         return {**results, "realised": response, "estimate_smooth_next": response, "estimate_cycles_next": cycles_next}
 
-    writes, own = Layout((plant.output, realised)), Layout(memory)
-    if lost:
-        return Block("estimate", Layout((seen, GAP)), writes, step, own)
-    return Block(
-        "estimate",
-        Layout((seen,)),
-        writes,
-        step,
-        own,
-        bridged=lambda: _difference_block(plant, period, start, seen, pole, lost=True),
-    )
+    return Block("estimate", Layout((seen,)), Layout((plant.output, realised)), step, Layout(memory))
 
 
 EXAMPLES = (VelocityDifference(), LowPassDifference(time_constant=0.01))

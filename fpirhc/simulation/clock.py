@@ -29,7 +29,6 @@ CLOCK = "_clock"  # signal of the believed time; NaN where it is none, and AGAIN
 LONGEST = 1e5  # periods between two steps
 _RESOLVED = 2.0**42  # periods from zero within which a period is resolved to a thousandth
 _PATIENCE = 20
-_STEPS = 500
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 Clock = Callable[[], float]
@@ -86,19 +85,6 @@ def missed_cycles(time: float, before: float, period: float) -> int:
     """
     cycles = (time - before) / period
     return round(cycles) - 1 if before > -FINITE / 2 and 1.5 <= cycles <= LONGEST else 0
-
-
-def most_missed(problem: Problem, bridged: int) -> int:
-    """Return the number of missed cycles that are stepped over, so that the time of a step has a bound.
-
-    Beyond it estimators begin anew, and queues hold nothing but the held command; an observer is predicted no further.
-
-    Args:
-        bridged: number of missing cycles up to which a gap is bridged; queues go on for their whole length.
-    """
-    late = problem.dead_time
-    longest = max((*late.inputs.values(), *late.longest.values()), default=0.0)
-    return max(_STEPS, bridged + 1) + math.ceil((longest + late.measurement) / problem.period)
 
 
 class Deadline:

@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Undeformed, given_response
-from fpirhc.controllers.gate import BRIDGED, INNER, Gate, across_gaps, gap_of
+from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.sensing_chain import compose_with_sensing, seeing_blocks, sensor_ranges
@@ -22,11 +22,13 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import (
     acting_blocks,
     disturbance_signals,
+    loses,
     lost_blocks,
     moving,
     outside_blocks,
     sensing_blocks,
 )
+from fpirhc.simulation.replay import known_samples
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
@@ -51,9 +53,9 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
     task = nominal(problem)
-    mover, lost = moving(problem), lost_blocks(problem)
-    inner, gap = across_gaps(compose_with_sensing(problem, ready)), gap_of(task, BRIDGED)
-    acting = Gate(task, inner, trusted=("time", "memory"), ranges=sensor_ranges(task), loses=bool(lost), gap=gap)
+    mover, lost, inner = moving(problem), lost_blocks(problem), compose_with_sensing(problem, ready)
+    ranges, samples = sensor_ranges(task), known_samples(task) if loses(problem) else 0
+    acting = Gate(task, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = disturbance_signals(problem)
     seeing = sensing_blocks(problem, given_response(problem, ready), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
@@ -86,7 +88,7 @@ def start_memory(
         starts |= {name: value for name, value in live.items() if name in loop.memory}
         starts |= {**derived.signals, **derived.memory()}
     elif INNER in loop.memory and _plans_exactly(loop, problem, controller):
-        starts[INNER] = across_gaps(compose_with_sensing(problem, controller)).memory.start()
+        starts[INNER] = compose_with_sensing(problem, controller).memory.start()
     return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, fed, under_names
 from fpirhc.controllers.contract import given_response
-from fpirhc.controllers.gate import Gate, across_gaps, gap_of, was_skipped
+from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.sensing_chain import compose_with_sensing, given_states, raw_signal, sensor_ranges
 from fpirhc.deformation.base import of_last_pair
@@ -27,6 +27,7 @@ from fpirhc.plant.motion import SECONDS
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
+from fpirhc.simulation.replay import known_samples
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, compose
 from fpirhc.symbolic.driver import every_finite
@@ -194,7 +195,7 @@ def _count_block() -> Block:
 
 
 def composed_step(
-    live: LiveSettings, ready: Controller, max_age: float | None, monitor: RunMonitor, bridged: int
+    live: LiveSettings, ready: Controller, max_age: float | None, monitor: RunMonitor
 ) -> tuple[Composite, Layout]:
     """Return the step behind its gate, and the layout of its memory.
 
@@ -203,9 +204,9 @@ def composed_step(
     gates: list[Gate] = []
 
     def compose(problem: Problem, controller: Controller) -> Composite:
-        gap = gap_of(live.problem, bridged)
-        inner = across_gaps(compose_with_sensing(problem, controller))
-        gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), max_age=max_age, gap=gap))
+        inner = compose_with_sensing(problem, controller)
+        samples = known_samples(live.problem)
+        gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), max_age=max_age, samples=samples))
         return machine_step(live.problem, ready, gates[-1], monitor)
 
     composite = live.composed(compose) if live.paths else compose(live.problem, ready)

@@ -19,7 +19,7 @@ from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
-from fpirhc.controllers.sensing_chain import first_estimates, first_shown
+from fpirhc.controllers.sensing_chain import first_estimates, first_shown, sensor_ranges
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
@@ -383,6 +383,18 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     assert late is not None
     realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
     return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
+
+
+def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
+    """Return how many cycles one call of the loop runs: one where samples may be lost, and the caller replays them."""
+    mover = moving(problem)
+    many = mover.cycles_of_call if compiled else mover.cycles_interpreted
+    return 1 if loses(problem) else many
+
+
+def loses(problem: Problem) -> bool:
+    """Return whether samples may be lost, or lie outside the range of their sensor."""
+    return bool(lost_blocks(problem) or sensor_ranges(problem))
 
 
 def lost_blocks(problem: Problem) -> list[Block]:

@@ -28,8 +28,9 @@ from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.changes import Changes, InForce, in_force
 from fpirhc.simulation.loop import close_loop, start_memory
-from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, moving
+from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, cycles_per_call, moving
 from fpirhc.simulation.ranges import Dropped
+from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
 from fpirhc.simulation.tables import run_tables
@@ -230,7 +231,7 @@ class ComposedLoop:
     @property
     def calls(self) -> int:
         """Cycles of a call of the compiled loop."""
-        return moving(self.problem).cycles_of_call
+        return cycles_per_call(self.problem, compiled=True)
 
     def simulator(self, compiled: bool | None, known: dict[object, Compiled] | None = None) -> Simulator:
         """Return the loop ready to run.
@@ -253,7 +254,7 @@ class ComposedLoop:
         backend = Native(function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
         if self.worth_compiling(compiled):
             backend = native(function, required=bool(self.live.paths), calls=self.calls)
-        interpreted = moving(self.problem).cycles_interpreted
+        interpreted = cycles_per_call(self.problem, compiled=False)
         called = backend.function if backend.compiled else chained(function, interpreted, _CHAIN)
         return Evaluator(called), backend.compiled, backend.reason
 
@@ -353,6 +354,7 @@ def run_cycles(
     memory, *read, run = evaluator.arguments
     windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
     after, sent = evaluator.results[0], evaluator.results[2:]
+    again = replaying(problem, loop, evaluator)
     memory[:] = start
     try:
         talk.begin(read[len(tables) :])
@@ -365,6 +367,7 @@ def run_cycles(
             run[:] = end - at
             evaluator.redirect(1, log[at : at + count])
             why = evaluator.failure()
+            why = why or again(memory, log[at])
             if why:
                 return log[:at].copy(), _failed(at, count, problem, why)
             rows = log[at:end]
@@ -389,7 +392,7 @@ def run_cycles(
 
 def _padded(problem: Problem, patches: Sequence[Patch]) -> int:
     """Rows of a log in whole chunks, with one to spare where a call ends at a change of the memory."""
-    chunk = moving(problem).cycles_of_call
+    chunk = cycles_per_call(problem, compiled=True)
     return (-(-problem.cycles // chunk) + (1 if patches else 0)) * chunk
 
 

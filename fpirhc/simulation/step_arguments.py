@@ -142,6 +142,7 @@ class StepArguments:
         estimates: whether the step begins with raw measurements.
         beside: number of entries of `output`, which are read beside the sample: measured outputs, or the state where the sample is
             that of estimated outputs; 0 without any.
+        sample: arguments by name.
         ages: whether the time stamp of the sample is read.
     """
 
@@ -153,6 +154,7 @@ class StepArguments:
         self.evaluator = Evaluator(function)
         arguments = dict(zip(function.name_in(), self.evaluator.arguments, strict=True))
         arguments["parameters"][:] = parameters
+        self.sample = arguments
         places = {name: k + 1 for k, name in enumerate(composite.reads.names)}  # after the memory
         self.settings = {name: self.evaluator.arguments[places[name]] for name in composite.settings.names}
         self.setpoints = np.zeros(0)

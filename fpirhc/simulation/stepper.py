@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isnan, nan
+from math import isnan
 from time import perf_counter
 from typing import TYPE_CHECKING, NoReturn, Self
 
@@ -14,13 +14,14 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import name_in_task
-from fpirhc.controllers.gate import BRIDGED, HELD
+from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import ByName, Checked, missing
 from fpirhc.simulation.clock import MEMORY as CLOCK
-from fpirhc.simulation.clock import Clock, Deadline, missed_cycles, most_missed
+from fpirhc.simulation.clock import Clock, Deadline, missed_cycles
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, measures, refuse_unbounded
+from fpirhc.simulation.replay import Bound, Replay
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
     NOTHING,
@@ -53,7 +54,7 @@ class ComposedStep:
     composite: Composite
     memory: Layout
     ages: bool  # whether it reads time stamps
-    bridged: int
+    replay: Replay
 
     @property
     def function(self) -> ca.Function:
@@ -70,7 +71,7 @@ class ComposedStep:
         monitor: RunMonitor | None = None,
         bounded: bool = True,
         live: Sequence[str] = (),
-        bridged: int = BRIDGED,
+        bridged: int | None = None,
     ) -> Self:
         """Return the step of a controller; arguments as of `Stepper`."""
         settings = live_settings(problem, controller, live)
@@ -78,8 +79,9 @@ class ComposedStep:
             ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
-        composite, memory = composed_step(settings, ready, max_age, monitor or RunMonitor(), bridged)
-        return cls(problem, controller, settings, ready, composite, memory, max_age is not None, bridged)
+        composite, memory = composed_step(settings, ready, max_age, monitor or RunMonitor())
+        replay = Replay.of(settings.problem, composite, bridged)
+        return cls(problem, controller, settings, ready, composite, memory, max_age is not None, replay)
 
 
 class Stepper(NumbersNow, Checked):
@@ -99,13 +101,13 @@ class Stepper(NumbersNow, Checked):
     Where the outputs of a plant are estimated, its state stands before them, unless it is believed.
 
     A bad sample skips the cycle: one that is not finite, outside the range of its sensor, or (with `max_age`) out of date. The
-    command is the last one, the status is BAD_SAMPLE, and the signal 'skipped' counts. What is remembered stays as it was, but
-    for what goes on with the time: queues, integrals, filters, observers. The next good sample moves them over the gap, with
-    the status BRIDGED. After more than `bridged` cycles they begin anew, and deformations are held until their windows are
-    full, with the status SETTLING. Cycles that the caller missed, by the times of two steps, are gaps too. Before the first
-    good sample the command is the one before the run. A sample for which the model has no number skips the cycle too, as
-    NON_FINITE. So does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not
-    finite is forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status
+    command is the last one, the status is BAD_SAMPLE, the signal 'skipped' counts, and every memory stays as it was. With the
+    next good sample the step runs once more for every missing cycle, on samples between those around the gap, with the status
+    BRIDGED; after more than `bridged` cycles for the last ones alone, as many as fill the windows of estimators, with the
+    status SETTLING. Cycles that the caller missed, by the times of two steps, are missing too. Before the first good sample
+    the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. So
+    does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not finite is
+    forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status
     RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands
     at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
 
@@ -141,7 +143,7 @@ class Stepper(NumbersNow, Checked):
         live: Sequence[str] = (),
         deadline: float | None = None,
         clock: Clock = perf_counter,
-        bridged: int = BRIDGED,
+        bridged: int | None = None,
     ) -> None:
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
@@ -152,7 +154,8 @@ class Stepper(NumbersNow, Checked):
             bounded: whether an optimiser whose call may take any time is refused.
             deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
             clock: function that returns the time for that, s.
-            bridged: number of missing cycles up to which estimators and queues are moved over a gap.
+            bridged: number of missing cycles up to which each of them is run afterwards; None: 5, or 20 behind differences of
+                positions.
         """
         self.deadline = None if deadline is None else Deadline(deadline, clock)
         if self.deadline is not None:
@@ -192,6 +195,8 @@ class Stepper(NumbersNow, Checked):
         self.estimates, self.beside = arguments.estimates, arguments.beside
         self._tokens = [True]
         self._fingerprint = float(self.memory[FINGERPRINT].start[0])
+        sample, a = arguments.sample, arguments
+        self._bound = Bound(a.memory_before, a.memory_next, a.trace, sample, sample, sample["time"], sample["time"])
         # Attributes of the stepper itself are found faster in every step.
         self._evaluate = arguments.evaluator.evaluate
         self._time, self._state, self._realised = arguments.time, arguments.state, arguments.realised
@@ -201,7 +206,7 @@ class Stepper(NumbersNow, Checked):
         self._before, self._period = self.memory.slice(CLOCK.name).start, float(problem.period)
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._counted = self.signals.slice(SKIPPED).start
-        self._late, self._most = 1.5 * self._period, most_missed(problem, step.bridged)
+        self._late, self.replay, self._missing = 1.5 * self._period, step.replay, step.replay.missing
 
     if not TYPE_CHECKING:
 
@@ -350,30 +355,28 @@ class Stepper(NumbersNow, Checked):
         """Evaluate the step, and before it those of missed cycles; return why it failed, empty where it did not."""
         try:
             if self._time[0] - self._memory[self._before] > self._late:
-                self._wait(self._time[0], self._memory[self._before])
-            if self._may_fail:
-                self._command[0] = NOT_WRITTEN
-            self._evaluate()
+                self._count(missed_cycles(self._time[0], self._memory[self._before], self._period))
+            missing = self._memory[self._missing]
+            why = self._solve()
+            return self.replay.after(self._bound, self._solve) if missing > 0 and not why else why
         except (RuntimeError, SystemError) as error:
             cause = unwrapped(error)
             if not isinstance(cause, RuntimeError):
                 raise cause from None
             return str(error) or "a solver raised"
+
+    def _solve(self) -> str:
+        if self._may_fail:
+            self._command[0] = NOT_WRITTEN
+        self._evaluate()
         return _NOT_SOLVED if self._may_fail and isnan(self._command[0]) else ""
 
-    def _wait(self, time: float, before: float) -> None:
-        """Step over the cycles that the caller missed, each without a sample."""
-        missed, sample = missed_cycles(time, before, self._period), self._state[0]
-        try:
-            for k in range(max(missed - self._most, 0), missed):
-                self._time[0], self._state[0], self._command[0] = before + (k + 1) * self._period, nan, NOT_WRITTEN
-                self._evaluate()
-                if isnan(self._command[0]):
-                    raise RuntimeError(_NOT_SOLVED)
-                self._arguments.memory_before[:] = self._arguments.memory_next
-            self._memory[self._skipped] += max(missed - self._most, 0)
-        finally:
-            self._time[0], self._state[0] = time, sample
+    def _count(self, missed: int) -> None:
+        """Count the cycles that the caller missed: none has a sample."""
+        self._memory[self._skipped] += missed
+        self._memory[self._before] = self._time[0] - self._period if missed else self._memory[self._before]
+        if self._memory[self._missing] > -0.5:
+            self._memory[self._missing] += missed
 
     def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:
         """The last command and the memory as it was, after a solver that raised or failed.

@@ -1,4 +1,4 @@
-"""The contract of everything that happens in a control cycle, how blocks become one Function, and cycles without a sample.
+"""The contract of everything that happens in a control cycle, and how blocks become one Function.
 
 Theory: docs/theory.md.
 """
@@ -13,59 +13,14 @@ from operator import attrgetter
 from typing import cast
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.symbolic.expression import FINITE, Expression, Matrix, Signals, Value, expression, kind, total
+from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, kind
 from fpirhc.symbolic.layout import Kind, Layout, Signal, scalar
 from fpirhc.symbolic.live import PREFIX as SETTING
 from fpirhc.symbolic.live import Derived, Values
 
-LONG = 1e15  # the gap that is not bridged; shares of it are one
-GAP, SETTLING = scalar("gap"), scalar("settling")
-GAPS = (GAP, SETTLING)
-
-
-def is_long(gap: Expression) -> Expression:
-    """Return whether the gap is longer than what is bridged."""
-    return gap > LONG / 2
-
-
-def shares(gap: Expression, count: int, degree: int = 1) -> list[Expression]:
-    """Return the shares w_1 ... w_count of the newest value in values that are 1 ... count cycles old."""
-    result, cycles = [], gap + 1
-    for i in range(1, count + 1):
-        share = ca.fmax(0, cycles - i) / cycles
-        for j in range(2, degree + 1):
-            share *= (gap + j - i) / (gap + j)
-        result.append(share)
-    return result
-
-
-def straightened(queue: Expression, newest: Expression, gap: Expression) -> Expression:
-    """Return a queue of columns, newest first, whose newest one was repeated over the gap, on the straight line to now."""
-    size = newest.numel()
-    entries = ca.vertsplit(queue)
-    line = shares(gap, len(entries) // size)
-    return ca.vertcat(*(e + line[k // size] * (newest[k % size] - e) for k, e in enumerate(entries)))
-
-
-def ahead(count: int, degree: int) -> np.ndarray:
-    """Return the weights of values 1 ... count cycles old, newest first, in the polynomial through them at this cycle.
-
-    It is the polynomial of that degree, or of the highest one that the values determine, by least squares.
-    """
-    powers = np.vander(-np.arange(1.0, count + 1) / count, min(degree, count - 1) + 1, increasing=True)
-    return np.asarray(np.linalg.pinv(powers)[0])
-
-
-def continued(weights: np.ndarray, values: Sequence[Expression]) -> Expression:
-    """Return the value of the polynomial at this cycle; see `ahead`."""
-    return total(float(w) * v for w, v in zip(weights, values, strict=True))
-
-
 Step = Callable[[Signals], Mapping[str, Value]]
-_NO_SAMPLE = 10 * FINITE  # beyond the finite numbers, and no NaN, which is the mark of a live setting that was lost
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
 
 
@@ -84,10 +39,6 @@ class Block:
             the block is then built with MX.
         derived: function of the numbers of all settings, by path, that returns what follows from them; None: nothing does.
         inside: the composed step that the block runs, where it is nothing but the guard of one.
-        waits: block with the same memory that stands for this one in a cycle without a sample. It reads no sample; what it writes,
-            others read that wait. None: the memory stays as it is.
-        bridged: function that returns the block where samples may be lost, which may read the signals `GAPS`; None: the
-            same one.
     """
 
     name: str
@@ -98,8 +49,6 @@ class Block:
     opaque: bool = False
     derived: Callable[[Values], Derived] | None = None
     inside: Composite | None = None
-    waits: Block | None = None
-    bridged: Callable[[], Block] | None = None
 
     @property
     def function(self) -> ca.Function:
@@ -228,42 +177,6 @@ class Composite:
         """Whether some block holds operations that scalar expressions cannot."""
         return any(map(attrgetter("opaque"), self.blocks))
 
-    @property
-    def bridged_if_any(self) -> Callable[[], Composite] | None:
-        """Function that returns the same step where samples may be lost; None where no block differs."""
-        return self._bridged if any(b.bridged is not None for b in self.blocks) else None
-
-    @cached_property
-    def waits(self) -> Block | None:
-        """The step in a cycle without a sample, as a block that writes nothing; None where every memory stays as it is."""
-        waiting = [b.waits for b in self.blocks if b.waits is not None]
-        if not any(b.memory.names for b in waiting):
-            return None
-        held = {*self.memory.names, *(w for b in waiting for w in b.writes.names)}
-        inputs = {s.name: s for b in waiting for s in b.inputs.signals if s.name not in held}
-        reads = Layout(tuple(inputs.values()))
-
-        def step(s: Signals) -> dict[str, Expression]:
-            known = dict(vars(s))
-            following = {m: known[m] for m in self.memory.names}
-            for block in waiting:
-                call(block, known, following)
-            return {f"{m}_next": value for m, value in following.items()}
-
-        opaque = any(b.opaque for b in waiting)
-        return Block(f"{self.name}_waits", reads, Layout(), step, self.memory, opaque=opaque)
-
-    def _bridged(self) -> Composite:
-        blocks = [bridged(b) for b in self.blocks]
-        read = {name for b in blocks for name in b.reads.names} - set(self.reads.names)
-        gaps = [g for g in GAPS if g.name in read]
-        return compose(self.name, self.reads + Layout((*gaps,)), blocks, self.delays, self.outputs)
-
-
-def bridged(block: Block) -> Block:
-    """Return the block as it is where samples may be lost."""
-    return block if block.bridged is None else block.bridged()
-
 
 def compose(
     name: str, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay] = (), outputs: Sequence[str] = ()
@@ -323,23 +236,6 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
 def open_settings(blocks: Sequence[Block]) -> Layout:
     """Return the signals of all settings and derived numbers that some blocks read."""
     return _settings([s for b in blocks for s in b._built[1].signals])
-
-
-def unseen(block: Block, samples: Sequence[str]) -> Block:
-    """Return the block that runs a step in a cycle without a sample, for a step that passes over samples which are not finite.
-
-    `samples`: names of the signals that are missing; it is given a number beyond the finite ones.
-    """
-    missing = {s.name: s.size for s in block.reads.signals if s.name in samples}
-
-    def step(s: Signals) -> dict[str, Expression]:
-        values = block.step(
-            Signals({**vars(s), **{n: expression(ca.DM.ones(k, 1) * _NO_SAMPLE) for n, k in missing.items()}})
-        )
-        return {f"{m}_next": expression(values[f"{m}_next"]) for m in block.memory.names}
-
-    reads = Layout(tuple(s for s in block.reads.signals if s.name not in missing))
-    return replace(block, name=f"{block.name}_waits", reads=reads, writes=Layout(), step=step)
 
 
 def every(block: Block, cycles: int) -> Block:

@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import GAP, Block, Delay, is_long
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 from fpirhc.symbolic.live import numbers, remembered
@@ -159,14 +159,11 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
     Every coordinate is judged alone: its error counts where it is not of the sign of '_cut_off', what limits cut off of its
     demand. So it takes the integral out of a limit, where a frozen integral could stay for ever.
 
-    Over a gap the error is on a line: cycle by cycle the last one is integrated again, and the next sample adds the rest.
-
     Args:
         period: of the control cycle, s.
         useful: what the integral of every controlled coordinate may ask for; empty: anything.
     """
     writes = Layout((integral_signal(plant, "integral"),))
-    increment, before = integral_signal(plant, "integral_increment"), integral_signal(plant, "_integral_before")
     cut_off, held = plant.response_signal("_cut_off"), scalar("_held")
     reads = (error_signal(plant), cut_off, held, integral_signal(plant, "_integral_used"))
 
@@ -178,20 +175,7 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
         columns = zip(useful, ca.vertsplit(s._integral_used), ca.vertsplit(error), strict=True)
         return {"integral": ca.vertcat(*(one.next(i, e, period) for one, i, e in columns))}
 
-    def lossy(s: Signals) -> dict[str, Expression]:
-        integral = step(s)["integral"]
-        added = integral - s._integral_used
-        missing = ca.if_else(is_long(s.gap), 0, s.gap)
-        rest = ca.if_else(missing > 0.5, missing / 2 * (added - s.integral_increment), 0)
-        return {"integral": integral + rest, "integral_increment_next": added}
-
-    def wait(s: Signals) -> dict[str, Expression]:
-        added = ca.if_else(is_long(s.gap), 0, s.integral_increment)
-        return {"_integral_before_next": s._integral_before + added, "integral_increment_next": s.integral_increment}
-
-    waits = Block("tracking_waits", Layout((GAP,)), Layout(), wait, Layout((before, increment)))
-    bridged = Block("tracking_update", Layout((*reads, GAP)), writes, lossy, Layout((increment,)), waits=waits)
-    return Block("tracking_update", Layout(reads), writes, step, bridged=lambda: bridged)
+    return Block("tracking_update", Layout(reads), writes, step)
 
 
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:

@@ -17,7 +17,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Positive, Range
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import GAP, Block, straightened
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.live import following, live_numbers, nominal, power, settled
@@ -97,13 +97,7 @@ class Fractional(IntegralLaw):
         return self.rate
 
     def law(self, plant: Plant, period: float) -> Block:
-        """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use).
-
-        Over a gap S is on the line from the last one to that of now.
-        """
-        return self._law(plant, period, lost=False)
-
-    def _law(self, plant: Plant, period: float, *, lost: bool) -> Block:
+        """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         check_modes(self, plant, [self.rate])
         cycles, size = nominal(self).cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
@@ -123,11 +117,7 @@ class Fractional(IntegralLaw):
             last = s.decay_first + ca.vertcat(*(s.decay_past[cycles * k] for k in range(size)))
             decaying = self._useful_decay(measured, ca.if_else(running, last, 0))
             first = ca.if_else(running, s.decay_first, decaying)
-            past = s.decay_past
-            if lost:
-                queued = zip(ca.vertsplit(past, cycles), ca.vertsplit(decaying - first), strict=True)
-                past = ca.vertcat(*(straightened(queue, now, s.gap) for queue, now in queued))
-            past_now = ca.if_else(running, past, 0)
+            past_now = ca.if_else(running, s.decay_past, 0)
             queues = [_pushed(past_now[cycles * k : cycles * (k + 1)], decaying[k] - first[k]) for k in range(size)]
             # One product per coordinate, so that a long memory becomes a short loop in generated code.
             summed = ca.vertcat(*(ca.dot(weights, queue) for queue in queues))
@@ -143,18 +133,7 @@ class Fractional(IntegralLaw):
         derived = None
         if row is not None:
             reads, derived = reads + row.reads, row.derived
-        if not lost:
-            lossy = lambda: self._law(plant, period, lost=True)  # noqa: E731
-            return Block("tracking", reads, writes, step, memory, opaque=True, derived=derived, bridged=lossy)
-
-        def wait(s: Signals) -> dict[str, Expression]:
-            again = (_pushed(queue, queue[0]) for queue in ca.vertsplit(s.decay_past, cycles))
-            return {"decay_past_next": ca.vertcat(*again), "decay_first_next": s.decay_first}
-
-        waits = Block("tracking_waits", Layout(), Layout(), wait, memory, opaque=True)
-        return Block(
-            "tracking", reads + Layout((GAP,)), writes, step, memory, opaque=True, derived=derived, waits=waits
-        )
+        return Block("tracking", reads, writes, step, memory, opaque=True, derived=derived)
 
     def _row(self, cycles: int, period: float) -> np.ndarray:
         """The weights of the past, and (Lambda T)^beta."""

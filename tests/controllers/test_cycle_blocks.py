@@ -13,8 +13,8 @@ import pytest
 import fpirhc as fp
 from fpirhc import Status
 from fpirhc.contraction.delayed import step_for_basin
-from fpirhc.contracts import Block, Controller, Deformation, Layout, Response, reference_block, scalar
-from fpirhc.controllers.base import clip, commanding_blocks, deform_block, fed, invert_block, with_held_deformation
+from fpirhc.contracts import Block, Controller, Deformation, Response, reference_block, scalar
+from fpirhc.controllers.base import clip, commanding_blocks, deform_block, invert_block
 from fpirhc.controllers.check import check_form, checked
 from fpirhc.controllers.contract import (
     Planner,
@@ -33,10 +33,9 @@ from fpirhc.controllers.reference_states import (
     request_of_commands,
     request_of_plans,
 )
-from fpirhc.controllers.sensing_chain import compose_controller, controller_reads, embedded
+from fpirhc.controllers.sensing_chain import compose_controller, controller_reads
 from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
-from fpirhc.symbolic.block import compose
 
 PERIOD = 0.1
 TIMES = np.linspace(0.0, 10.0, 100001)
@@ -172,24 +171,6 @@ def test_a_map_with_a_memory_remembers_nothing_of_an_absurd_error(error, learns)
     assert (result["_deformed_unclipped"].tolist() != [10.0, 20.0]) == learns
     after = np.concatenate([result[f"{name}_next"] for name in block.memory.names])
     assert (after != block.memory.start()).any() == learns
-
-
-@pytest.mark.parametrize(
-    ("deformation", "answered", "repeats"),
-    [
-        (fp.Affine(-1.0), 1.0, True),
-        (fp.Affine(-1.0), np.inf, False),
-        (fp.Identity(), 1.0, False),
-        (fp.Filtered(fp.Affine(-1.0), pole=0.5), 1.0, False),
-        (fp.ModelReferenced(fp.Affine(-1.0)), 1.0, False),
-    ],
-)
-def test_the_steps_of_missing_cycles_are_those_of_a_plain_map_without_memory(deformation, answered, repeats):
-    plant = masses().plant
-    block = with_held_deformation(
-        plant, deformation, deform_block(plant, deformation), settles=False, answered=answered
-    )
-    assert (block.bridged is not None) == repeats
 
 
 def test_one_blind_cycle_where_nothing_else_is_said():
@@ -527,21 +508,6 @@ def test_a_form_with_too_many_dead_times_is_refused():
     three = fp.ComputedTorque(TRACK, fp.Paired(fp.Affine(gain=-0.5), cycles=(1, 2, 3)))
     with pytest.raises(NotSupported, match="3"):
         check_form(masses(), three)
-
-
-def test_a_step_inside_another_one_is_given_other_signals_also_while_it_waits():
-    """The sum m + a + b, and m + 2 a + b while it waits; z in place of a."""
-    reads, memory = Layout((scalar("a"), scalar("b"))), Layout((scalar("m", start=1.0),))
-    waiting = Block("inside", reads, Layout(), lambda s: {"m_next": s.m + 2 * s.a + s.b}, memory)
-    block = Block("inside", reads, Layout(), lambda s: {"m_next": s.m + s.a + s.b}, memory, waits=waiting)
-    outer = embedded("outer", compose("inside", reads, [block]), {"a": scalar("z")})
-    for one in (outer, fed(block, "a", scalar("z"))):
-        assert one.waits is not None
-        assert one.reads.names == one.waits.reads.names == ("z", "b")
-        assert [float(v[0]) for v in cycle(one, z=3.0, b=0.5).values()] == [4.5]
-        assert [float(v[0]) for v in cycle(one.waits, z=3.0, b=0.5).values()] == [7.5]
-    assert fed(block, "d", scalar("z")) is block
-    assert embedded("outer", compose("inside", reads, [waiting]), {}).waits is None
 
 
 def test_a_reference_that_jumps_asks_for_its_largest_change_in_a_cycle():

@@ -16,7 +16,7 @@ import fpirhc as fp
 from fpirhc import Gate, Status
 from fpirhc.conformance.loops import two_masses
 from fpirhc.contracts import Block, Layout, Signal, scalar
-from fpirhc.controllers.gate import AGAIN, Gap, was_skipped
+from fpirhc.controllers.gate import AGAIN, was_skipped
 from fpirhc.symbolic.block import compose
 from fpirhc.symbolic.live import Derived
 
@@ -27,11 +27,8 @@ RANGES = {"state.a": (-1.0, 3.0), "state.b": (-np.inf, 5.0), "state.a'": (-4.0, 
 both = pytest.mark.parametrize("opaque", [False, True], ids=["scalar", "graph"])
 
 
-def inner(opaque: bool, *, with_status: bool = True, waits: bool = False):
-    """(count, sum) -> (count + 1, sum + a); command (sum + a, -count); 'fine' is the status, 1/b a part of the command.
-
-    With `waits` a cycle without a sample counts ten.
-    """
+def inner(opaque: bool, *, with_status: bool = True):
+    """(count, sum) -> (count + 1, sum + a); command (sum + a, -count); 'fine' is the status, 1/b a part of the command."""
     plant = PROBLEM.plant
     reads = Layout((scalar("time", "s"), plant.state, plant.response_signal("realised")))
     memory = Layout((scalar("count"), scalar("total", start=7.0)))
@@ -52,23 +49,15 @@ def inner(opaque: bool, *, with_status: bool = True, waits: bool = False):
         }
 
     writes = Layout((plant.input, *([scalar("status")] if with_status else [])))
-    waiting = Block(
-        "inside_waits",
-        Layout(),
-        Layout(),
-        lambda s: {"count_next": s.count + 10, "total_next": s.total},
-        memory,
-        opaque=opaque,
-    )
-    block = Block("inside", reads, writes, step, memory, opaque=opaque, waits=waiting if waits else None)
+    block = Block("inside", reads, writes, step, memory, opaque=opaque)
     return compose("inside", reads, [block], outputs=("command",))
 
 
 class Gated:
     """A gate with its memory, stepped with numbers by name."""
 
-    def __init__(self, opaque, waits=False, **settings):
-        self.gate = Gate(PROBLEM, inner(opaque, waits=waits), **settings)
+    def __init__(self, opaque, **settings):
+        self.gate = Gate(PROBLEM, inner(opaque), **settings)
         self.block = self.gate.block()
         self.reads, self.layout = self.gate.reads, self.gate.memory
         self.memory = {s.name: s.start_vector() for s in self.layout.signals}
@@ -241,7 +230,7 @@ def test_what_is_trusted_is_not_checked(opaque):
 @both
 def test_a_cycle_that_is_given_again_is_no_missing_one(opaque):
     """Its time is beyond every time: nothing is counted; a bad sample at any other time is missing."""
-    gated = Gated(opaque, gap=Gap(5, 0.0))
+    gated = Gated(opaque, samples=2)
     gated(0.5, time=0.0)
     gated(np.nan, time=0.1)
     gated(np.nan, time=AGAIN)
@@ -250,20 +239,6 @@ def test_a_cycle_that_is_given_again_is_no_missing_one(opaque):
     assert gated.memory["missing_cycles"].tolist() == [2.0]
     assert gated(0.5, time=0.3) == ([8.0, -1.0], Status.NOT_CONVERGED)
     assert gated.memory["missing_cycles"].tolist() == [0.0]
-
-
-@both
-def test_what_remembers_the_passing_time_waits_in_a_missing_cycle(opaque):
-    """Once in each, and not in a cycle that is given again; nor where gaps are not counted."""
-    gated, uncounted = Gated(opaque, waits=True, gap=Gap(5, 0.0)), Gated(opaque, waits=True)
-    for one in (gated, uncounted):
-        one(0.5, time=0.0)
-        one(np.nan, time=0.1)
-    assert (gated.own, uncounted.own) == ([11.0, 7.5], [1.0, 7.5])
-    gated(np.nan, time=AGAIN)
-    assert gated.own == [11.0, 7.5]
-    assert gated(0.5, time=0.2) == ([8.0, -11.0], Status.NOT_CONVERGED)
-    assert gated.own == [12.0, 8.0]
 
 
 def test_what_is_remembered():

@@ -72,7 +72,7 @@ def before_the_fault(stepper: fp.Stepper) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_sample_outside_the_domain_is_a_skipped_tick(name):
-    """The command is held, and afterwards every one is that of the tick missed, bit for bit."""
+    """The command is held, and every memory stays as it was, but for the clock and the counts."""
     stepper = fp.Stepper(TANK, CONTROLLERS[name], compiled=False)
     times, rows = measurements()
     command, memory = before_the_fault(stepper)
@@ -80,10 +80,8 @@ def test_sample_outside_the_domain_is_a_skipped_tick(name):
     assert status(stepper) == fp.Status.NON_FINITE
     assert stepper.trace()["skipped"] == 1
     assert np.array_equal(held, command)
-    for k in range(BAD + 1, BAD + 12):
-        one, after = stepper.step_measured(times[k], rows[k], after)
-        other, memory = stepper.step_measured(times[k], rows[k], memory)
-        assert np.array_equal(one, other)
+    changed = {s.name for s in stepper.memory.signals if (after != memory)[stepper.memory.slice(s.name)].any()}
+    assert changed == {"clock", "skipped_before", "not_finite"}
 
 
 @needs_compiler

@@ -103,7 +103,7 @@ class ADRC(Undeformed):
 
 
 def _prediction_block(problem: Problem) -> Block:
-    """Block (extended state, command) -> the extended state before the next sample; without a sample it goes on."""
+    """Block (extended state, command) -> the extended state before the next sample."""
     plant, gain, orders = (
         problem.plant,
         problem.plant.equations.input_gain,
@@ -128,13 +128,9 @@ def _prediction_block(problem: Problem) -> Block:
             "acting_next": ca.if_else(usable, effect, s.acting),
         }
 
-    def wait(s: Signals) -> dict[str, Expression]:
-        return {"_predicted_next": later(s._predicted, s.acting), "acting_next": s.acting}
-
     reads = Layout((plant.state, plant.input, plant.parameter, _states(plant, "extended_state"), predicted))
-    waits = Block("prediction_waits", Layout(), Layout(), wait, Layout((predicted, acting)))
     writes = Layout((_states(plant, "_predicted_later"),))
-    return Block("prediction", reads, writes, step, Layout((acting,)), waits=waits)
+    return Block("prediction", reads, writes, step, Layout((acting,)))
 
 
 def _corrections(plant: Plant, order: int, period: float, pole: float) -> Iterator[float]:

@@ -100,16 +100,11 @@ class IntelligentPID(Undeformed):
                 "window_filled_next": ca.if_else(usable, ca.fmin(s.window_filled + 1, length), 0),
             }
 
-        def wait(s: Signals) -> dict[str, Expression]:
-            """The window is filled anew from the next sample on."""
-            return {**{f"{n}_next": getattr(s, n) for n in memory.names}, "window_filled_next": ca.SX(0)}
-
         measured = dict.fromkeys((plant.state, plant.output))
         reads = (*measured, command_before(problem), plant.response_signal("desired"), plant.parameter)
         writes = ("_deformed_unclipped", "ultra_local")
         signals = Layout((like(plant.input, "command_unclipped"), *map(plant.response_signal, writes)))
-        waits = Block("model_waits", Layout(), Layout(), wait, memory)
-        return Block("ultra_local_model", Layout(reads), signals, step, memory, waits=waits)
+        return Block("ultra_local_model", Layout(reads), signals, step, memory)
 
 
 def window_weights(plant: Plant, order: int, length: int, period: float) -> tuple[np.ndarray, np.ndarray]:

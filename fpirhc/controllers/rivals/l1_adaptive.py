@@ -83,14 +83,9 @@ class L1Adaptive(Undeformed):
                 "predictor_begun_next": ca.if_else(usable, 1, 0),
             }
 
-        def wait(s: Signals) -> dict[str, Expression]:
-            """The predictor begins anew with the next sample; the estimate stays."""
-            return {**{f"{n}_next": getattr(s, n) for n in names}, "predictor_begun_next": ca.SX(0)}
-
         reads = Layout((plant.output, plant.response_signal("desired"), plant.response_signal("_expected")))
         writes = Layout((plant.response_signal("_deformed_unclipped"), plant.response_signal("response_disturbance")))
-        waits = Block("predictor_waits", Layout(), Layout(), wait, memory)
-        return Block("predictor", reads, writes, step, memory, waits=waits)
+        return Block("predictor", reads, writes, step, memory)
 
 
 def _expected_block(plant: Plant) -> Block:

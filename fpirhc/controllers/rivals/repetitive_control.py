@@ -80,15 +80,10 @@ class RepetitiveControl(PairedAtOnce):
             learned = self.smoothing * (before + after) + (1 - 2 * self.smoothing) * same
             return {"_deformed_unclipped": s.desired + learned, "_deformation": learned, "lessons_next": queue}
 
-        def wait(s: Signals) -> dict[str, Expression]:
-            """Without a sample nothing is learned of this cycle, and the period goes on: what it had is repeated."""
-            return {"lessons_next": ca.vertcat(s.lessons[size:], s.lessons[size : 2 * size])}
-
         names = ("desired", "realised", "_deformed_last", "_desired_last")
         reads = Layout((*map(plant.response_signal, names), scalar("warm_up")))
         writes = Layout(tuple(map(plant.response_signal, ("_deformed_unclipped", "_deformation"))))
-        waits = Block("repetition_waits", Layout(), Layout(), wait, Layout((lessons,)), opaque=True)
-        return Block("repetition", reads, writes, step, Layout((lessons,)), opaque=True, waits=waits)
+        return Block("repetition", reads, writes, step, Layout((lessons,)), opaque=True)
 
 
 EXAMPLES = (

@@ -349,9 +349,7 @@ def _renamed(inner: Composite, written: set[str]) -> Block:
         renamed = {other: values[name] for name, other in shown.items()}
         return {**renamed, **{f"{m}_next": values[f"{m}_next"] for m in block.memory.names}}
 
-    lossy = inner.bridged_if_any
-    bridged = None if lossy is None else lambda: _renamed(lossy(), written)
-    return replace(block, writes=writes, step=step, bridged=bridged)
+    return replace(block, writes=writes, step=step)
 
 
 # What is left is the dead time of the problem.

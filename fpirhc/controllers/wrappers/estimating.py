@@ -22,7 +22,7 @@ from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import GAP, Block, Delay
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
@@ -121,13 +121,7 @@ class Estimating(ControllerWrapper):
 
 
 def _estimate_block(
-    pairs: ResponsePairs,
-    modelled: Problem,
-    estimator: ParameterEstimator,
-    believed: Signal,
-    acted: Signal,
-    *,
-    lost: bool = False,
+    pairs: ResponsePairs, modelled: Problem, estimator: ParameterEstimator, believed: Signal, acted: Signal
 ) -> Block:
     """Block (state, realised, parameters, command of the last cycle) -> (corrected parameters, the learned ones among them)."""
     plant, model = pairs.problem.plant, modelled.plant
@@ -140,7 +134,6 @@ def _estimate_block(
     own = memory + Layout((like(estimate, "estimate_change"), discrete("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
-        s = pairs.moved(s) if lost else s
         parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
         before = {m: getattr(s, m) for m in memory.names}
         state, command, waiting = pairs.pair(s, s._acted)
@@ -168,38 +161,8 @@ def _estimate_block(
     outputs = (pairs.seen,) * pairs.with_outputs
     reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
     writes = Layout((believed, estimate))
-    if lost:
-        waits = _waiting(pairs, modelled, estimator, believed, acted, own)
-        reads = reads + Layout((GAP,)) if pairs.gaps else reads
-        block = Block("estimate", reads, writes, step, own, opaque=True, waits=waits)
-    else:
-        lossy = lambda: _estimate_block(pairs, modelled, estimator, believed, acted, lost=True)  # noqa: E731
-        block = Block("estimate", reads, writes, step, own, opaque=True, bridged=lossy)
+    block = Block("estimate", reads, writes, step, own, opaque=True)
     return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)
-
-
-def _waiting(
-    pairs: ResponsePairs, modelled: Problem, estimator: ParameterEstimator, believed: Signal, acted: Signal, own: Layout
-) -> Block:
-    """Block of a cycle without a sample: (parameters, command of the last cycle) -> corrected parameters."""
-    model, count = modelled.plant, len(pairs.problem.plant.parameters)
-    places = [model.parameter.elements.index(n) for n in estimator.learned()]
-    wait, names = estimator.waiting(modelled), estimator.memory(modelled).names
-
-    def step(s: Signals) -> dict[str, Value]:
-        parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))
-        command, waiting = pairs.waited(s, getattr(s, acted.name))
-        before = {m: getattr(s, m) for m in names}
-        later = before if wait is None else wait(command, parameters, before)
-        begun = s.estimate_begun > pairs.cycles - 0.5
-        values = parameters + 0
-        values[places] += s.estimate_change
-        stays = {f"{m}_next": getattr(s, m) for m in own.names}
-        remembered = {f"{m}_next": ca.if_else(begun, later[m], before[m]) for m in names}
-        return {believed.name: values, **stays, **remembered, **waiting}
-
-    reads = Layout((pairs.problem.plant.parameter, acted))
-    return Block("estimate_waits", reads, Layout((believed,)), step, own, opaque=True)
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

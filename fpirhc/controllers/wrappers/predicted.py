@@ -268,14 +268,7 @@ def _predict_block(
             memory_next[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
         return {"time_ahead": s.time + ahead.inputs, "state_ahead": state, **memory_next}
 
-    def wait(s: Signals) -> dict[str, Expression]:
-        """The value that is held was sent once more."""
-        later = {"sent_next": queue.pushed(s.sent, s._sent_before), "time_ahead": s.time + ahead.inputs}
-        return {**later, **{f"{signal.name}_next": getattr(s, signal.name) for signal in own[1:]}}
-
-    time = tuple(w for w in writes if w.name == "time_ahead")
-    waits = Block("predict_waits", Layout((time_signal(plant), before)), Layout(time), wait, Layout(own))
-    return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True, waits=waits)
+    return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
 
 
 def _answered_at(problem: Problem) -> tuple[Signal, ...]:

@@ -92,16 +92,6 @@ class _Queued(Wrapper):
         }
         return ca.if_else(valid, next_request, desired), {**queues, **remembered}
 
-    def held(self, request: Expression, memory: Mapping[str, Expression]) -> dict[str, Expression]:
-        queue, filled = self._queue, memory["queue_filled"]
-        desired = ca.if_else(filled < 0.5, request, memory["queue_now"])
-        return {
-            "queue_requests": queue.pushed(memory["queue_requests"], request),
-            "queue_desired": queue.pushed(memory["queue_desired"], desired),
-            "queue_filled": ca.fmin(filled + 1, queue.length),
-            **self.map.held(request, memory),
-        }
-
     @abstractmethod
     def _request(
         self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]

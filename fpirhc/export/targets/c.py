@@ -12,7 +12,7 @@ from importlib import resources
 
 import numpy as np
 
-from fpirhc.controllers.gate import HELD
+from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
 from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device, identifiers, in_comment, literal
 from fpirhc.export.samples import recorded
@@ -206,9 +206,8 @@ def _controller(device: Device) -> str:
     texts += [
         f"#define PERIOD ((casadi_real){literal(device.problem.period)})",
         f"#define LONGEST ((casadi_real){LONGEST})",
-        f"#define MISSED {device.most_missed}L",
+        *_replay(device),
     ]
-    missing = next(k for k, s in enumerate(device.inputs.signals) if s.name != "time")
     return filled(
         device,
         "controller.c",
@@ -216,12 +215,35 @@ def _controller(device: Device) -> str:
         before=str(memory.slice(MEMORY.name).start),
         held=str(memory.slice(HELD).start),
         skipped=str(memory.slice(f"{SKIPPED}_before").start),
+        missing=str(memory.slice(MISSING.name).start),
         skipped_now=str(trace.slice(SKIPPED).start),
         fails=str(int(not stepper.function.is_a("SXFunction"))),
         changes=str(int(bool(device.bounds))),
-        first=str(device.inputs.slice(device.inputs.names[missing]).start),
         **words,
     )
+
+
+def _replay(device: Device) -> list[str]:
+    """Numbers and places of what `fpirhc.simulation.replay` needs."""
+    replay, inputs = device.stepper.replay, device.inputs
+    samples = len(next(iter(replay.good.values())))
+    good = np.full((samples, inputs.size), -1)
+    for name, places in replay.good.items():
+        good[:, inputs.slice(name)] = places
+    tables = {"GOOD": good.ravel(), "KEPT": replay.kept, "STAYS": replay.stays}
+    numbers = {
+        "BRIDGED": replay.bridged,
+        "FILLS": replay.fills,
+        "SAMPLES": samples,
+        "KEPTS": replay.kept.size,
+        "STAY": replay.stays.size,
+    }
+    return [
+        f"enum {{ {', '.join(f'{name} = {value}' for name, value in numbers.items())} }};",
+        f"#define MOST_MISSING ((casadi_real){literal(MOST_MISSING)})",
+        "/* places in the memory */",
+        *(f"static const int {name}[] = {{{', '.join(map(str, values))}}};" for name, values in tables.items()),
+    ]
 
 
 def _bound(device: Device) -> list[str]:

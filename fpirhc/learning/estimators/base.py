@@ -43,7 +43,6 @@ class Seen:
 
 
 Correct = Callable[[Seen, Mapping[str, Expression]], tuple[Expression, dict[str, Expression]]]
-Wait = Callable[[Expression, Expression, Mapping[str, Expression]], dict[str, Expression]]
 
 
 class ParameterEstimator(Checked, ABC):
@@ -85,10 +84,6 @@ class ParameterEstimator(Checked, ABC):
     @abstractmethod
     def step(self, problem: Problem) -> Correct:
         """Function (seen, memory) -> (change of the learned parameters, memory one cycle later)."""
-
-    def waiting(self, problem: Problem) -> Wait | None:  # noqa: ARG002
-        """Function (command, parameters, memory) -> memory after a cycle without a sample; None: as it was, as pairs are."""
-        return None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
 from fpirhc.fields.kinds import Deviation, Positive
-from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen, Wait
+from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen
 from fpirhc.plant.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
@@ -219,22 +219,6 @@ class DisturbanceKalman(ParameterEstimator):
             return change, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
-
-    def waiting(self, problem: Problem) -> Wait:
-        model = problem.plant
-        advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
-        places = [model.parameter.elements.index(n) for n in self.learned()]
-        moves, adds = self.modes(problem).of(len(places))
-
-        def wait(
-            command: Expression, parameters: Expression, memory: Mapping[str, Expression]
-        ) -> dict[str, Expression]:
-            disturbed_parameters = parameters + 0
-            disturbed_parameters[places] += adds @ memory["observed_disturbance"]
-            later = advance(memory["observed_state"], command, disturbed_parameters, no_forcing)
-            return {"observed_state": later, "observed_disturbance": moves @ memory["observed_disturbance"]}
-
-        return wait
 
     def _foresees(self, plant: Plant) -> bool:
         """Whether it remembers the next state: a map's response is to the command that acts after the state, and not before."""
