@@ -57,7 +57,6 @@ LOOPS: dict[str, Callable[[], tuple[Controller, fp.Problem]]] = {
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
             ("set-points", "CTC+FPI (eq 6)", AIMS),
             ("plans to set-points", "RHC+FPI", AIMS),
-            ("estimated", fp.ComputedTorque(TRACK), PUSHED | {"sensing": fp.Sensing(estimator=fp.PositionDifference())}),
             ("reality", fp.ComputedTorque(TRACK, fp.ModelReferenced(MAP)), {"reality": None}),
         )
     },
