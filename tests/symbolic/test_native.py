@@ -82,20 +82,8 @@ def every_operation(x: Any, y: Any) -> list[Any]:
              ca.log1p, ca.expm1, ca.floor, ca.ceil, ca.sqrt, ca.fabs, ca.sign, ca.logic_not, ca.erf]  # fmt: skip
     binary = [ca.fmin, ca.fmax, ca.atan2, ca.hypot, ca.fmod, ca.copysign, ca.logic_or, ca.logic_and]
     values = [*(f(x) for f in unary), ca.acosh(x + 2), *(f(x, y) for f in binary), *(f(y, x) for f in binary)]
-    return values + [
-        x**y,
-        x**2.5,
-        x * x,
-        2 * x,
-        1 / x,
-        x - y,
-        x / y,
-        x < y,
-        x <= y,
-        x == y,
-        x != y,
-        ca.if_else(x > y, x, y),
-    ]
+    values += [x**y, x**2.5, x * x, 2 * x, 1 / x, x - y, x / y, x < y, x <= y, x == y, x != y]
+    return [*values, ca.if_else(x > y, x, y)]
 
 
 @needs_compiler
