@@ -185,19 +185,6 @@ class Regressor:
         return x, ca.SX.sym("r", len(self.plant.names)), p
 
 
-def linear_parameters(plant: Plant) -> tuple[str, ...]:
-    """Return the parameters in which the inverse dynamics is linear, jointly with every other one.
-
-    Their second derivatives, mixed ones included, vanish at random points. A Regressor of all of them exists.
-
-    Raises:
-        NotSupported: the plant is not fully actuated, or its inverse response needs a root finder.
-    """
-    _check_plant(plant)
-    nonlinear = _nonlinear_pairs(plant)
-    return tuple(name for k, name in enumerate(plant.parameters) if not nonlinear[k].any())
-
-
 def _with_theta(regressor: Regressor) -> Plant:
     """The plant whose parameters are theta and those that theta does not cover."""
     plant, covered, size = regressor.plant, regressor.covered, len(regressor.names)
