@@ -1,10 +1,12 @@
-"""A mass whose model is too heavy, and the answers of its review by their keys."""
+"""Small plants of which a review is asked, and the answers about a mass whose model is too heavy, by their keys."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
 import fpirhc as fp
 from fpirhc.contracts import Controller
@@ -28,3 +30,237 @@ def answers(problem: fp.Problem, controller: Controller | None = None, mismatch:
     """All answers about the problem and one controller."""
     found = fp.review(problem, {"it": controller or torque()}, mismatch=mismatch, seed=0).answers
     return {a.key: a for some in found.values() for a in some}
+
+
+# Plants on which answers of a theory were false
+
+
+def cart(limits: fp.Limits, reference: Any, exact: float, **settings: Any) -> fp.Problem:
+    """M x'' = F, the model's mass 1 kg."""
+    plant = fp.Plant(
+        coordinates={"x": "m"},
+        inputs={"F": "N"},
+        response=lambda q, v, u, p: {"x": u.F / p.mass},
+        parameters={"mass": fp.Parameter(1.0, exact, "kg")},
+    )
+    return fp.Problem(plant, fp.Trajectory(reference), period=1e-2, limits=limits, **settings)
+
+
+def plans(*, iterations: int | None = 5, tolerance: float | None = 1e-3, gain: float = -0.8) -> dict[str, Any]:
+    optimiser = fp.FixedPoint(iterations=iterations, tolerance=tolerance)
+    adapted = fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=gain)))
+    return {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": adapted}
+
+
+def three_lags() -> fp.Problem:
+    """At a constant set-point, where the slowest of three lags in a row is the third derivative's share of rounding."""
+    plant = fp.Plant.of_states(
+        states={"a": "K", "b": "K", "c": "K"},
+        inputs={"u": "K"},
+        rates=lambda x, u, p: {
+            "a": 3 * (u.u - x.a) / p.delay,
+            "b": 3 * (x.a - x.b) / p.delay,
+            "c": 3 * (x.b - x.c) / p.delay,
+        },
+        outputs={"outlet": fp.Output("K", lambda x, p: x.c)},
+        parameters={"delay": fp.Parameter(1.0, 1.2, "min")},
+        time_unit="min",
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"outlet": 10 + 0 * t}),
+        start={"a": 0.0, "b": 0.0, "c": 0.0},
+        period=0.05,
+        duration=10.0,
+        measure_from=5.0,
+        limits=fp.Limits(inputs={"u": (0.0, 20.0)}),
+        horizon=fp.Horizon(stages=40, step=0.05),
+        cost=fp.Quadratic(outputs={"outlet": 1.0}, rate={"u": 0.01}),
+    )
+
+
+def untouched_limit() -> fp.Problem:
+    """A speed limit that nothing comes near; the slowest mode of an own Riccati solution is .973 per cycle of the model."""
+    return cart(
+        fp.Limits(inputs={"F": (-2.0, 2.0)}, states={"x'": (-100.0, 100.0)}),
+        lambda t: {"x": 5.0 + 0 * t},
+        1.2,
+        start={"x": 4.9, "x'": 0.0},
+        duration=3.0,
+        horizon=fp.Horizon(stages=30, step=0.1),
+        cost=fp.Quadratic(states={"x": 10.0, "x'": 1.0}, effort={"F": 1e-1}),
+    )
+
+
+def limited_rate() -> fp.Problem:
+    """A force that may change by 20 N/s: an own loop with such an actuator has .637 m without adaptation, and metres with it."""
+    return cart(
+        fp.Limits(inputs={"F": (-20.0, 20.0)}, rates={"F": (-20.0, 20.0)}),
+        lambda t: {"x": 1 - ca.cos(2 * t)},
+        2.0,
+        start={"x": 0.5},
+        duration=6.0,
+        measure_from=2.0,
+        horizon=fp.Horizon(stages=20, step=0.05),
+        cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, rate={"F": 1e-3}),
+    )
+
+
+def turntable(reference: Callable[[Any], Any]) -> fp.Problem:
+    """It follows a bearing that turns on with 1 rad/s."""
+    plant = fp.Plant(
+        coordinates={"yaw": "rad"},
+        inputs={"torque": "N m"},
+        response=lambda q, v, u, p: {"yaw": (u.torque - p.friction * v.yaw) / p.inertia},
+        parameters={"inertia": fp.Parameter(0.3, 0.4, "kg m^2"), "friction": fp.Parameter(0.05, 0.1, "N m s")},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"yaw": reference(t)}),
+        start={"yaw": 0.0, "yaw'": 1.0},
+        period=5e-3,
+        duration=8.0,
+        measure_from=1.0,
+        limits=fp.Limits(inputs={"torque": (-3.0, 3.0)}),
+        horizon=fp.Horizon(stages=20, step=2e-2),
+        cost=fp.Quadratic(states={"yaw": 100.0, "yaw'": 1.0}, deviation={"torque": 1e-2}),
+    )
+
+
+def levitation(exact: float = 1.4e-4) -> fp.Problem:
+    """A ball below a magnet, whose current follows the voltage: order three, unstable, with limits of the voltage."""
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        force = p.inductance / (2 * 0.06) * (x.current / x.gap) ** 2
+        return {"gap": x.speed, "speed": 9.81 - force, "current": (u.voltage - 5.0 * x.current) / 0.05}
+
+    plant = fp.Plant.of_states(
+        states={"gap": "m", "speed": "m/s", "current": "A"},
+        inputs={"voltage": "V"},
+        rates=rates,
+        outputs={"gap": fp.Output("m", lambda x, _: x.gap)},
+        parameters={"inductance": fp.Parameter(1.5e-4, exact, "H m")},
+    )
+    rest = 0.012 * np.sqrt(2 * 0.06 * 9.81 / exact)
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"gap": 0.012 + 0.001 * ca.sin(3 * t)}),
+        start={"gap": 0.012, "speed": 0.003, "current": float(rest)},
+        period=1e-3,
+        duration=1.0,
+        measure_from=0.3,
+        limits=fp.Limits(inputs={"voltage": (-20.0, 20.0)}),
+        horizon=fp.Horizon(stages=20, step=4e-3),
+        cost=fp.Quadratic(outputs={"gap": 1e6, "gap'": 1e2}, rate={"voltage": 1e-2}),
+    )
+
+
+def ball(start: float) -> fp.Problem:
+    """A ball under a magnet of which the current is commanded."""
+    plant = fp.Plant(
+        coordinates={"gap": "m"},
+        inputs={"current": "A"},
+        response=lambda q, v, u, p: {"gap": 9.81 - p.inductance / (2 * 0.06) * (u.current / q.gap) ** 2},
+        parameters={"inductance": fp.Parameter(2.0e-4, 1.4e-4, "H m")},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"gap": 0.009 + 0 * t}),
+        start={"gap": start},
+        period=1e-3,
+        duration=1.0,
+        limits=fp.Limits(inputs={"current": (0.0, 3.0)}),
+        horizon=fp.Horizon(stages=40, step=1e-2),
+        cost=fp.Quadratic(states={"gap": 1e6, "gap'": 1e2}, deviation={"current": 1.0}),
+        measure_from=0.5,
+    )
+
+
+def biased(size: float) -> fp.Problem:
+    """A mass along a slow sine, whose measured acceleration has a bias of the sensor."""
+    sensing = fp.Sensing({"x''": fp.Sensor(noise=fp.Step(at=0.0, size=size))}) if size else fp.Sensing()
+    return cart(
+        fp.Limits(inputs={"F": (-20.0, 20.0)}),
+        lambda t: {"x": 0.5 * ca.sin(2 * t)},
+        1.2,
+        start={"x": 0.0, "x'": 1.0},
+        duration=6.0,
+        measure_from=2.0,
+        sensing=sensing,
+        horizon=fp.Horizon(stages=20, step=0.05),
+        cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, deviation={"F": 1e-3}),
+    )
+
+
+def balanced() -> fp.Problem:
+    """Two pendulums on top of each other on a cart (those of do-mpc's example), held upright by a force that has limits."""
+    rod, pole = 0.2, 0.5  # kg, m
+    first, second = 0.5 * rod * pole + rod * pole, 0.5 * rod * pole
+
+    def response(q: Any, v: Any, u: Any, p: Any) -> dict[str, Any]:
+        cos, sin = ca.cos(q.low - q.high), ca.sin(q.low - q.high)
+        inertia = ca.vertcat(
+            ca.horzcat(p.cart + 2 * rod, first * ca.cos(q.low), second * ca.cos(q.high)),
+            ca.horzcat(first * ca.cos(q.low), 4 / 3 * rod * pole**2, second * pole * cos),
+            ca.horzcat(second * ca.cos(q.high), second * pole * cos, rod * pole**2 / 3),
+        )
+        forces = ca.vertcat(
+            first * v.low**2 * ca.sin(q.low) + second * v.high**2 * ca.sin(q.high) + u.F,
+            9.81 * first * ca.sin(q.low) - second * pole * v.high**2 * sin,
+            9.81 * second * ca.sin(q.high) + second * pole * v.low**2 * sin,
+        )
+        moved = ca.solve(inertia, forces)
+        return {"x": moved[0], "low": moved[1], "high": moved[2]}
+
+    plant = fp.Plant(
+        coordinates={"x": "m", "low": "rad", "high": "rad"},
+        inputs={"F": "N"},
+        response=response,
+        controlled=("x",),
+        parameters={"cart": fp.Parameter(0.6, 0.7, "kg")},
+    )
+    weights = {"x": 100.0, "low": 100.0, "high": 100.0, "x'": 1.0, "low'": 1.0, "high'": 1.0}
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"x": 0 * t, "low": 0 * t, "high": 0 * t}),
+        start={"x": 0.0, "low": 0.01, "high": -0.01},
+        period=1e-2,
+        duration=6.0,
+        measure_from=3.0,
+        limits=fp.Limits(inputs={"F": (-4.0, 4.0)}),
+        horizon=fp.Horizon(stages=25, step=4e-2),
+        cost=fp.Quadratic(states=weights, effort={"F": 1e-2}),
+    )
+
+
+def servo() -> fp.Problem:
+    """The servomechanism of `abroad.flexible_servo`, whose load is controlled: the model's load is half as heavy."""
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        twist = x.load - x.motor / 20.0
+        turned = (1280.2 / 20.0 * twist - 5.1 * x.turn + 0.5 * u.V) / 0.5
+        return {
+            "load": x.swing,
+            "swing": (-1280.2 * twist - p.friction * x.swing) / p.inertia,
+            "motor": x.turn,
+            "turn": turned,
+        }
+
+    plant = fp.Plant.of_states(
+        states={"load": "rad", "swing": "rad/s", "motor": "rad", "turn": "rad/s"},
+        inputs={"V": "V"},
+        rates=rates,
+        outputs={"angle": fp.Output("rad", lambda x, p: x.load)},
+        parameters={"inertia": fp.Parameter(12.5, 25.0, "kg m^2"), "friction": fp.Parameter(12.5, 25.0, "N m s/rad")},
+    )
+    return fp.Problem(
+        plant=plant,
+        reference=fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(0.8 * t)}),
+        start={"load": 0.0, "swing": 0.4, "motor": 0.0, "turn": 8.0},
+        period=0.01,
+        duration=10.0,
+        measure_from=5.0,
+        limits=fp.Limits(inputs={"V": (-220.0, 220.0)}),
+        horizon=fp.Horizon(stages=20, step=0.1),
+        cost=fp.Quadratic(outputs={"angle": 1e3, "angle'": 1.0}, rate={"V": 1e-4}),
+    )

@@ -15,169 +15,14 @@ import casadi as ca
 import numpy as np
 import pytest
 from abroad import load
+from helpers import reviewed, tasks
+from helpers.reviewed import ball, biased, levitation, plans, turntable
 
 import fpirhc as fp
 from fpirhc.review.review import Answer
 
 UNWRAP = "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error."
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
-
-
-def cart(limits: fp.Limits, reference: Any, exact: float, **settings: Any) -> fp.Problem:
-    """M x'' = F, the model's mass 1 kg."""
-    plant = fp.Plant(
-        coordinates={"x": "m"},
-        inputs={"F": "N"},
-        response=lambda q, v, u, p: {"x": u.F / p.mass},
-        parameters={"mass": fp.Parameter(1.0, exact, "kg")},
-    )
-    return fp.Problem(plant, fp.Trajectory(reference), period=1e-2, limits=limits, **settings)
-
-
-def plans(*, iterations: int = 5, tolerance: float = 1e-3, gain: float = -0.8) -> dict[str, Any]:
-    optimiser = fp.FixedPoint(iterations=iterations, tolerance=tolerance)
-    adapted = fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=gain)))
-    return {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": adapted}
-
-
-def three_lags() -> fp.Problem:
-    """At a constant set-point, where the slowest of three lags in a row is the third derivative's share of rounding."""
-    plant = fp.Plant.of_states(
-        states={"a": "K", "b": "K", "c": "K"},
-        inputs={"u": "K"},
-        rates=lambda x, u, p: {
-            "a": 3 * (u.u - x.a) / p.delay,
-            "b": 3 * (x.a - x.b) / p.delay,
-            "c": 3 * (x.b - x.c) / p.delay,
-        },
-        outputs={"outlet": fp.Output("K", lambda x, p: x.c)},
-        parameters={"delay": fp.Parameter(1.0, 1.2, "min")},
-        time_unit="min",
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"outlet": 10 + 0 * t}),
-        start={"a": 0.0, "b": 0.0, "c": 0.0},
-        period=0.05,
-        duration=10.0,
-        measure_from=5.0,
-        limits=fp.Limits(inputs={"u": (0.0, 20.0)}),
-        horizon=fp.Horizon(stages=40, step=0.05),
-        cost=fp.Quadratic(outputs={"outlet": 1.0}, rate={"u": 0.01}),
-    )
-
-
-def untouched_limit() -> fp.Problem:
-    """A speed limit that nothing comes near; the slowest mode of an own Riccati solution is .973 per cycle of the model."""
-    return cart(
-        fp.Limits(inputs={"F": (-2.0, 2.0)}, states={"x'": (-100.0, 100.0)}),
-        lambda t: {"x": 5.0 + 0 * t},
-        1.2,
-        start={"x": 4.9, "x'": 0.0},
-        duration=3.0,
-        horizon=fp.Horizon(stages=30, step=0.1),
-        cost=fp.Quadratic(states={"x": 10.0, "x'": 1.0}, effort={"F": 1e-1}),
-    )
-
-
-def limited_rate() -> fp.Problem:
-    """A force that may change by 20 N/s: an own loop with such an actuator has .637 m without adaptation, and metres with it."""
-    return cart(
-        fp.Limits(inputs={"F": (-20.0, 20.0)}, rates={"F": (-20.0, 20.0)}),
-        lambda t: {"x": 1 - ca.cos(2 * t)},
-        2.0,
-        start={"x": 0.5},
-        duration=6.0,
-        measure_from=2.0,
-        horizon=fp.Horizon(stages=20, step=0.05),
-        cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, rate={"F": 1e-3}),
-    )
-
-
-def turntable(reference: Callable[[Any], Any]) -> fp.Problem:
-    """It follows a bearing that turns on with 1 rad/s."""
-    plant = fp.Plant(
-        coordinates={"yaw": "rad"},
-        inputs={"torque": "N m"},
-        response=lambda q, v, u, p: {"yaw": (u.torque - p.friction * v.yaw) / p.inertia},
-        parameters={"inertia": fp.Parameter(0.3, 0.4, "kg m^2"), "friction": fp.Parameter(0.05, 0.1, "N m s")},
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"yaw": reference(t)}),
-        start={"yaw": 0.0, "yaw'": 1.0},
-        period=5e-3,
-        duration=8.0,
-        measure_from=1.0,
-        limits=fp.Limits(inputs={"torque": (-3.0, 3.0)}),
-        horizon=fp.Horizon(stages=20, step=2e-2),
-        cost=fp.Quadratic(states={"yaw": 100.0, "yaw'": 1.0}, deviation={"torque": 1e-2}),
-    )
-
-
-def levitation(exact: float = 1.4e-4) -> fp.Problem:
-    """A ball below a magnet, whose current follows the voltage: order three, unstable, with limits of the voltage."""
-
-    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        force = p.inductance / (2 * 0.06) * (x.current / x.gap) ** 2
-        return {"gap": x.speed, "speed": 9.81 - force, "current": (u.voltage - 5.0 * x.current) / 0.05}
-
-    plant = fp.Plant.of_states(
-        states={"gap": "m", "speed": "m/s", "current": "A"},
-        inputs={"voltage": "V"},
-        rates=rates,
-        outputs={"gap": fp.Output("m", lambda x, _: x.gap)},
-        parameters={"inductance": fp.Parameter(1.5e-4, exact, "H m")},
-    )
-    rest = 0.012 * np.sqrt(2 * 0.06 * 9.81 / exact)
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"gap": 0.012 + 0.001 * ca.sin(3 * t)}),
-        start={"gap": 0.012, "speed": 0.003, "current": float(rest)},
-        period=1e-3,
-        duration=1.0,
-        measure_from=0.3,
-        limits=fp.Limits(inputs={"voltage": (-20.0, 20.0)}),
-        horizon=fp.Horizon(stages=20, step=4e-3),
-        cost=fp.Quadratic(outputs={"gap": 1e6, "gap'": 1e2}, rate={"voltage": 1e-2}),
-    )
-
-
-def ball(start: float) -> fp.Problem:
-    """A ball under a magnet of which the current is commanded."""
-    plant = fp.Plant(
-        coordinates={"gap": "m"},
-        inputs={"current": "A"},
-        response=lambda q, v, u, p: {"gap": 9.81 - p.inductance / (2 * 0.06) * (u.current / q.gap) ** 2},
-        parameters={"inductance": fp.Parameter(2.0e-4, 1.4e-4, "H m")},
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"gap": 0.009 + 0 * t}),
-        start={"gap": start},
-        period=1e-3,
-        duration=1.0,
-        limits=fp.Limits(inputs={"current": (0.0, 3.0)}),
-        horizon=fp.Horizon(stages=40, step=1e-2),
-        cost=fp.Quadratic(states={"gap": 1e6, "gap'": 1e2}, deviation={"current": 1.0}),
-        measure_from=0.5,
-    )
-
-
-def biased(size: float) -> fp.Problem:
-    """A mass along a slow sine, whose measured acceleration has a bias of the sensor."""
-    sensing = fp.Sensing({"x''": fp.Sensor(noise=fp.Step(at=0.0, size=size))}) if size else fp.Sensing()
-    return cart(
-        fp.Limits(inputs={"F": (-20.0, 20.0)}),
-        lambda t: {"x": 0.5 * ca.sin(2 * t)},
-        1.2,
-        start={"x": 0.0, "x'": 1.0},
-        duration=6.0,
-        measure_from=2.0,
-        sensing=sensing,
-        horizon=fp.Horizon(stages=20, step=0.05),
-        cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, deviation={"F": 1e-3}),
-    )
 
 
 @dataclass(frozen=True)
@@ -207,21 +52,22 @@ def foreign(name: str, *controllers: str, variant: str = "problem") -> Callable[
     return made
 
 
+SERVO = -1.0, -1.97, -2.12
 CTC6, PAIRED = "CTC+FPI (eq 6)", "CTC+FPI paired"
 CASES: dict[str, Case] = {
     "three lags at a set-point": Case(
-        lambda: (three_lags(), {"RHC": plans(iterations=2)["RHC"]}),
+        lambda: (reviewed.three_lags(), {"RHC": plans(iterations=2)["RHC"]}),
         {("problem", "inverse"): "yes", ("RHC", "returns"): "yes", ("RHC", "follows"): "yes"},
         never=("problem", "RHC"),
     ),
     "a limit that nothing comes near": Case(
-        lambda: (untouched_limit(), {"RHC": plans()["RHC"]}),
+        lambda: (reviewed.untouched_limit(), {"RHC": plans()["RHC"]}),
         {("RHC", "returns"): "yes", ("RHC", "box"): "yes", ("RHC", "limits"): "yes", ("RHC", "plans"): "yes"},
         {("RHC", "returns", "factor"): (0.98, 0.01)},
         never=("RHC",),
     ),
     "a limit of a rate": Case(
-        lambda: (limited_rate(), plans()),
+        lambda: (reviewed.limited_rate(), plans()),
         {("RHC", "limits"): "yes", ("RHC+FPI", "limits"): "yes", ("RHC+FPI", "pays"): "no"},
         {("RHC", "limits", "share_of_cycles"): (0, 0), ("RHC+FPI", "pays", "error_without"): (0.637, 0.01)},
         never=("problem",),
@@ -246,6 +92,26 @@ CASES: dict[str, Case] = {
         lambda: (ball(0.011), plans(iterations=1, tolerance=1e-2)),
         {("RHC", "plans"): "no", ("RHC", "follows"): "no"},
         changes={("RHC", "follows"): MORE},
+    ),
+    "two pendulums on a cart, with limits of the force": Case(
+        lambda: (reviewed.balanced(), {"RHC": fp.RecedingHorizon(fp.FixedPoint())}),
+        {("RHC", "returns"): "yes", ("RHC", "follows"): "yes", ("RHC", "box"): "yes", ("RHC", "plans"): "yes"},
+        {("RHC", "returns", "factor"): (0.9876, 1e-3), ("RHC", "returns", "largest_factor"): (0.991, 3e-3)},
+        never=("problem", "RHC"),
+    ),
+    "a servo and its recommended gain": Case(
+        lambda: (reviewed.servo(), {str(g): plans(iterations=None, tolerance=None, gain=g)["RHC+FPI"] for g in SERVO}),
+        {
+            (g, key): said
+            for g, said in (("-1.0", "no"), ("-1.97", "yes"), ("-2.12", "yes"))
+            for key in ("gain", "returns", "pays")
+        },
+        {
+            (g, "pays", "error_with"): (e, 0.05 * e)
+            for g, e in zip(map(str, SERVO), (0.0130, 2.28e-4, 2.27e-4), strict=True)
+        },
+        never=("problem", "-1.97", "-2.12"),
+        changes={("-1.0", "returns"): "Use the recommended gain; without one, another form."},
     ),
     "an inverse with two branches": Case(
         foreign("cstr", "RHC", "RHC+FPI"),
@@ -331,7 +197,11 @@ def said(name: str) -> dict[tuple[str, str], Answer]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_what_is_said_is_true(name):
+    """It prints the table: pytest -k is_true -rP."""
     case, found = CASES[name], said(name)
+    for about, key in {k[:2]: None for k in (*case.verdicts, *case.numbers)}:
+        told, true = found[about, key], {n: v for (*who, n), (v, _) in case.numbers.items() if who == [about, key]}
+        print(f"{about}: {told.question} {told.verdict} ({told.evidence})" + (f"; the truth: {true}" if true else ""))
     assert {key: found[key].verdict.value for key in case.verdicts} == case.verdicts
     assert not [(k, a) for k, a in found.items() if k[0] in case.never and a.verdict == "no"]
     for (about, key, number), (value, tolerance) in case.numbers.items():
@@ -382,16 +252,26 @@ def test_the_harm_of_a_bias_is_that_of_runs():
 
 
 def test_the_factor_is_the_decay_of_two_runs():
-    """An unstable plant that is balanced: the deviation of a run from another start decays as it is said to."""
-    problem, controllers = CASES["an unstable plant of order three with limits of its input"].task()
-    runs = [
-        fp.simulate(replace(problem, start={**problem.start, "gap": 0.012 + d}), controllers["RHC"], seed=0)
-        for d in (1e-5, -1e-5)
-    ]
-    apart = np.abs(runs[0]["plant_state.gap"] - runs[1]["plant_state.gap"])
-    told = said("an unstable plant of order three with limits of its input")["RHC", "returns"]
-    assert apart[700:].max() < 1e-2 * apart[:100].max()
-    assert told.numbers["factor"] < 1
+    """Unstable plants that are balanced: the deviation of a run from another start decays as it is said to."""
+    cases = {"an unstable plant of order three with limits of its input": ("gap", 1e-5, 0.1),
+             "two pendulums on a cart, with limits of the force": ("low", 1e-4, 6e-3)}  # fmt: skip
+    for name, (state, size, tolerance) in cases.items():
+        problem, controllers = CASES[name].task()
+        starts = (replace(problem, start={**problem.start, state: problem.start[state] + d}) for d in (size, -size))
+        runs = [fp.simulate(one, controllers["RHC"], seed=0)[f"plant_state.{state}"] for one in starts]
+        tops = [part.max() for part in np.array_split(np.abs(runs[0] - runs[1]), 6)]
+        own = (tops[-1] / tops[0]) ** (6 / 5 / len(runs[0]))
+        assert tops[-1] < 1e-2 * tops[0]
+        assert own == pytest.approx(said(name)["RHC", "returns"].numbers["factor"], abs=tolerance)
+
+
+def test_neither_of_two_lost_balls_is_better():
+    """A current that cannot hold them: errors are measured against the set-point and the plant left alone, whatever their ratio."""
+    weak = replace(ball(0.009), limits=fp.Limits(inputs={"current": (0.0, 0.6)}))
+    found = fp.compare(tasks.made(weak, plans(gain=-0.2)), seed=0, compiled=False)
+    assert min(one.errors["gap"] for one in found.entries) > 0.1
+    assert str(found.outcome) == "not comparable"
+    assert "neither follows the reference" in found.verdict[0].lower()
 
 
 def test_a_command_that_is_later_by_more_than_is_borne_is_lost_in_a_run():

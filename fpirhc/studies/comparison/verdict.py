@@ -76,6 +76,9 @@ class Yardstick:
     scales: Mapping[str, float]  # range of the reference, its start included; 1 where it does not move
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
     moving: frozenset[str]  # coordinates whose references move by themselves
+    resting: Mapping[
+        str, float
+    ]  # size of the set-point; where that is zero or disturbances act, that of the movement left alone
 
     @staticmethod
     def of(problem: Problem, seed: int) -> Yardstick:
@@ -85,17 +88,18 @@ class Yardstick:
         places = {n: plant.output.elements.index(n) for n in problem.judged_names}
         own = {n: float(np.ptp(rows[k])) for n, k in places.items()}
         both = {n: float(np.ptp(np.append(rows[k], problem.start_output[k]))) for n, k in places.items()}
-        small = {n: max(ROUNDING * float(np.abs(rows[k]).max()), 1e-300) for n, k in places.items()}
+        sizes, alone = {n: float(np.abs(rows[k]).max()) for n, k in places.items()}, left_alone(problem, seed)
+        small = {n: max(ROUNDING * size, 1e-300) for n, size in sizes.items()}
+        resting = {n: max(s, alone.get(n, 0.0)) if problem.disturbances or not s else s for n, s in sizes.items()}
         weights = (problem.cost.tracked or {}) if problem.cost is not None else {}
         wide = {n: high - low for n, (low, high) in problem.limits.states.items() if math.isfinite(high - low)}
         held = {n: weights[n] ** -0.5 if weights.get(n, 0) > 0 else wide.get(n, 1.0) for n in places}
         scales = {n: size if size > small[n] else held[n] for n, size in both.items()}
-        return Yardstick(scales, left_alone(problem, seed), frozenset(n for n in places if own[n] > small[n]))
+        return Yardstick(scales, alone, frozenset(n for n in places if own[n] > small[n]), resting)
 
     def beyond(self, entry: Entry, name: str) -> bool:
-        """Whether an error is larger than the motion itself, and than that of the plant left alone where nothing is to move."""
-        least = self.scales[name] if name in self.moving else max(self.scales[name], self.alone.get(name, 0.0))
-        return entry.errors[name] > least
+        """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
+        return entry.errors[name] > max(self.scales[name], 0.0 if name in self.moving else self.resting[name])
 
 
 # --- Flags ---------------------------------------------------------------------------------------------------------------
@@ -204,16 +208,14 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     names = plain.name, adaptive.name
     ended = [e for e in (plain, adaptive) if e.run.stop is not None]
     if ended:
-        outcome = (
-            Outcome.NOT_COMPARABLE if len(ended) == 2 else Outcome.WORSE if ended == [adaptive] else Outcome.BETTER
-        )
+        lost = Outcome.WORSE if ended == [adaptive] else Outcome.BETTER
+        outcome = Outcome.NOT_COMPARABLE if len(ended) == 2 else lost
         return Finding("; ".join(f"{e.name} does not finish: {e.run.stop}" for e in ended) + ".", outcome, names)
-    before, after = plain.errors, adaptive.errors
+    before, after, run = plain.errors, adaptive.errors, adaptive.run
     counted = [n for n in before if adaptive.weighed is None or n in adaptive.weighed] or list(before)
     if not all(math.isfinite(before[n] + after[n]) for n in counted):
-        return Finding(
-            f"{names[1]} and {names[0]} cannot be compared: an error is no number.", Outcome.NOT_COMPARABLE, names
-        )
+        text = f"{names[1]} and {names[0]} cannot be compared: an error is no number."
+        return Finding(text, Outcome.NOT_COMPARABLE, names)
     share = {n: (before[n] / yard.scales[n], after[n] / yard.scales[n]) for n in counted}
     least = MINOR * min(max(s[k] for s in share.values()) for k in (0, 1))
     major = [n for n in counted if max(share[n]) >= max(least, ROUNDING)]
@@ -229,9 +231,7 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
-    errors = ", ".join(
-        f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(adaptive.run.unit(f'error.{n}'))}" for n in ratios
-    )
+    errors = ", ".join(f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(run.unit(f'error.{n}'))}" for n in ratios)
     text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'})."
     return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
 
