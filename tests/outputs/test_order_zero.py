@@ -118,22 +118,6 @@ def test_a_wrong_static_map_is_made_up_for() -> None:
         assert rms(problem, fp.Cascade(STATIC, affine(gain), paired=None)) < 0.06 * without, gain
 
 
-def test_set_points_noise_and_dead_time() -> None:
-    """Unannounced set-points, a noisy wattmeter, and a voltage that acts two cycles late."""
-    problem = heated(
-        element(),
-        reference=fp.Setpoint({"power": [(0.0, 150.0), (10.0, 250.0)]}, rate=2.0),
-        sensing=fp.Sensing({"power": fp.Sensor(noise=fp.Noise(0.5))}),
-        dead_time=fp.DeadTime(inputs={"u": 0.2}, before={"u": 60.0}),
-    )
-    run = simulated(problem, fp.Cascade(STATIC, affine(0.3), AT_ONCE))
-    assert np.std(run["output.power"] - run["plant_output.power"]) == pytest.approx(0.5, rel=0.2)
-    assert np.array_equal(run["realised"], run["output"])
-    assert not np.array_equal(run["plant_realised"], run["realised"])
-    settled = (run.time > 15) | ((run.time > 5) & (run.time < 10))
-    assert np.abs(run["true_error.power"][settled]).max() < 3.0  # W; the element is still warming up
-
-
 def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:
     """A lamp of 20 W on the same meter: measured, judged, and made up for by the target."""
     problem = heated(element(COLD, WARMER), disturbances={"power": fp.Step(at=20.0, size=20.0)})

@@ -10,6 +10,7 @@ import pytest
 from helpers.plants import chain
 
 import fpirhc as fp
+from fpirhc.contracts import Disturbance
 from fpirhc.errors import InvalidProblem, InvalidShape, InvalidValue
 
 
@@ -114,3 +115,18 @@ def test_formula_must_be_finite():
     np.testing.assert_allclose(_values(fp.Formula(lambda t: ca.exp(-t))), np.exp(-TIMES), equal_nan=False)
     with pytest.raises(InvalidValue, match="not finite at t = 0"):
         _values(fp.Formula(lambda t: 1 / t))
+
+
+def test_a_disturbance_of_a_users_own_acts_with_its_values():
+    """A sawtooth on the response of y'' = 0: the speed is its integral, cycle by cycle."""
+
+    class Sawtooth(Disturbance):
+        def values(self, times, random):  # noqa: ARG002
+            return 3.0 * np.mod(times + 1e-12, 0.5)
+
+    reference = fp.Trajectory(lambda t: {"y": 0 * t})
+    problem = fp.Problem(chain(2), reference, {"y": 0.0}, 0.1, 2.0, disturbances={"y": Sawtooth()})
+    still = fp.ComputedTorque(fp.Exponential(rate=1e-9, integral=False))
+    speed = fp.simulate(problem, still, seed=0, compiled=False)["state.y'"]
+    acting = 3.0 * np.mod(0.1 * np.arange(20) + 1e-12, 0.5)
+    np.testing.assert_allclose(speed, 0.1 * np.concatenate([[0.0], np.cumsum(acting)[:-1]]), atol=1e-7)
