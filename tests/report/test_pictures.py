@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.line import line_text
 from matplotlib.figure import Figure
 
 import fpirhc as fp
+from fpirhc.contracts import Layout, Signal, scalar
 from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
-from fpirhc.report.html import own_pictures, render
-from fpirhc.simulation.pictures.base import averaged, extremes
-from fpirhc.simulation.pictures.lines import passages
 
 
 def spring(time=1.0):
@@ -61,16 +59,23 @@ def test_a_line_over_time_is_the_signal(runs):
     assert lower.get_xlabel() == "time [s]"
 
 
-def test_an_alternating_command_is_drawn_as_wide_as_it_is():
+def made_run(values: np.ndarray) -> fp.Run:
+    """A run with this signal 'state.q', a value each millisecond."""
+    signals = scalar("time", "s"), Signal("state", ("q",), ("m",))
+    log = np.column_stack([np.arange(len(values)) * 1e-3, values])
+    return fp.Run("case", "made", 0, 1e-3, Layout(signals), log, None, False, {})
+
+
+def test_an_alternating_signal_is_drawn_as_wide_as_it_is():
     """Extremes of intervals, not every n-th value; in their order, and nothing but values of the series."""
-    times = np.arange(20_000) * 1e-3
-    values = np.where(np.arange(20_000) % 2, 60.0, -60.0) * (times > 5)
-    when, what = extremes(times, values)
-    assert what.size == 4000
+    values = np.where(np.arange(20_000) % 2, 60.0, -60.0) * (np.arange(20_000) > 5000)
+    figure = Figure()
+    fp.OverTime("t", panels=("state.q",)).draw(figure, {"made": made_run(values)})
+    when, what = (np.asarray(one) for one in figure.axes[0].lines[0].get_data())
+    assert what.size <= 4000
     assert np.all(np.diff(when) >= 0)
     assert (what[-100:].min(), what[-100:].max()) == (-60.0, 60.0)
-    np.testing.assert_array_equal(what, values[np.searchsorted(times, when)])
-    assert extremes(times[:10], values[:10])[0].size == 10
+    np.testing.assert_array_equal(what, values[np.rint(when * 1e3).astype(int)])
 
 
 def test_a_portrait_has_a_panel_for_each_run(runs):
@@ -86,8 +91,9 @@ def test_a_raster_counts_passages_upwards(runs):
     figure = Figure()
     fp.Raster("r", signal="reference.q", threshold=0.5).draw(figure, runs)
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["slow (2)", "quick (2)"]
-    times = np.arange(6.0)
-    np.testing.assert_array_equal(passages(times, np.array([2.0, 0, 2, 2, 1, 3]), 1.0), [2.0, 5.0])
+    above, figure = made_run(np.array([2.0, 0, 2, 2, 1, 3])), Figure()
+    fp.Raster("r", signal="state.q", threshold=1.0).draw(figure, {"above": above})
+    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["above (2)"]
 
 
 def test_an_unknown_signal_is_named(runs):
@@ -95,48 +101,35 @@ def test_an_unknown_signal_is_named(runs):
         fp.Portrait("p", x="state.p", y="state.q").draw(Figure(), runs)
 
 
-FILE = '''"""A spring."""
-from test_pictures import spring
-import fpirhc as fp
-problem = spring(0.05)
-controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=5.0))}
-pictures = (%s,)
-'''
+FILE = line_text("period=5e-3, duration=0.1", more="pictures = (%s,)\n")
 
 
 @pytest.mark.parametrize(
     ("written", "message"),
     [
-        ("'phase'", r"line 6: pictures\[0\]: expected a Picture, got the text 'phase'"),
-        ("fp.Portrait('p', x='state.q', y='state.q', controllers=('CTX',))", r"picture 'p': controller 'CTX'.*CTC"),
+        ("'phase'", r"line \d+: pictures\[0\]: expected a Picture, got the text 'phase'"),
+        ("fp.Portrait('p', x='state.y', y='state.y', controllers=('CTX',))", r"picture 'p': controller 'CTX'.*CTC"),
     ],
 )
-def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, message, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    path = tmp_path / "spring.py"
+def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, message, tmp_path):
+    path = tmp_path / "line.py"
     path.write_text(FILE % written)
     with pytest.raises(ProblemFileError, match=message):
         fp.load_problem(str(path))
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path, monkeypatch):
-    """Its place says why; one whose controllers did not run is left out; without pictures there is no section."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-    path = tmp_path / "spring.py"
-    path.write_text(
-        FILE % "fp.Portrait('good', x='state.q', y='error.q'), fp.Portrait('bad', x='state.p', y='state.q')"
-    )
+def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path):
+    """Its place says why; without pictures there is no section."""
+    path, page = tmp_path / "line.py", tmp_path / "report.html"
+    good, bad = (f"fp.Portrait('{n}', x='state.{x}', y='error.y')" for n, x in (("good", "y"), ("bad", "p")))
+    path.write_text(FILE % f"{good}, {bad}")
     comparison = fp.compare(fp.load_problem(str(path)), seed=0, compiled=False)
-    (good, bad), _ = own_pictures(comparison)
-    assert good.source.startswith("data:image/png")
-    assert not bad.source
-    page = render(comparison).partition("Pictures of this problem")[2].partition("</section>")[0]
-    assert page.count("<img") == 1
-    assert "bad is not drawn" in page
-    first: Any = comparison.pictures[0]
-    absent = replace(first, controllers=("RHC",))
-    assert own_pictures(replace(comparison, pictures=(absent,))) == ([], [])
-    assert "Pictures of this problem" not in render(replace(comparison, pictures=()))
+    fp.write_report(comparison, page)
+    own = page.read_text(encoding="utf-8").partition("Pictures of this problem")[2].partition("</section>")[0]
+    assert own.count("<img") == 1
+    assert "bad is not drawn" in own
+    fp.write_report(replace(comparison, pictures=()), page)
+    assert "Pictures of this problem" not in page.read_text(encoding="utf-8")
 
 
 def test_a_heat_map_has_one_scale_for_all_runs(runs):
@@ -155,11 +148,12 @@ def test_a_heat_map_has_one_scale_for_all_runs(runs):
 
 def test_many_cycles_of_a_heat_map_are_averaged():
     """A column is the mean of its interval, so the mean of the whole is kept."""
-    values = np.random.default_rng(3).normal(size=20_000)
-    columns = averaged(values, 1000)
-    assert columns.shape == (1000,)
-    assert columns[0] == pytest.approx(values[:20].mean())
-    np.testing.assert_array_equal(averaged(values[:1000], 1000), values[:1000])
+    values, figure = np.random.default_rng(3).normal(size=20_000), Figure()
+    fp.HeatMap("h", rows=("state.q",)).draw(figure, {"made": made_run(values)})
+    [row] = np.asarray(figure.axes[0].collections[0].get_array())
+    assert row.size < 5000
+    assert row.mean() == pytest.approx(values.mean())
+    assert row[0] == pytest.approx(values[: 20_000 // row.size].mean())
 
 
 def test_a_heat_map_has_rows_of_one_unit(runs):
