@@ -1,4 +1,4 @@
-"""The shipped problems as parameters of a law: in the slow lane are those that repeat another's kind of plant, sensors and plan."""
+"""The shipped problems as parameters of a law: one of each kind, and all of them in the slow lane."""
 
 from __future__ import annotations
 
@@ -11,25 +11,15 @@ import pytest
 _FOLDER = Path(__file__).parents[2] / "problems"
 NAMES = sorted(p.stem for where in (_FOLDER, _FOLDER / "gallery") for p in where.glob("[!_]*.py"))
 
-ALIKE = {  # a problem of the same kind: the problems that repeat it
-    "anaesthesia": ("anaesthesia_drawn", "anaesthesia_monitor", "anaesthesia_people", "anaesthesia_stimulated"),
-    "cart_pole_slots": ("crane_slots", "mass_spring_slots", "two_tanks_slots"),
-    "delayed_mass": ("delayed_tanks",),
-    "diabetes": ("diabetes_announced", "diabetes_order_five"),
-    "freeway_metering": ("freeway_coordinated", "freeway_economic"),
-    "hodgkin_huxley": ("hodgkin_huxley_silent",),
-    "tumour": ("tumour_daily", "tumour_portions", "tumour_vessels"),
-    "turbojet": ("turbojet_slow",),
-    "two_link_arm": ("planar_arm", "puma560", "three_link_arm"),
-    "van_der_pol": ("van_der_pol_duffing",),
-}
+# One of each kind: a linear plant, an unstable one, slots, dead time, a map of steps, a reality, a learner, limits of states.
+EIGHT: tuple[str, ...] = ("two_mass", "cart_pole", "two_tanks_slots", "delayed_mass")
+EIGHT += ("fishery", "heat_exchanger", "turbojet", "chain_of_masses")
 
 
 def shipped(*long: str) -> list[Any]:
-    """All names; those that repeat another, and those that take long here, with the mark of the slow lane."""
-    slow = {*long, *(name for names in ALIKE.values() for name in names)}
-    assert slow | {*ALIKE} <= {*NAMES}
-    return [pytest.param(n, marks=[pytest.mark.slow] if n in slow else ()) for n in NAMES]
+    """All names; all but one of each kind, and those that take long here, with the mark of the slow lane."""
+    assert {*long, *EIGHT} <= {*NAMES}
+    return [pytest.param(n, marks=() if n in EIGHT and n not in long else pytest.mark.slow) for n in NAMES]
 
 
 def slow_but(values: Iterable[Any], *quick: Any) -> list[Any]:
