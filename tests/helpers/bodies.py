@@ -9,7 +9,6 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.symbolic.evaluate import Evaluator
 
 PERIOD = 1e-2
 RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))
@@ -27,15 +26,13 @@ class Body:
     def reset(self, seed: int) -> np.ndarray:
         n = len(self.gains)
         self.random, self.queue = np.random.default_rng(seed), [np.zeros(n)] * self.dead
-        self.moving = Evaluator(cycle(tuple(map(tuple, self.gains)), self.lag))
+        self.moving, self.now = cycle(tuple(map(tuple, self.gains)), self.lag), np.zeros(3 * n)
         return np.zeros(3 * n)
 
     def step(self, time: float, command: np.ndarray) -> np.ndarray:
         self.queue.append(command)
-        (now, moving, acting), (moved, response) = self.moving.arguments, self.moving.results
-        now[:], acting[:] = time, self.queue.pop(0)
-        self.moving.evaluate()
-        moving[:] = moved
+        moved, response = (one.full().ravel() for one in self.moving(time, self.now, self.queue.pop(0)))
+        self.now = moved
         noise = self.noise * self.random.standard_normal(len(response))
         return np.concatenate([moved[: 2 * len(response)], response + noise])
 
