@@ -10,12 +10,7 @@ import pytest
 os.environ.setdefault("FPIRHC_CFLAGS", "-O0")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in the background of a shell; tests interrupt processes
     signal.signal(signal.SIGINT, signal.default_int_handler)
-AS_SHIPPED = (
-    "tests/export/",
-    "tests/symbolic/",
-    "tests/optimisers/test_kernels_in_c",
-    "tests/optimisers/test_loops_in_c",
-)
+AS_SHIPPED = ("tests/export/", "tests/symbolic/", "tests/optimisers/test_loops_in_c")
 
 
 @pytest.fixture(autouse=True)

@@ -2,6 +2,8 @@
 
 from .controller import check_controller as check_controller
 from .deformation import check_deformation as check_deformation
+from .horizons import compiled as compiled
+from .horizons import posed as posed
 from .laws import FAMILIES as FAMILIES
 from .laws import Example as Example
 from .laws import check_live as check_live

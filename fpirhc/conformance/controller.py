@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
-from fpirhc.conformance.loops import REPLAYED, Replay, Trial, coarse_steps, spelled_by_states
-from fpirhc.conformance.loops import two_masses as two_masses
+from fpirhc.conformance.loops import REPLAYED, Replay, Trial, coarse_steps, spelled_by_states, two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import resolved, tracking_law, with_optimiser

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import solve_discrete_are
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import CompileError, InvalidProblem, NotSupported
 from fpirhc.horizon.cost import LQRTerminal, Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import OptimalControl
@@ -21,10 +22,38 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.native import native
+from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.limits import Limits
+from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 
 Array = npt.NDArray[Any]
+Posed: TypeAlias = tuple[OptimalControl, Array, Array]
+
+
+def posed(problem: Problem, *, time: float = 0.0, parameters: Array | None = None) -> Posed:
+    """Return (ocp, s_0, data) of a problem's horizon at a time, for `solve(ocp, optimiser, s_0, data)`.
+
+    s_0, shape (ns,), is the stages' state at the problem's start; data, shape (ntheta, N + 1), have the approximate parameters
+    unless others are given.
+    """
+    horizon, cost = problem.horizon, problem.cost
+    if horizon is None or cost is None:
+        raise InvalidProblem("nothing is planned without a horizon and a cost: give the problem both")
+    parts, ahead = (problem.plant, problem.reference, horizon, cost), previewed_values(problem.plant, problem.signals)
+    ocp = transcribe(*parts, problem.limits, ahead, problem.start_state)
+    data = stage_data(*parts, signals=ahead)(time, problem.plant.approximate if parameters is None else parameters)
+    return ocp, np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel(), data.full()
+
+
+def compiled(function: ca.Function, flags: Sequence[str] = ()) -> ca.Function:
+    """Return a Function in C as a run has it, an optimiser's step with its own loops; CompileError: no compiler, or it failed."""
+    made = native(function, flags, required=True)
+    if not made.compiled:
+        raise CompileError(made.reason)
+    return made.function
+
 
 STAGES, STEP = 6, 0.3  # s; a short horizon of a mild cost, so that plain gradient methods converge too
 BOUND = 0.4  # N; plans without bounds need about twice as much
@@ -158,15 +187,19 @@ class TrialHorizon:
         return Quadratic(states=_WEIGHTS, effort={"u": _EFFORT}, terminal=LQRTerminal())
 
     @cached_property
+    def _posed(self) -> Posed:
+        horizon, start = Horizon(STAGES, STEP), {"y": 0.0}
+        return posed(Problem(self.plant, _REST, start, STEP, STEP, limits=self.limits, horizon=horizon, cost=self.cost))
+
+    @property
     def ocp(self) -> OptimalControl:
         """The horizon in standard form."""
-        return transcribe(self.plant, _REST, Horizon(STAGES, STEP), self.cost, self.limits)
+        return self._posed[0]
 
-    @cached_property
+    @property
     def data(self) -> Array:
         """Data of the stages."""
-        data = stage_data(self.plant, _REST, Horizon(STAGES, STEP), self.cost)(0.0, self.plant.approximate)
-        return np.asarray(data.full())
+        return self._posed[2]
 
     @cached_property
     def model(self) -> tuple[Array, Array]:

@@ -5,8 +5,7 @@ J is that of the equations, of a cycle of a reality differentiated through its i
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
@@ -16,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, NotContractive, nearest
+from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
 from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Count, Seed
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
@@ -115,44 +113,6 @@ def spectrum_over_run(
     rows = _thinned(len(states))
     true = np.tile(plant.exact if exact is None else np.asarray(exact, dtype=float), (len(rows), 1))
     return _spectrum(response_jacobians(plant, states[rows], deformed[rows], true, approximate))
-
-
-@checked_call
-def spectrum_over_box(
-    plant: Plant, box: Mapping[str, tuple[float, float]], states: Array, deformed: Array, *, samples: Count, seed: Seed
-) -> Spectrum:
-    """Return the eigenvalues of J for exact parameters drawn from a box, at states drawn from the given rows.
-
-    Every corner of the box is a sample where there are at least as many samples as corners; the others are uniform.
-
-    Args:
-        box: parameter -> (lower, upper), in its unit; others keep the plant's exact value.
-        states: states to draw from, shape (rows, nx).
-        deformed: the requests at these states, shape (rows, n).
-        samples: number of draws.
-        seed: of the draws.
-
-    Raises:
-        InvalidName: the box names an unknown parameter.
-        InvalidValue: an interval whose ends are swapped or not finite, or no finite eigenvalue.
-        InvalidShape: arrays that do not fit the plant or each other.
-    """
-    states, deformed = _rows(plant, states, deformed)
-    names, ends = list(plant.parameters), np.tile(plant.exact, (2, 1))
-    for name, (low, high) in box.items():
-        if name not in names:
-            raise InvalidName(f"box: parameter '{name}' is unknown.{nearest(name, names)}")
-        if not -np.inf < low <= high < np.inf:
-            raise InvalidValue(f"box: '{name}' is from {low!r} to {high!r}; expected finite ends with lower <= upper")
-        ends[:, names.index(name)] = low, high
-    generator = np.random.default_rng(seed)
-    parameters = generator.uniform(ends[0], ends[1], size=(samples, len(names)))
-    places = [names.index(name) for name in box]
-    if 2 ** len(places) <= samples:
-        for row, sides in enumerate(itertools.product((0, 1), repeat=len(places))):
-            parameters[row, places] = ends[list(sides), places]
-    rows = generator.integers(len(states), size=samples)
-    return _spectrum(response_jacobians(plant, states[rows], deformed[rows], parameters, None))
 
 
 def _rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, Array]:

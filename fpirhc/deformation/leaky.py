@@ -10,29 +10,12 @@ from __future__ import annotations
 import math
 
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import NotNegative, Product, finite_number
+from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.live import between, ceil, larger, largest, positive, smaller, sqrt
 from fpirhc.task.dead_time import MOST, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
-
-
-@checked_call
-def leaky_pole(product: Product, uncertainty: NotNegative) -> float:
-    """Return the least pole p that the theorem allows for a dead time wrong by at most `uncertainty` cycles.
-
-    p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4; 0 where the dead time is certain.
-
-    Args:
-        product: g, effective gain times the largest eigenvalue of the response Jacobian, in (0, 2).
-        uncertainty: m, in cycles.
-
-    Raises:
-        InvalidValue: a product outside (0, 2), for which no pole is large enough; a negative or infinite uncertainty.
-    """
-    return _least_pole(product, uncertainty)
 
 
 def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
@@ -87,6 +70,9 @@ def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
 
 
 def _least_pole(product: float, uncertainty: float) -> float:
-    """The formula of `leaky_pole` without cancellation at small bounds; the product may be live."""
+    """The least pole that the theorem allows for a product g of gain and plant in (0, 2) and a dead time wrong by m cycles.
+
+    p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4, here without cancellation; the product may be live.
+    """
     bound = product * (2 + product) * uncertainty**2 / 4
     return 2 * bound / (2 * bound + 1 + sqrt(4 * bound + 1))

@@ -13,14 +13,14 @@ from __future__ import annotations
 import importlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import fpirhc as fp
-from fpirhc.problem_files.problem_file import Task
 
 FOLDER = Path(__file__).parent
 
 
-def load(name: str, variant: str = "problem") -> Task:
+def load(name: str, variant: str = "problem") -> Any:
     """The task of one file, with another of the file's problems if `variant` names it."""
     task = fp.load_problem(str(FOLDER / f"{name}.py"))
     return replace(task, problem=getattr(importlib.import_module(f"{__name__}.{name}"), variant))

@@ -9,7 +9,6 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import simulator
 from fpirhc.errors import NotContractive
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
@@ -29,10 +28,10 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
     """Built in, as a live setting of a run, of a stepper, and during a run: one message with the limit and a remedy."""
     message = r"too large; (use 0 < \|gain\| < 2.67|the smallest limit is -2.64)"
     path = "deformation.gain"
-    for make in (fp.Stepper, simulator):
+    for make in (fp.Stepper, fp.simulator):
         with pytest.raises(NotContractive, match=message):
             make(brief(), affine(gain), compiled=False)
-    loop = simulator(brief(), affine(-0.5), compiled=False, live=[path])
+    loop = fp.simulator(brief(), affine(-0.5), compiled=False, live=[path])
     with pytest.raises(NotContractive, match=message):
         loop.run(seed=0, settings={path: gain})
     with pytest.raises(NotContractive, match=message):

@@ -10,9 +10,8 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import Identity
 from fpirhc.contracts import Controller, Deformation
-from fpirhc.errors import InvalidField, InvalidProblem
+from fpirhc.errors import InvalidField
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.01, measure_from=0.0))
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
@@ -54,18 +53,11 @@ class Whole(Around):
 
 
 @dataclass(frozen=True, eq=False)
-class Formless(Alone):
-    """A controller with a map, and blocks in a wrong form."""
-
-    deformation: Deformation = field(default_factory=Identity)
-
-
-@dataclass(frozen=True, eq=False)
 class Halfway(Controller):
     """A wrapper of something that is no controller."""
 
     inner: Any
-    deformation: Deformation = field(default_factory=Identity)
+    deformation: Deformation = field(default_factory=fp.Identity)
 
     def blocks(self, problem):
         """Those of the inner one."""
@@ -109,13 +101,6 @@ def test_what_is_lacking_is_told_in_the_line_that_makes_it(make, words):
     """Not by an error inside the library, cycles later."""
     with pytest.raises(InvalidField, match=f"(?s){words}"):
         make()
-
-
-def test_blocks_of_a_wrong_form_are_named():
-    with pytest.raises(
-        InvalidProblem, match=r"Formless.blocks\(problem\) must return two lists \(blocks, delays\), got \[\]"
-    ):
-        fp.simulate(brief(), Formless(), seed=0, compiled=False)
 
 
 def test_a_whole_wrapper_runs():

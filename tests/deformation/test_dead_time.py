@@ -5,38 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.plants import linear, pendulum
-from test_adaptation import Scalar
+from helpers.iteration import Scalar, affine, iteration_radius
+from helpers.plants import pendulum
 
 import fpirhc as fp
-from fpirhc.contracts import Controller, Deformation
-from fpirhc.errors import FpirhcError
+from fpirhc.contracts import Controller
 
 DELAYS = (0, 1, 2, 3, 5, 10, 20)
-
-
-def affine(effective_gain: float) -> fp.Affine:
-    """r+ = r - a (f - d)."""
-    return fp.Affine(gain=-1.0).with_effective_gain(effective_gain)
-
-
-def iteration_radius(deformation: Deformation, delay: int) -> float:
-    """Spectral radius of the scalar iteration whose response is the request of `delay` cycles earlier."""
-    layout = deformation.memory(("q",))
-    size = delay + 1  # requests on their way, newest first
-    z = ca.SX.sym("z", size + layout.size)
-    memory = layout.split(z[size:])
-    request, next_memory = deformation.step(z[0], z[delay], ca.SX(0), memory)
-    on = ca.vertcat(request, z[: size - 1]) if delay else request
-    function = ca.Function("one", [z], [ca.jacobian(ca.vertcat(on, layout.join(next_memory)), z)])
-    start = layout.start()
-    if "queue_filled" in layout.names:
-        start[layout.slice("queue_filled")] = 1e6
-    return float(np.abs(np.linalg.eigvals(function(np.r_[np.zeros(size), start]).full())).max())
 
 
 def limit(stable, low: float, high: float) -> float:
@@ -141,24 +119,6 @@ def test_prediction_with_the_exact_model_undoes_the_dead_time():
         np.testing.assert_allclose(measured_log[shift:], free["state"][:-shift], atol=2e-8)
 
 
-def test_desired_responses_predict_an_ideal_plant():
-    """With an exact model the realised response is the desired one, and both predictors agree."""
-    problem = fp.Problem(
-        plant=linear(1.0, 1.0),
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
-        start={"y": 0.2},
-        period=1e-2,
-        duration=3.0,
-        dead_time=fp.DeadTime(inputs={"u": 0.05}),
-    )
-    law = fp.ComputedTorque(LAW)
-    states = [
-        fp.simulate(problem, fp.Predicted(law, inputs=0.05, by=by), seed=0, compiled=False)["state"]
-        for by in (fp.ByModel(), fp.ByDesired())
-    ]
-    np.testing.assert_allclose(states[0], states[1], atol=1e-9)
-
-
 late_mass = cache(lambda: replace(tasks.delayed_mass.problem, duration=9.0, measure_from=4.0))
 
 
@@ -190,12 +150,6 @@ def test_long_dead_time_needs_prediction(product):
     assert min(errors["unpaired"], errors["paired"]) > 0.2
 
 
-def test_residual_corrects_the_prediction():
-    """A model with its residual predicts better than the wrong model alone."""
-    errors = {name: rms_error(0.06, c) for name, c in controllers(0.06).items()}
-    assert errors["increment, corrected"] < 0.8 * errors["increment, by model"]
-
-
 @pytest.mark.parametrize("share", [0.7, 1.3])
 def test_misestimated_dead_time_degrades_gracefully(share):
     """30 % too short or too long: a few times the error, and a command as smooth; without a stated uncertainty it chatters."""
@@ -211,40 +165,6 @@ def test_misestimated_dead_time_degrades_gracefully(share):
     assert errors[1] < 4 * errors[0]
     assert moves[1] < 2 * moves[0]
     assert moves[2] > 100 * moves[0]
-
-
-def test_receding_horizon_starts_where_its_command_acts():
-    """RHC with prediction over the dead time keeps the tracking of RHC without dead time; without prediction it loses it."""
-    task = fp.load_problem("van_der_pol")
-    problem = replace(task.problem, duration=6.0, measure_from=3.0)
-    late = replace(problem, dead_time=fp.DeadTime(inputs={"u": 0.1}))
-    rhc = task.controllers["RHC"]
-    runs = {
-        "free": (problem, fp.ExactModel(rhc)),
-        "late": (late, fp.ExactModel(rhc)),
-        "predicted": (late, fp.ExactModel(fp.Predicted(rhc, inputs=0.1))),
-    }
-    errors = {
-        name: fp.measure(p, fp.simulate(p, c, seed=0, compiled=None)).rms_error["q"] for name, (p, c) in runs.items()
-    }
-    assert errors["predicted"] < 2 * errors["free"] + 1e-3
-    assert errors["late"] > 5 * errors["predicted"]
-
-
-@pytest.mark.parametrize(
-    ("dead_time", "sentence"),
-    [
-        (fp.DeadTime(inputs={"Q3": 0.1}), "input 'Q3'.*Did you mean"),
-        (fp.DeadTime(inputs={"Q1": 2.0}), "'Q1' is 2 s, more than 1000 control cycles of 0.001 s"),
-    ],
-)
-def test_bad_dead_times(dead_time, sentence):
-    with pytest.raises(FpirhcError, match=sentence):
-        replace(two_mass(), dead_time=dead_time)
-
-
-CYCLES = np.arange(4000)
-WHITE, SQUARE = np.random.default_rng(1).standard_normal(4000), np.sign(np.sin(0.02 * CYCLES))
 
 
 def test_commands_on_their_way_at_the_start():

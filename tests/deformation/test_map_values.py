@@ -11,7 +11,6 @@ from scipy.optimize import brentq
 
 import fpirhc as fp
 from fpirhc.contracts import Deformation
-from fpirhc.deformation.base import Reach, RequestChange, automatic
 from fpirhc.errors import InvalidValue
 
 
@@ -50,7 +49,7 @@ def test_robust_fixed_point_transformation(offset, sign):
     assert (other.offset, other.sign) == (offset, sign)
     assert other.gain == pytest.approx(-0.2 / (offset * sign))
     assert other.effective_gain() == pytest.approx(0.2)
-    assert one.iteration.reach == Reach("offset", 50.5)
+    assert one.iteration.reach.size == 50.5
 
 
 @pytest.mark.parametrize(("offset", "sign"), [(50.0, -1), (-50.0, 1)])
@@ -96,36 +95,6 @@ def test_sigmoid(gain, shift):
     assert one.with_effective_gain(0.25).effective_gain() == pytest.approx(0.25)
 
 
-def test_scale_of_the_sigmoid():
-    """The step covers a jump, or twice a change that goes on (S then, 0.81 S the step), the recovery too; S is at least 1."""
-    free, step = fp.Sigmoid(gain=-0.5), fp.Sigmoid(gain=-0.5, scale=1.0).largest_step()
-    selection = {
-        RequestChange(50.0, sudden=True): 50.0 / step,
-        RequestChange(50.0, sudden=False): 100.0,
-        RequestChange(50.0, sudden=False, recovery=200.0): 200.0 / step,
-        RequestChange(0.1, sudden=False): 1.0,
-        RequestChange(0.9, sudden=True): 0.9 / step,
-    }
-    assert step == pytest.approx(0.81, abs=5e-3)  # with the usual shift of 0.3
-    for request, scale in selection.items():
-        assert free.with_scale_for(request).scale == pytest.approx(scale, rel=5e-3)
-    assert (automatic(free), automatic(free.with_scale(2.0))) == (("scale",), ())
-    assert free.with_scale(2.0).with_scale_for(RequestChange(50.0, sudden=True)).scale == 2.0
-    assert fp.Sigmoid(gain=-0.5, shift=5.0).shift == 5.0
-    for wrong in (
-        {"shift": 5.01},
-        {"shift": -5.01},
-        {"shift": math.nan},
-        {"gain": math.nan},
-        {"scale": 0.0},
-        {"scale": -1.0},
-        {"scale": math.inf},
-        {"gain": 0.0},
-    ):
-        with pytest.raises(InvalidValue, match="expected"):
-            fp.Sigmoid(**{"gain": -0.5, **wrong})
-
-
 @pytest.mark.parametrize("fraction", [0.4, 1.0, -0.7])
 @pytest.mark.parametrize("scale", [1.0, 20.0])
 def test_rotation(fraction, scale):
@@ -152,7 +121,7 @@ def test_facts_of_the_rotation():
     assert one.secant_gain() == pytest.approx(0.4 * 2 * math.pi / (3 * math.sqrt(3)))
     assert one.with_effective_gain(0.3) == fp.Rotation(fraction=0.3, radius=10.0)
     assert fp.Rotation(fraction=0.4, radius=0.5).radius == 0.5
-    assert one.iteration.reach == Reach("radius", 10.0)
+    assert one.iteration.reach.size == 10.0
     for wrong in ({"fraction": 0.0}, {"radius": 0.0}, {"radius": -1.0}, {"radius": math.inf}):
         with pytest.raises(InvalidValue, match="expected"):
             fp.Rotation(**{"fraction": 0.4, "radius": 1.0, **wrong})

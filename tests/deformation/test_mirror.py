@@ -82,16 +82,6 @@ def test_wrong_model_behind_estimators(estimator):
     assert result < 0.1 * none
 
 
-def test_twin_is_the_instant_where_the_response_is_measured():
-    """Behind an estimator without delay the twin gives what the response of the instant gives, to the order of the period."""
-    errors = {}
-    for name, sensing in (("twin", fp.Sensing(estimator=fp.VelocityDifference())), ("instant", fp.Sensing())):
-        problem = replace(tasks.two_mass.problem, sensing=sensing, duration=6.0)
-        run = fp.simulate(problem, fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID)), seed=0)
-        errors[name] = fp.measure(problem, run).rms_error["q1"]
-    assert errors["twin"] == pytest.approx(errors["instant"], rel=0.15)
-
-
 def test_gain_that_the_delay_does_not_allow_is_refused():
     """With a model of a third of the plant's gain and a long window; the limit in the message is one that runs."""
     known = {
@@ -159,18 +149,3 @@ def test_paired_through_the_lag_the_command_is_quiet(lag):
         assert error < none
     assert through(problem, fp.Increment(map, cycles=0))[1] > 8 * quiet
     assert through(problem, map)[1] > 50 * quiet
-
-
-def test_any_gain_through_the_lag():
-    """The gain may be anything: .02 to .8, quiet and alike; without the lag in the mirror the loop is at its limit."""
-    problem = lagging(0.1)
-    result = [through(problem, fp.ModelReferenced(fp.Affine(gain=-2 * a), lag=0.1)) for a in (0.02, 0.2, 0.8)]
-    assert max(step for _, step in result) < 0.01
-    assert max(e for e, _ in result) < 1.3 * min(e for e, _ in result)
-    assert through(problem, fp.ModelReferenced(fp.Affine(gain=-0.4)))[1] > 1.0
-
-
-def test_short_lag_needs_no_mirror():
-    """An honest loss: at 20 ms the form without a lag tracks better, .07 against 1.7 mrad."""
-    problem, map = lagging(0.02), fp.Affine(gain=-0.4)
-    assert through(problem, fp.ModelReferenced(map))[0] < 0.1 * through(problem, fp.ModelReferenced(map, lag=0.02))[0]

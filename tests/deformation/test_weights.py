@@ -11,7 +11,6 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance import check_deformation
 from fpirhc.contracts import Deformation
-from fpirhc.deformation.base import Iteration
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 
 GAINS = np.array([[0.8, 0.3], [-0.5, 0.4]])
@@ -95,8 +94,3 @@ def test_a_wrong_number_of_weights_is_refused():
     problem, controller = coupled(fp.Affine(gain=-0.5, weights=(1.0, 2.0, 3.0)))
     with pytest.raises(NotSupported, match=r"3 weights are given, but the plant has 2 controlled coordinates \(q, p\)"):
         fp.simulate(problem, controller, seed=0, compiled=False)
-
-
-def test_what_has_no_weights_is_left_as_it_is():
-    one = np.eye(2)
-    assert Iteration().weighted(one) is one

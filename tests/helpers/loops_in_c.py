@@ -6,15 +6,14 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
-from fpirhc.symbolic.native import native
+from fpirhc.conformance import compiled
+from helpers.horizons import horizon_of
 
 REST = fp.Trajectory(lambda t: {"a": 0.3 * ca.sin(t), "b": 0 * t})
 
@@ -30,7 +29,7 @@ class Pair:
         loops: in C.
     """
 
-    ocp: OptimalControl
+    ocp: Any
     data: np.ndarray
     graph: ca.Function
     loops: ca.Function
@@ -77,14 +76,11 @@ def _terminal(v):
 
 
 @cache
-def coupled(
-    limits: fp.Limits | None = None, stages: int = 4, *, convex: bool = True
-) -> tuple[OptimalControl, np.ndarray]:
+def coupled(limits: fp.Limits | None = None, stages: int = 4, *, convex: bool = True) -> tuple[Any, np.ndarray]:
     """The horizon of these two with a cost whose curvature changes with states and inputs, and couples them."""
     cost = fp.CustomCost(terms=_terms if convex else _bent, terminal=_terminal, feedforward=True)
     horizon, plant = fp.Horizon(stages=stages, step=0.15), coupled_plant()
-    ocp = transcribe(plant, REST, horizon, cost, limits or fp.Limits())
-    return ocp, np.asarray(stage_data(plant, REST, horizon, cost)(0.3, plant.approximate).full())
+    return horizon_of(plant, REST, horizon, cost, limits, time=0.3)
 
 
 @cache
@@ -94,15 +90,13 @@ def pair(
     """Graph and loops of `step` or `converging`."""
     ocp, data = coupled(limits, stages, convex=convex)
     graph = getattr(optimiser, kind)(ocp)
-    compiled = native(graph, required=True)
-    assert compiled.compiled, compiled.reason
-    return Pair(ocp, data, graph, compiled.function)
+    return Pair(ocp, data, graph, compiled(graph))
 
 
 def within_its_arrays(pair_of: Pair, calls: Iterator[tuple[np.ndarray, ...]]) -> bool:
     """Whether the loops stay inside their arrays: compiled so that they end their process where they do not."""
     flags = ("-fsanitize=bounds", "-fsanitize-undefined-trap-on-error")
-    function = native(pair_of.graph, flags, required=True).function
+    function = compiled(pair_of.graph, flags)
     child = os.fork()
     if not child:
         for arguments in calls:

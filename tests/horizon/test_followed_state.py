@@ -7,11 +7,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.horizons import horizon_of
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported
-from fpirhc.horizon.nominal import followed_state
-from fpirhc.horizon.stage_data import data_layout, stage_data
 
 K = 3.0  # 1/s
 REFERENCE = fp.Trajectory(lambda t: {"shown": 0.5 * ca.sin(t)})
@@ -36,34 +35,22 @@ SCALED = lags(lambda x, _: 2 * x.b)
 def test_the_input_along_the_reference_is_that_of_the_lags():
     """B = y / 2, a = b + b' / K, u = a' + a at every stage."""
     cost = fp.Quadratic(**COST, deviation={"u": 1e-2})
-    data = np.asarray(stage_data(SCALED, REFERENCE, HORIZON, cost)(0.3, SCALED.approximate).full())
+    ocp, data = horizon_of(SCALED, REFERENCE, HORIZON, cost, time=0.3)
     t = 0.3 + HORIZON.step * np.arange(HORIZON.stages + 1)
     b, b1, b2 = 0.25 * np.sin(t), 0.25 * np.cos(t), -0.25 * np.sin(t)
     needed = b1 + b2 / K + b + b1 / K
-    np.testing.assert_allclose(
-        data[data_layout(SCALED, HORIZON).slice("feedforward")][0], needed, rtol=1e-12, atol=1e-14
-    )
-
-
-def test_coupled_outputs_are_a_linear_system():
-    """Sum and difference of both states give both."""
-    plant = lags(lambda x, _: x.a + x.b, lambda x, _: x.a - x.b)
-    function = followed_state(plant)
-    assert function is not None
-    y = np.array([5.0, 1.0])
-    np.testing.assert_allclose(np.asarray(function(y, plant.approximate).full()).ravel(), [3.0, 2.0])
+    np.testing.assert_allclose(data[ocp.data.slice("feedforward")][0], needed, rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("shown", [lambda x, _: x.a, lambda x, _: x.b**3 + x.a * x.b])
 def test_states_that_do_not_follow_are_refused_by_name(shown):
     """An inner state, which no output shows, and one that stands in it in a power: `rate` is named."""
     plant = lags(shown)
-    assert followed_state(plant) is None
     with pytest.raises(
         NotSupported,
         match=r"needs the states .*, which are no outputs and do not follow from them by linear equations.*rate",
     ):
-        stage_data(plant, REFERENCE, HORIZON, fp.Quadratic(**COST, deviation={"u": 1e-2}))
+        horizon_of(plant, REFERENCE, HORIZON, fp.Quadratic(**COST, deviation={"u": 1e-2}), start={"a": 0.3, "b": 0.2})
 
 
 def test_a_loop_with_deviations_on_an_output_runs_and_adapts():
@@ -88,6 +75,7 @@ def test_a_loop_with_deviations_on_an_output_runs_and_adapts():
     assert errors[2] < 0.2 * errors[0]
 
 
+FULL = {"upper": 0.2, "lower": 0.2}
 G, A, HOLE = 9.81, 0.01, 1e-4  # m/s^2, m^2, m^2
 
 
@@ -116,8 +104,8 @@ def test_a_state_that_follows_one_to_one_can_be_written_so_that_it_is_linear():
     cost = fp.Quadratic(**COST, deviation={"flow": 1.0})
     still = fp.Trajectory(lambda t: {"shown": 0.2 + 0 * t})
     with pytest.raises(NotSupported, match=r"needs the states upper.*rate"):
-        stage_data(tanks(by_velocity=False), still, HORIZON, cost)
+        horizon_of(tanks(by_velocity=False), still, HORIZON, cost, start=FULL)
     plant = tanks(by_velocity=True)
-    data = np.asarray(stage_data(plant, still, HORIZON, cost)(0.0, plant.approximate).full())
-    needed = data[data_layout(plant, HORIZON).slice("feedforward")][0]
+    ocp, data = horizon_of(plant, still, HORIZON, cost, start=FULL)
+    needed = data[ocp.data.slice("feedforward")][0]
     np.testing.assert_allclose(needed, HOLE * np.sqrt(2 * G * 0.2), rtol=1e-12)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.horizons import horizon_of
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
 
 SLEDGE = fp.Plant(
     coordinates={"y": "m"},
@@ -31,8 +28,7 @@ def plan_of(
     horizon = fp.Horizon(stages=stages, step=STEP, terminal=terminal)
     cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.01})
     limits = fp.Limits(inputs={"u": (-1.0, 1.0)}, states=states, **more)
-    ocp = transcribe(SLEDGE, reference, horizon, cost, limits)
-    data = np.asarray(stage_data(SLEDGE, reference, horizon, cost)(0.0, SLEDGE.approximate).full())
+    ocp, data = horizon_of(SLEDGE, reference, horizon, cost, limits)
     first = np.asarray(ocp.start(list(start), [0.0]).full()).ravel()
     return fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
 
@@ -73,28 +69,3 @@ def test_a_soft_limit_lets_the_plan_pass_and_come_back():
     assert plan.violations() == ()
     assert plan.states[0, 10] == pytest.approx(1.4, abs=1e-3)
     assert plan.states[0, 20:].max() < 1.0 + 1e-3
-
-
-@pytest.mark.parametrize(
-    "make", [lambda: {"y": (1.0, -1.0)}, lambda: {"speed": (0.0, 1.0)}], ids=["crossed", "unknown"]
-)
-def test_limits_that_cannot_be_meant_are_refused_before_any_solve(make: Callable[[], dict[str, tuple[float, float]]]):
-    with pytest.raises(InvalidProblem, match=r"lower 1.0 above upper -1.0; swap them|'speed'"):
-        plan_of((0.0, 0.0), make(), 5)
-
-
-def test_a_run_whose_plans_cannot_keep_a_limit_says_so_when_it_is_shown():
-    """A start outside a limit does not stop a run: its text names the outcome, how often, and since when."""
-    problem = fp.Problem(
-        plant=SLEDGE,
-        start={"y": 1.3, "y'": 0.0},
-        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
-        period=STEP,
-        duration=0.3,
-        limits=fp.Limits(inputs={"u": (-1.0, 1.0)}, states={"y": (-5.0, 1.0)}),
-        horizon=fp.Horizon(stages=12, step=STEP),
-        cost=fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.01}),
-    )
-    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPoint(iterations=20, tolerance=1e-6)), seed=0)
-    assert run.stop is None
-    assert "HELD in 3 cycles, first at 0 s" in repr(run)  # the policy's name for every plan that is not usable as it is

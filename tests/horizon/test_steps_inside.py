@@ -6,11 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from helpers.horizons import horizon_of
 
 import fpirhc as fp
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
-from fpirhc.plant.integrators import MapSteps
 
 STEPS, MOST = 8, 0.5
 T = 1.0 / STEPS
@@ -43,9 +41,8 @@ LIMITED = {
 
 def largest(limits: fp.Limits, lengths: tuple[float, ...] = ()) -> float:
     """Largest swing over all single steps of a plan of three stages."""
-    horizon = fp.Horizon(stages=3, step=STEPS * T, discretisation=MapSteps(), lengths=lengths)
-    ocp = transcribe(PLANT, STILL, horizon, PUSHED, limits)
-    data = np.asarray(stage_data(PLANT, STILL, horizon, PUSHED)(0.0, PLANT.approximate).full())
+    horizon = fp.Horizon(stages=3, step=STEPS * T, lengths=lengths)
+    ocp, data = horizon_of(PLANT, STILL, horizon, PUSHED, limits)
     first = np.asarray(ocp.start([0.0, 0.0], [0.0]).full()).ravel()
     own = fp.FixedPoint(iterations=30, tolerance=1e-6, hessian=fp.ExactHessian())
     plan = fp.solve(ocp, own if limits.prices else fp.Ipopt(accuracy=1e-9), first, data)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
+from fpirhc.conformance import posed
 
 LIMIT = 0.8
 
@@ -36,19 +35,12 @@ def carriage(mass: float = 1.0, believed: float = 1.3) -> fp.Problem:
     )
 
 
-def adaptive(gain: float = -1.0) -> fp.RecedingHorizon:
-    return fp.RecedingHorizon(fp.FixedPoint(iterations=20, tolerance=1e-6), fp.Affine(gain))
-
-
 def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
     """On the bound less the margin where the limit is active, like IPOPT's plan with the same margin."""
     margin = 0.13
     problem = carriage()
-    assert problem.horizon is not None
     horizon = replace(problem.horizon, margins={"q": margin})
-    assert problem.cost is not None
-    ocp = transcribe(problem.plant, problem.reference, horizon, problem.cost, problem.limits)
-    data = np.asarray(stage_data(problem.plant, problem.reference, horizon, problem.cost)(0.3, [1.3]).full())
+    ocp, _, data = posed(replace(problem, horizon=horizon), time=0.3)
     first = np.asarray(ocp.start([0.55, 1.4], [0.0]).full()).ravel()
     plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
     assert plan.status == fp.Status.OK
@@ -85,17 +77,3 @@ def test_the_rate_of_a_plan_counts_from_the_command_without_its_shift(weights):
         problem, fp.RecedingHorizon(fp.FixedPoint(iterations=50, tolerance=1e-9), fp.Affine(-1.0)), seed=0
     )
     assert np.abs(run["state"][-50:, 0]).max() < 1e-6
-
-
-def test_a_run_with_blocks_and_margins_is_measured():
-    """Its cost is that of the problem's stage, which has neither."""
-    problem = carriage()
-    assert problem.horizon is not None
-    shaped = replace(
-        problem,
-        duration=0.3,
-        measure_from=0.0,
-        horizon=replace(problem.horizon, blocks=(1,) * 10 + (5, 5), margins={"q": 0.01}),
-    )
-    run = fp.simulate(shaped, adaptive(), seed=0)
-    assert np.isfinite(run["cost"]).all()

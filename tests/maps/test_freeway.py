@@ -16,8 +16,6 @@ import pytest
 from helpers.kinds import slow_but
 
 import fpirhc as fp
-from fpirhc.plant.maps import over
-from fpirhc.problem_files.problem_file import Task
 
 DATA = Path(__file__).parents[1] / "data" / "freeway" / "reference.csv"
 T = 10 / 3600  # h
@@ -25,7 +23,7 @@ TOTAL_TIME_SPENT = 1433.7876921  # veh h
 
 
 @cache
-def task(name: str) -> Task:
+def task(name: str) -> Any:
     return fp.load_problem(name)
 
 
@@ -42,7 +40,7 @@ def error(name: str, controller: str) -> float:
 
 def stepper(plant: fp.Plant) -> ca.Function:
     """One step of 10 s, (state, inputs, parameters) -> state, and not the six of a minute."""
-    x, u, p = over(plant, T).symbols()
+    x, u, p = replace(plant, steps=1).symbols()
     return ca.Function("step", [x, u, p], [plant.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))])
 
 
@@ -61,7 +59,7 @@ def with_demands(plant: fp.Plant, steps: int) -> np.ndarray:
 def driven(name: str, commands: np.ndarray) -> np.ndarray:
     """States after each step of 10 s under these commands (steps, nu), from the start of a task."""
     problem = task(name).problem
-    plant = over(problem.plant, T)
+    plant = replace(problem.plant, steps=1)
     run = stepper(plant).mapaccum(len(commands))
     return np.asarray(run(problem.start_state, commands.T, with_demands(plant, len(commands)).T).full()).T
 
@@ -93,12 +91,6 @@ def test_cars_are_conserved() -> None:
 
 
 # Metering
-
-
-def test_the_density_at_the_merge_has_order_one() -> None:
-    plant = task("freeway_metering").problem.plant
-    assert tuple(plant.chains.values()) == (1,)
-    assert 0 not in plant.equations.output_orders.values()
 
 
 def test_an_exact_map_of_a_minute_has_no_error() -> None:
@@ -173,7 +165,7 @@ def test_an_economic_plan_is_the_published_run(which: str) -> None:
 
 def test_a_sign_limits_the_speed_at_which_traffic_settles() -> None:
     """One step of the map by hand: v moves towards 1.1 times what the sign shows where that is less, and nothing else changes."""
-    plant = over(task("freeway_coordinated").problem.plant, T)
+    plant = replace(task("freeway_coordinated").problem.plant, steps=1)
     state = np.array(task("freeway_coordinated").problem.start_state)
     step = plant.equations.next
     before = by_hand(state[:14], 0.4, tuple(plant.exact[-2:]))
@@ -188,17 +180,6 @@ def test_a_sign_limits_the_speed_at_which_traffic_settles() -> None:
         assert after[:14] == pytest.approx(wanted, rel=1e-13)
         assert after[-2:] == pytest.approx(shown)
         assert (np.array(limited) < 0).tolist() == (np.array(slower) > 0).tolist()
-
-
-def with_limits(lowest: float, highest: float) -> fp.Problem:
-    """The coordinated task whose signs have these limits."""
-    problem = task("freeway_coordinated").problem
-    return replace(
-        problem,
-        limits=replace(
-            problem.limits, inputs={"r": (0.0, 1.0), "sign3": (lowest, highest), "sign4": (lowest, highest)}
-        ),
-    )
 
 
 PUBLISHED_SIGNS = DATA.with_name("coordinated.csv")  # minute, rate, two signs
@@ -218,164 +199,6 @@ def spent_in(commands: np.ndarray) -> np.ndarray:
 def test_published_signs_and_rates_spend_the_published_time() -> None:
     """The map with its minimum, under the 100 steps of the source's coordinated run: 102.07711241922753 veh h."""
     assert spent_in(published_signs())[99] == pytest.approx(102.07711241922753, abs=1e-9)
-
-
-@pytest.mark.slow
-def test_the_published_signs_are_no_minimum() -> None:
-    """As in the source, five rates ahead and signs that stood at the speeds of the start; IPOPT does better from another guess.
-
-    Within .1 veh h after 96 steps. The rates differ by up to .65 in the first minutes, where the source meters for nothing.
-    """
-    coordinated = task("freeway_coordinated").problem
-    assert coordinated.horizon is not None
-    problem = replace(
-        coordinated,
-        signals=task("freeway_economic").problem.signals,
-        input_before={"r": 1.0, "sign3": 78.0, "sign4": 72.5},
-        horizon=replace(coordinated.horizon, blocks=(1, 1, 1, 1, 3)),
-        duration=17 / 60,
-    )
-    run = fp.simulate(problem, fp.ExactModel(fp.RecedingHorizon(fp.Ipopt())), seed=0, compiled=False)
-    spent = float(run["plant_state.spent"][16])
-    assert spent == pytest.approx(96.8224, abs=2e-3)
-    assert 0.05 < spent_in(published_signs())[95] - spent < 0.1
-
-
-@pytest.mark.slow
-def test_the_program_of_the_source_has_its_signs_and_rates() -> None:
-    """States and inputs of a horizon, zeros as the first guess, and IPOPT, as there; its first plan ends after 500 iterations."""
-    plant = over(task("freeway_coordinated").problem.plant, T)
-    program, iterations, costs = program_of_source(plant), list[int](), list[float]()
-    parameters = with_demands(plant, 100 + STEPS)
-    state, last = np.array(task("freeway_coordinated").problem.start_state), np.array([1.0, 78.0, 72.5])
-    guess: Any = 0.0
-    for wanted in published_signs():
-        k = 6 * len(iterations)
-        ahead = parameters[k : k + STEPS].ravel()
-        found = program(x0=guess, p=np.concatenate([state[:ROAD], last, ahead]), **bounds_of_source())
-        guess, count = found["x"].full().ravel(), (STEPS + 1) * ROAD
-        iterations.append(program.stats()["iter_count"])
-        costs.append(float(found["f"]))
-        last = guess[count : count + 3]
-        assert last == pytest.approx(wanted, abs=0.02)
-        for row in parameters[k : k + 6]:
-            state = np.ravel(stepper(plant)(state, last, row).full())
-    assert iterations[0] == 500
-    assert costs[0] == pytest.approx(37.8634, abs=1e-3)
-
-
-def test_the_first_plan_of_the_source_is_no_minimum() -> None:
-    """Its program, from an open ramp and signs that stand: another plan costs .05 veh h less in seven minutes, a part in 800.
-
-    So the cost hardly tells the two apart, and rates that differ by .65 are as good.
-    """
-    plant = over(task("freeway_coordinated").problem.plant, T)
-    parameters, start = with_demands(plant, STEPS), np.array(task("freeway_coordinated").problem.start_state)
-    standing = np.array([1.0, 78.0, 72.5])
-    states = [start]
-    for row in parameters[:STEPS]:
-        states.append(np.ravel(stepper(plant)(states[-1], standing, row).full()))
-    guess = np.concatenate([np.array(states)[:, :ROAD].ravel(), np.tile(standing, RATES)])
-    given = np.concatenate([start[:ROAD], standing, parameters[:STEPS].ravel()])
-    program = program_of_source(plant)
-    found = program(x0=guess, p=given, **bounds_of_source())
-    assert program.stats()["success"]
-    assert float(found["f"]) == pytest.approx(37.8151, abs=1e-3)
-    assert found["x"].full()[-3 * RATES :].ravel() == pytest.approx(np.tile(standing, RATES), abs=0.05)
-
-
-ROAD, STEPS, RATES = (
-    14,
-    42,
-    5,
-)  # states without time spent and signs, steps of 10 s ahead, minutes with rates of their own
-
-
-def program_of_source(plant: fp.Plant) -> ca.Function:
-    """Min of the time spent + 0.4 sum of the squares of the changes, over states at every step and inputs of five minutes."""
-    n, step, more = ROAD, stepper(plant), ca.SX.zeros(plant.state.size - ROAD)
-    x, u = ca.SX.sym("x", n, STEPS + 1), ca.SX.sym("u", 3, RATES)
-    p, of = ca.SX.sym("p", n + 3 + STEPS * plant.parameter.size), plant.parameter.size
-    rows = [p[n + 3 + k * of : n + 3 + (k + 1) * of] for k in range(STEPS)]
-    gaps = [
-        x[:, 0] - p[:n],
-        *(step(ca.vertcat(x[:, k], more), u[:, min(k // 6, 4)], rows[k])[:n] - x[:, k + 1] for k in range(STEPS)),
-    ]
-    change = ca.diff(ca.horzcat(p[n : n + 3], u), 1, 1) / ca.DM([1, 102, 102])
-    cost = T * (2 * ca.sum2(ca.sum1(x[:6, :])) + ca.sum2(ca.sum1(x[12:, :]))) + 0.4 * ca.sumsqr(change)
-    program = {"x": ca.vertcat(ca.vec(x), ca.vec(u)), "p": p, "f": cost, "g": ca.vertcat(*gaps)}
-    quiet = {"max_iter": 500, "sb": "yes", "print_level": 0}
-    options: dict[str, Any] = {"expand": True, "print_time": False, "ipopt": quiet}
-    return ca.nlpsol("source", "ipopt", program, options)
-
-
-def bounds_of_source() -> dict[str, Any]:
-    """Densities, speeds and queues are not negative, and at most 100 cars wait at the ramp."""
-    low, high = [0.0] * ROAD, [np.inf] * (ROAD - 1) + [100.0]
-    inputs = [0.0, 20.0, 20.0] * RATES, [1.0, 102.0, 102.0] * RATES
-    return {"lbx": low * (STEPS + 1) + inputs[0], "ubx": high * (STEPS + 1) + inputs[1], "lbg": 0.0, "ubg": 0.0}
-
-
-@pytest.mark.slow
-def test_signs_save_no_time_with_the_demands_of_the_source() -> None:
-    """They stay beyond what is driven, and the rates are those of metering alone."""
-    coordinated = task("freeway_coordinated")
-    problem = replace(coordinated.problem, signals=task("freeway_economic").problem.signals)
-    run = fp.simulate(problem, coordinated.controllers["RHC exact model"], seed=0, compiled=False)
-    driven = np.maximum(run["plant_state.v3"], run["plant_state.v4"])
-    assert (1.1 * run["command"][:, 1:].min(axis=1) > driven).all()
-    assert (run["status"] == 0).all()
-    assert run["plant_state.spent"].max() == pytest.approx(216.448, abs=2e-3)
-
-
-@pytest.mark.slow
-def test_signs_hold_the_queue_that_metering_alone_does_not() -> None:
-    """The second table of the coordinated task; its first row is that of IPOPT, which goes on from plans that keep no limit."""
-    coordinated = task("freeway_coordinated")
-    lines = coordinated.description.split("largest queue [veh]")[1].splitlines()[1:6]
-    table = {name: tuple(map(float, numbers)) for name, *numbers in (line.strip().rsplit(maxsplit=2) for line in lines)}
-    alone = fp.ExactModel(fp.RecedingHorizon(fp.Ipopt()))
-    runs = {"metering alone, by IPOPT": fp.simulate(with_limits(101.99, 102.0), alone, seed=0, compiled=False)}
-    names = [name for name in table if name in coordinated.controllers]
-    runs |= {n: fp.simulate(coordinated.problem, coordinated.controllers[n], seed=0, compiled=False) for n in names}
-    assert set(runs) == set(table)
-    for name, run in runs.items():
-        found = run["plant_state.spent"].max(), run["plant_state.w2"].max()
-        assert found == pytest.approx(table[name], abs=0.5), name
-    exact = runs["RHC exact model"]
-    assert exact["plant_state.w2"].max() <= 100 + 1e-6
-    assert exact["command.sign3"].min() == pytest.approx(20.0, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_the_iteration_spends_more_time() -> None:
-    """The second table of the description: a wrong model, where the density is not what is wrong."""
-    rows = task("freeway_economic").description.split("with an open light")[1].splitlines()[1:6]
-    table = {name: numbers for name, *numbers in (line.strip().rsplit(maxsplit=3) for line in rows)}
-    states = open_loop()[:174]
-    spent = T * (2 * states[:, :6].sum() + states[:, 12:].sum())
-    assert float(table.pop("open ramp")[0]) == pytest.approx(spent, abs=0.05)
-    for name, (time, queue, open_light) in table.items():
-        run = fp.simulate(task("freeway_economic").problem, task("freeway_economic").controllers[name], seed=0)
-        assert run["plant_state.spent"].max() == pytest.approx(float(time), abs=0.06), name
-        assert run["plant_state.w2"].max() == pytest.approx(float(queue), abs=0.06), name
-        assert (run["command.r"] > 1 - 1e-6).sum() == int(open_light), name
-        if name == "RHC":
-            assert np.flatnonzero(run["command.r"] > 1 - 1e-6).tolist() == [*range(8), 17, 19, 21, 22]
-            assert (run["plant_state.w2"][[17, 19, 21, 22]] > 100).all()
-
-
-@pytest.mark.slow
-def test_a_price_of_the_queue_leaves_a_plan_in_every_minute() -> None:
-    """The last table of the description; the hard limit leaves minutes in which the last plan is held."""
-    economic = task("freeway_economic")
-    rows = economic.description.split("    with a price ")[1].splitlines()[1:4]
-    priced = replace(economic.problem, limits=replace(economic.problem.limits, prices={"w2": 5.0}))
-    for name, time, queue in (line.strip().rsplit(maxsplit=2) for line in rows):
-        run = fp.simulate(priced, economic.controllers[name], seed=0, compiled=False)
-        assert (run["status"] == 0).all(), name
-        assert run["plant_state.spent"].max() == pytest.approx(float(time), abs=0.06), name
-        assert run["plant_state.w2"].max() == pytest.approx(float(queue), abs=0.06), name
 
 
 # Emission
@@ -406,17 +229,6 @@ def test_the_static_map_is_that_of_settled_traffic(which: str) -> None:
         assert mapped == pytest.approx(settled_emission(2500.0, rate, p), rel=1e-9)
 
 
-def test_every_target_has_a_rate() -> None:
-    """Beyond the largest rate the map goes on as a line, and its inverse with it."""
-    plant = task("freeway").problem.plant
-    for target in (1900.0, 2000.0, 2140.0):
-        rate = float(plant.equations.inverse([50.0], target, plant.approximate))
-        assert float(plant.equations.controlled_response([50.0], rate, plant.approximate)) == pytest.approx(
-            target, rel=1e-7
-        )
-    assert rate > 0.6
-
-
 def test_the_iteration_holds_the_emission() -> None:
     """The figures of the description; the map alone stays at its largest rate."""
     assert error("freeway", "static map") == pytest.approx(71.8, rel=0.02)
@@ -425,20 +237,6 @@ def test_the_iteration_holds_the_emission() -> None:
     assert run_of("freeway", "static map+FPI")["clipped"][30:].sum() == 0
     assert run_of("freeway", "static map+FPI")["reality_state.w2"].min() > 6  # so the ramp is never short of cars
     assert run_of("freeway", "static map+FPI")["reality_state.w2"].max() < 1760
-
-
-def test_even_the_exact_map_is_worse_than_the_iteration() -> None:
-    """Traffic takes its time, and nobody knows the mainstream: figures of the description."""
-    problem = task("freeway").problem
-    exact = {n: replace(one, approximate=one.exact) for n, one in problem.plant.parameters.items()}
-    known = {n: fp.Known(one.values) for n, one in problem.signals.items()}
-    informed = replace(problem, plant=replace(problem.plant, parameters=exact))
-    for one, expected in ((informed, 33.5), (replace(informed, signals=known), 7.3)):
-        run = fp.simulate(one, fp.FeedforwardOnly(), seed=0, compiled=False)
-        assert fp.measure(one, run).rms_error["emission"] == pytest.approx(expected, rel=0.02)
-    last = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), paired=None)
-    plain = fp.simulate(problem, last, seed=0, compiled=False)
-    assert fp.measure(problem, plain).rms_error["emission"] == pytest.approx(5.1, rel=0.02)
 
 
 def test_the_shift_of_the_target_is_that_of_a_loop_by_hand() -> None:
@@ -451,39 +249,6 @@ def test_the_shift_of_the_target_is_that_of_a_loop_by_hand() -> None:
         shift = float(run["shift.emission"][k])
         if free[k - 1] or abs(wanted) < abs(shift):
             assert shift == pytest.approx(wanted, abs=1e-8)
-
-
-def test_a_pi_law_is_as_good() -> None:
-    """The second table of the description: this mainstream, one that swings faster, and a sensor with noise."""
-    problem, shipped = task("freeway").problem, task("freeway").controllers
-    rows = task("freeway").description.split("noise of 5 kg/h")[1].splitlines()[1:3]
-    faster = {**problem.signals, "demand": fp.Unknown(lambda t: 2500 + 120 * ca.sin(2 * ca.pi * t))}
-    noisy = fp.Sensing(sensors={"emission": fp.Sensor(noise=fp.Noise(5.0))})
-    variants = problem, replace(problem, signals=faster), replace(problem, sensing=noisy)
-    for name, *numbers in (line.strip().rsplit(maxsplit=3) for line in rows):
-        for variant, number in zip(variants, numbers, strict=True):
-            run = fp.simulate(variant, shipped[name], seed=0, compiled=False)
-            assert fp.measure(variant, run).rms_error["emission"] == pytest.approx(float(number), abs=0.06), name
-    cascade: Any = shipped["static map+FPI"]
-    larger = replace(cascade, deformation=fp.Affine(gain=-3.5))
-    for variant, error in zip(variants, (1.1, 2.9, 6.7), strict=True):
-        run = fp.simulate(variant, larger, seed=0, compiled=False)
-        assert fp.measure(variant, run).rms_error["emission"] == pytest.approx(error, abs=0.06)
-
-
-@pytest.mark.parametrize("law", ["iteration", "PI"])
-def test_both_gains_have_room(law: str) -> None:
-    """Nothing swings with the smaller of the two multiples in the description, and the light does with the larger one."""
-    problem = task("freeway").problem
-    cascade: Any = task("freeway").controllers["static map+FPI"]
-    laws: dict[str, list[Any]] = {
-        "iteration": [replace(cascade, deformation=fp.Affine(gain=-2.5 * times)) for times in (1.0, 2.8, 3.2)],
-        "PI": [fp.PID({"emission": 0.006 * times}, {"emission": 0.4 * times}) for times in (1.0, 2.0, 3.0)],
-    }
-    runs = [fp.simulate(problem, one, seed=0, compiled=False) for one in laws[law]]
-    own, near, beyond = (fp.measure(problem, run).total_variation["r"] for run in runs)
-    assert near == pytest.approx(own, rel=0.05)
-    assert beyond > 10 * own
 
 
 class Road:

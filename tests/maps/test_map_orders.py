@@ -159,25 +159,6 @@ def test_poles_that_do_not_fit_are_refused(what: str) -> None:
         fp.simulate(task(chain(2)), fp.ComputedTorque(make()), seed=0, compiled=False)
 
 
-def believed(observer: Any) -> dict[str, Any]:
-    """Settings of a problem in which the output alone is measured."""
-    return {"sensing": fp.Sensing(estimator=fp.StepDifference(), measured=("y",), observer=observer)}
-
-
-def test_believed_states_of_a_wrong_map_are_corrected() -> None:
-    """A fifth of the wrong model's error is left with a filter of the output, and no more than with measured states."""
-    measured = task(chain(2, 0.95))
-    problem = task(chain(2, 0.95), **believed(fp.KalmanFilter(measured={"y": 1e-3}, noise={"x1": 1e-2, "x2": 1e-2})))
-    law = fp.Exponential(rate=0.3 / T, integral=False)
-    form = fp.ModelReferenced(fp.Affine(gain=-0.5))
-    plain, adapted, seen = (
-        float(np.sqrt(np.mean(error_of(p, fp.ComputedTorque(law, d))[150:] ** 2)))
-        for p, d in ((problem, fp.Identity()), (problem, form), (measured, form))
-    )
-    assert adapted < 0.2 * plain
-    assert adapted < 1.1 * seen
-
-
 def test_a_filter_of_late_responses_is_the_recursion_by_hand() -> None:
     """The response of order 2 is that of two cycles ago, to the state and the command of then; the disturbance is found."""
     filtering = fp.DisturbanceKalman({"x2": 0.02}, {"x1": 1e-2, "x2": 1e-2, "y''": 1e-4})

@@ -17,9 +17,7 @@ import pytest
 from helpers.plants import simulated
 
 import fpirhc as fp
-from fpirhc.errors import FpirhcError, InvalidProblem, NotSupported
-from fpirhc.plant.maps import over
-from fpirhc.report.html import chart_data
+from fpirhc.errors import FpirhcError
 
 T = 10.0  # s, one step
 RATE = 0.04  # 1/s
@@ -120,13 +118,6 @@ def test_a_cycle_of_three_steps_is_the_map_three_times() -> None:
         assert run["plant_state"][k + 1, 0] == x
 
 
-def test_the_response_is_the_difference_of_the_last_cycle() -> None:
-    run = simulated(task(), fp.ComputedTorque(fp.Exponential(rate=RATE)))
-    stock = run["plant_state"][:, 0]
-    assert np.array_equal(run["plant_realised"][1:, 0], (stock[1:] - stock[:-1]) / T)
-    assert np.allclose(run["realised"][1:, 0], run["plant_realised"][1:, 0], rtol=0, atol=1e-15)
-
-
 def chain(order: int) -> fp.Plant:
     """x1+ = x2, x2+ = x3, ..., xr+ = a x1 + b u, controlled at x1."""
     names = [f"x{k}" for k in range(1, order + 1)]
@@ -150,8 +141,7 @@ def test_the_order_is_counted_in_cycles(order: int) -> None:
     """In single steps it is the length of the chain; a cycle as long as the chain sees the input in one."""
     plant = chain(order)
     assert tuple(plant.chains.values()) == (order,)
-    assert set(over(plant, order * T).chains.values()) == {1}
-    assert over(plant, T) is plant
+    assert set(replace(plant, steps=order).chains.values()) == {1}
 
 
 BAD: dict[str, tuple[Callable[[], object], str]] = {
@@ -159,33 +149,17 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
         lambda: task(period=15.0),
         r"period 15 s is no whole number of the map's steps of 10 s; use 10 s or 20 s",
     ),
-    "short period": (lambda: task(period=4.0), r"no whole number of the map's steps of 10 s; use 10 s$"),
-    "integrator": (
-        lambda: task(integrator=fp.RungeKutta4()),
-        r"integrator: RungeKutta4\(substeps=1\) integrates differential equations; the plant is a map, leave it out",
-    ),
     "discretisation": (
         lambda: task(horizon=fp.Horizon(stages=3, step=T, discretisation=fp.Euler())),
         r"horizon: discretisation: Euler\(substeps=1\) integrates differential equations",
     ),
-    "stage": (lambda: task(horizon=fp.Horizon(stages=3, step=15.0)), r"does not divide the horizon step 15 s"),
     "estimator": (
         lambda: task(sensing=fp.Sensing(estimator=fp.PositionDifference())),
         r"PositionDifference estimates derivatives with respect to time, which a map does not have",
     ),
-    "step": (lambda: fishery(step=-1.0), r"step must be a positive number, in s, got -1.0"),
     "state": (
         lambda: fishery(next=lambda x, u, p: {}),
         r"next does not give the value of state 'stock' one step later",
-    ),
-    "unknown": (
-        lambda: fishery(next=lambda x, u, p: {"stock": x.stock + u.catch, "fish": 1}),
-        r"state 'fish' is unknown",
-    ),
-    "arguments": (lambda: fishery(next=lambda x, u: {}), r"it is called as next\(x, u, p\)"),
-    "text": (
-        lambda: fishery(next=lambda x, u, p: {"stock": "x"}),
-        r"next of 'stock' must be one scalar expression, got the text 'x'",
     ),
     "no input": (
         lambda: fishery(next=lambda x, u, p: {"stock": x.stock}, outputs={"y": fp.Output("1", lambda x, p: x.stock)}),
@@ -203,25 +177,6 @@ def test_what_does_not_fit_a_map_is_refused(what: str) -> None:
     build, message = BAD[what]
     with pytest.raises(FpirhcError, match=message):
         build()
-
-
-def test_a_page_draws_steps() -> None:
-    """Between two cycles a map has no motion that a line could show."""
-    made = fp.compare(fp.load_problem("fishery"), controllers=["CTC"], seed=0, compiled=False)
-    assert made.steps
-    assert chart_data(made)["steps"] is True
-
-
-def test_a_map_as_reality_needs_a_map_as_model() -> None:
-    rates = fp.Plant.of_states(
-        states={"stock": "1"},
-        inputs={"catch": "1/s"},
-        parameters={},
-        rates=lambda x, u, p: {"stock": -u.catch},
-        outputs={"stock": fp.Output("1", lambda x, p: x.stock)},
-    )
-    with pytest.raises(InvalidProblem, match="it is a map, and the model has differential equations"):
-        task(rates, reality=fp.Reality(fishery(outputs={"stock": fp.Output("1", lambda x, p: x.stock)})))
 
 
 def test_disturbances_and_signals_act_as_in_the_loop_by_hand() -> None:
@@ -284,35 +239,3 @@ def test_a_map_outside_is_the_map() -> None:
     controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.ModelReferenced(fp.Affine(gain=-1.0)))
     outside = simulated(task(reality=fp.ExternalPlant(Pond(), measures={"stock": "1"})), controller)
     assert np.abs(outside["command"] - simulated(task(), controller)["command"]).max() < 1e-12
-
-
-def test_a_cascade_on_a_map_iterates_on_its_target() -> None:
-    law = fp.Exponential(rate=0.04, integral=False)
-    cascade = fp.Cascade(fp.ComputedTorque(law), fp.Affine(gain=-0.6), fp.ThroughModel(lag=2 * T))
-    problem = task(duration=1500.0, measure_from=500.0)
-    plain, deformed = (
-        float(np.sqrt((simulated(problem, c)["true_error"][50:] ** 2).mean()))
-        for c in (fp.ComputedTorque(law), cascade)
-    )
-    assert deformed < 0.1 * plain
-
-
-@pytest.mark.parametrize(("steps", "words"), [(True, "steps, and the model has none"), (False, "the model is a map")])
-def test_the_exact_model_is_refused_with_the_time_that_each_has(steps: bool, words: str) -> None:
-    """A plant that steps is no exact model of one that flows, nor the other way round, and the sentence says which is which."""
-    common: dict[str, Any] = {
-        "states": {"a": "1"},
-        "inputs": {"u": "1"},
-        "parameters": {"k": fp.Parameter(0.1, 0.2, "1")},
-    }
-    stepping = fp.Plant.discrete(**common, next=lambda x, u, p: {"a": p.k * x.a + u.u}, step=1.0)
-    flowing = fp.Plant(
-        coordinates=common["states"],
-        inputs=common["inputs"],
-        parameters=common["parameters"],
-        response=lambda x, u, p: {"a": p.k * x.a + u.u},
-        order=1,
-    )
-    reality, model = (stepping, flowing) if steps else (flowing, stepping)
-    with pytest.raises(NotSupported, match=f"the reality has .*{words}.*leave ExactModel out"):
-        fp.Reality(reality).as_model(model)

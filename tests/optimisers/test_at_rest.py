@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
+from fpirhc.conformance import posed
 
 MANY = 200  # set-points of every plant: a thousand in all
 
@@ -89,11 +88,7 @@ def test_the_first_command_of_a_plan_at_rest_is_the_feedforward(name, optimiser)
     """At two hundred set-points, to 1e-6 of the range, with status OK."""
     one = PLANTS[name]
     problem = problem_of(name, sum(one.places) / 2)
-    horizon, cost = problem.horizon, problem.cost
-    assert horizon is not None
-    assert cost is not None
-    ocp = transcribe(problem.plant, problem.reference, horizon, cost, problem.limits)
-    table = stage_data(problem.plant, problem.reference, horizon, cost)(0.0, problem.plant.approximate).full()
+    ocp, _, table = posed(problem)
     places, needs = ocp.data.slice("reference"), ocp.data.slice("feedforward")
     wrong = []
     for at in np.random.default_rng(1).uniform(*one.places, MANY):

@@ -6,22 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_fixed_point import SWING, linear_problem, pendulum_problem
+from helpers.horizons import SWING, linear_problem, pendulum_problem, rolled
+from helpers.kinds import slow_but
 
 import fpirhc as fp
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
+from fpirhc.conformance import posed
 
 PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_masses")
-
-
-def first_horizon(name):
-    p = fp.load_problem(name).problem
-    assert p.horizon is not None
-    assert p.cost is not None
-    ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
-    data = stage_data(p.plant, p.reference, p.horizon, p.cost)(0.0, p.plant.approximate).full()
-    return ocp, data, ocp.start(p.start_state, np.zeros(ocp.input.size)).full().ravel()
 
 
 def iterates(ocp, data, first, count):
@@ -34,19 +25,15 @@ def iterates(ocp, data, first, count):
         yield replace(best, inputs=inputs, states=best.states, cost=float(diagnostics.ravel()[0])), best
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "chain_of_masses" else n for n in PROBLEMS]
-)
+@pytest.mark.parametrize("name", slow_but(PROBLEMS, "two_mass", "cart_pole"))
 def test_no_bound_is_below_the_true_error(name):
     """On early and late iterates of every shipped problem: distance to the optimum, error of any input, and suboptimality."""
-    from fpirhc.horizon.problem import rollout
-
-    ocp, data, first = first_horizon(name)
+    ocp, first, data = posed(fp.load_problem(name).problem)
     counted = 0
     for k, (plan, best) in enumerate(iterates(ocp, data, first, 14)):
         if k not in {0, 1, 2, 3, 5, 8, 13}:
             continue
-        plan = replace(plan, states=rollout(ocp)(first, plan.inputs, data)[0].full())
+        plan = replace(plan, states=rolled(ocp, first, plan.inputs, data).states)
         certificate = fp.certify(plan)
         if not np.isfinite(certificate.input_error):
             continue
@@ -81,26 +68,6 @@ def test_factor_is_the_rate_of_the_iteration():
         inputs, _, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
         distances.append(np.linalg.norm(inputs.full() - best.inputs))
     assert distances[-1] / distances[-2] == pytest.approx(fp.certify(best).factor, abs=0.01)
-
-
-def test_nothing_is_free_when_every_bound_holds():
-    """A plan in a corner of its box cannot move: nothing is left to bound."""
-    ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (3.0, 3.0)}))
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([0.5, 0.0]), data)
-    certificate = fp.certify(plan)
-    assert certificate.input_error == 0.0 or certificate.free > 0
-
-
-def test_a_saddle_is_not_certified():
-    """Standing upright with a cost that wants to fall: curvature below zero, no bound."""
-    ocp, data = pendulum_problem(
-        fp.Quadratic(states={"angle": 1e-3}, effort={"torque": 1e-4}, terminal={"angle": 50.0}),
-        horizon=fp.Horizon(stages=30, step=0.1),
-    )
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([np.pi * 3, 0.0]), data, calls=1)
-    certificate = fp.certify(replace(plan, inputs=0 * plan.inputs))
-    assert certificate.factor > 0
-    assert np.isfinite(certificate.curvature)
 
 
 def test_bounds_hold_with_active_limits_of_states():

@@ -9,13 +9,12 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.horizons import NEEDS_C
 from helpers.loops_in_c import Pair, pair, within_its_arrays
 
 import fpirhc as fp
-from fpirhc import Status
-from fpirhc.symbolic.native import find_compiler
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+pytestmark = NEEDS_C
 LIMITS = fp.Limits(inputs={"Ma": (-2.0, 2.5), "Mb": (-150.0, 120.0)}, states={"a": (-0.5, 0.6), "a'": (-np.inf, 1.2)})
 END = 60  # more turns than any of these horizons needs
 
@@ -42,10 +41,10 @@ def called(both: Pair, first: np.ndarray, memory: np.ndarray, bounds=None, data=
 
 
 SEEN = {
-    1: {Status.NOT_CONVERGED},
-    3: {Status.NOT_CONVERGED},
-    8: {Status.NOT_CONVERGED, Status.OK},
-    END: {Status.OK, Status.INFEASIBLE},
+    1: {fp.Status.NOT_CONVERGED},
+    3: {fp.Status.NOT_CONVERGED},
+    8: {fp.Status.NOT_CONVERGED, fp.Status.OK},
+    END: {fp.Status.OK, fp.Status.INFEASIBLE},
 }
 
 
@@ -78,7 +77,7 @@ def test_a_solution_stays():
     for _ in range(3):
         _, diagnostics, memory = called(both, first, memory)
     plan, diagnostics, after = called(both, first, memory)
-    assert (diagnostics[3], diagnostics[4]) == (0, Status.OK)
+    assert (diagnostics[3], diagnostics[4]) == (0, fp.Status.OK)
     np.testing.assert_allclose(after, memory, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(plan.ravel(order="F"), memory[:6, 0], atol=1e-12)
 
@@ -115,7 +114,7 @@ def test_bounds_of_the_call_count():
         lower, upper = np.array([-1.0, -1.0]), np.array([1.0, 1.0])
         lower[k], upper[k] = 0.5, 0.4
         _, diagnostics, _ = called(both, first, np.zeros(both.size), (lower, upper))
-        assert int(diagnostics[4]) == Status.INFEASIBLE
+        assert int(diagnostics[4]) == fp.Status.INFEASIBLE
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e301])
@@ -127,14 +126,14 @@ def test_what_is_not_finite(bad):
         first = np.array([0.2, 0.1, -0.2])
         first[entry] = bad
         plan, diagnostics, after = called(both, first, memory)
-        assert int(diagnostics[4]) == Status.NON_FINITE
+        assert int(diagnostics[4]) == fp.Status.NON_FINITE
         assert np.isfinite(plan).all()
         np.testing.assert_array_equal(after, memory)
     for place in (0, both.data.size // 2, both.data.size - 1):
         data = both.data.copy()
         data.flat[place] = bad
         _, diagnostics, after = called(both, np.array([0.2, 0.1, -0.2]), memory, data=data)
-        assert int(diagnostics[4]) == Status.NON_FINITE
+        assert int(diagnostics[4]) == fp.Status.NON_FINITE
         np.testing.assert_array_equal(after, memory)
     plan, _, _ = called(both, np.full(3, bad), np.full(both.size, bad))
     np.testing.assert_array_equal(plan, np.zeros((2, 3)))
@@ -142,7 +141,7 @@ def test_what_is_not_finite(bad):
         broken = memory.copy()
         broken[place] = bad
         _, diagnostics, after = called(both, np.array([0.35, -0.1, 0.3]), broken)
-        assert int(diagnostics[4]) == Status.OK
+        assert int(diagnostics[4]) == fp.Status.OK
         assert np.isfinite(after).all()
 
 
@@ -155,7 +154,7 @@ def test_a_model_that_overflows():
     memory[6:9] = 1e200
     _, diagnostics, after = called(both, np.array([0.2, 0.1, -0.2]), memory)
     assert np.isfinite(after).all()
-    assert int(diagnostics[4]) != Status.NON_FINITE
+    assert int(diagnostics[4]) != fp.Status.NON_FINITE
 
 
 def test_a_plan_that_leaves_a_limit_is_never_called_ok():
@@ -171,7 +170,7 @@ def test_a_plan_that_leaves_a_limit_is_never_called_ok():
             broken = np.maximum(both.ocp.state_lower - state, state - both.ocp.state_upper).max()
             worst = max(worst, float(broken))
         assert diagnostics[2] == pytest.approx(max(worst, 0.0), abs=1e-9)
-        verdicts.add((int(diagnostics[4]) == Status.OK, worst <= 1e-6))
+        verdicts.add((int(diagnostics[4]) == fp.Status.OK, worst <= 1e-6))
     assert verdicts == {(True, True), (False, False)}
 
 

@@ -10,13 +10,12 @@ import sys
 
 import numpy as np
 import pytest
+from helpers.horizons import NEEDS_C
 from helpers.loops_in_c import pair, within_its_arrays
 
 import fpirhc as fp
-from fpirhc import Status
-from fpirhc.symbolic.native import find_compiler
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
+pytestmark = NEEDS_C
 WIDE = np.array([-9.0, -900.0]), np.array([9.0, 900.0])
 NARROW = np.array([-0.7, -110.0]), np.array([1.2, 40.0])
 
@@ -71,12 +70,12 @@ def test_what_is_not_finite(stepping, bad):
             arguments[place] = changed.reshape(base[place].shape)
             results = list(stepping.both(*arguments))
             if (place in (2, 3) and np.isnan(bad)) or (place == 3 and bad < 0):  # no box, and so no plan to compare
-                assert results[0][1][4, 0] == results[1][1][4, 0] != Status.OK
+                assert results[0][1][4, 0] == results[1][1][4, 0] != fp.Status.OK
                 continue
             same(results[0], results[1], 1e-6)
             assert np.isfinite(results[1][0]).all()
             if place in (0, 1):
-                assert int(results[1][1][4, 0]) == Status.NON_FINITE
+                assert int(results[1][1][4, 0]) == fp.Status.NON_FINITE
 
 
 def test_an_empty_box_is_told(stepping):
@@ -86,7 +85,7 @@ def test_an_empty_box_is_told(stepping):
         lower[k], upper[k] = 1.0, 0.5
         results = list(stepping.both(np.ones(3), stepping.data, lower, upper, np.zeros(stepping.size)))
         same(results[0], results[1])
-        assert int(results[1][1][4, 0]) == Status.INFEASIBLE
+        assert int(results[1][1][4, 0]) == fp.Status.INFEASIBLE
 
 
 def test_a_plan_that_overflows_is_forgotten(stepping):
@@ -128,7 +127,7 @@ def test_converging_loops_stop_where_the_graph_stops(bounds):
         # Not the feedback: rounding decides whether an input is just at its bound.
         same([results[0][2][-2:]], [results[1][2][-2:]], 1e-6)
         counts.add(results[1][1][3, 0])
-        assert results[1][1][4, 0] == Status.OK
+        assert results[1][1][4, 0] == fp.Status.OK
         memory = results[0][2]
     assert len(counts) > 1
 

@@ -10,19 +10,13 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
+from helpers.horizons import horizon_of
 from helpers.plants import chain, known
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fpirhc as fp
 from fpirhc.contracts import judge
-from fpirhc.controllers.contract import resolved
-from fpirhc.errors import InvalidValue, NotSupported
-from fpirhc.horizon.problem import rollout
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
-from fpirhc.symbolic.native import native
-from fpirhc.symbolic.program import generate
 
 SHIPPED: Any = tasks  # whose horizons and controllers are of known kinds
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
@@ -40,8 +34,8 @@ ids = [type(o).__name__ + ("" if "quadratic" not in dir(o) else o.quadratic.plug
 def two_mass(limits):
     """(ocp, data, first state) of the shipped problem's first horizon."""
     p = SHIPPED.two_mass.problem
-    ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, limits)
-    return ocp, stage_data(p.plant, p.reference, p.horizon, p.cost)(0.0, p.plant.approximate), p.start_state
+    ocp, data = horizon_of(p.plant, p.reference, p.horizon, p.cost, limits)
+    return ocp, data, p.start_state
 
 
 @pytest.mark.parametrize("limits", BOXES.values(), ids=BOXES)
@@ -58,19 +52,6 @@ def test_all_find_the_same_stationary_plan(optimiser, limits):
     assert stationarity <= 1e-3
     assert np.all(plan.inputs.min(axis=1) >= ocp.input_lower)
     assert np.all(plan.inputs.max(axis=1) <= ocp.input_upper)
-
-
-def test_state_limits_are_refused_by_the_reduced_gradient():
-    ocp, data, first = two_mass(fp.Limits(states={"q1": (2.0, 2.3)}))
-    with pytest.raises(NotSupported, match="Ipopt"):
-        fp.solve(ocp, GRADIENT, first, data)
-
-
-def test_settings_are_checked():
-    with pytest.raises(InvalidValue, match=r"ReducedGradient.iterations: expected a whole number from 1"):
-        fp.ReducedGradient(iterations=0, tolerance=1e-3)
-    with pytest.raises(InvalidValue, match=r"Ipopt.tolerance: expected a finite number above 0"):
-        fp.Ipopt(tolerance=0.0)
 
 
 def receding(optimiser, deformation=None, **settings):
@@ -127,38 +108,6 @@ def test_bounds_of_the_plan_are_shifted_by_the_correction():
     assert meant.max() > 9.9
 
 
-def test_scale_is_chosen_from_the_input_limits():
-    """S covers a jump of the command from limit to limit; without limits it must be given."""
-    controller = resolved(SHIPPED.two_mass.problem, fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5)))
-    jump = np.linalg.norm([600 / 1.5, 600 / 2.6])
-    assert controller.deformation.largest_step() == pytest.approx(jump, rel=0.01)
-    with pytest.raises(InvalidValue, match="input 'Q1' has no finite limits"):
-        resolved(
-            replace(SHIPPED.two_mass.problem, limits=fp.Limits()), fp.RecedingHorizon(GRADIENT, fp.Sigmoid(gain=-0.5))
-        )
-
-
-def test_chain_of_order_four_under_receding_horizon():
-    """Any relative order works: a chain of four integrators with a wrong mass."""
-    plant = chain(4)
-    wrong = replace(plant, parameters={"m": fp.Parameter(1.5, 1.0, "kg")})
-    problem = fp.Problem(
-        plant=wrong,
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}),
-        start={"y": 0.0, "y'": 1.0, "y'''": -1.0},
-        period=1e-2,
-        duration=6.0,
-        limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
-        horizon=fp.Horizon(stages=30, step=0.05),
-        cost=fp.Quadratic(states={"y": 1e3, "y'": 1e2, "y''": 10.0, "y'''": 1.0}, deviation={"u": 1e-2}),
-        measure_from=3.0,
-    )
-    plain, adaptive = (
-        fp.simulate(problem, fp.RecedingHorizon(FIXED, d), seed=0) for d in (fp.Identity(), fp.Sigmoid(gain=-0.8))
-    )
-    assert fp.measure(problem, adaptive).rms_error["y"] < 0.5 * fp.measure(problem, plain).rms_error["y"]
-
-
 def scaled(factor):
     """The shipped problem with every weight times `factor`."""
     cost: Any = SHIPPED.two_mass.problem.cost
@@ -177,44 +126,13 @@ def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterati
     """A cost in other units is the same problem: tiny weights must not make every plan look converged."""
     diagnostics = {}
     for name, problem in (("one", SHIPPED.two_mass.problem), ("scaled", scaled(factor))):
-        ocp = transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
-        data = stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(
-            0.0, problem.plant.approximate
-        )
+        ocp, data = horizon_of(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
         optimiser = fp.ReducedGradient(iterations=iterations, tolerance=1e-3)
         diagnostics[name] = fp.solve(ocp, optimiser, problem.start_state, data, calls=1)
     one, other = diagnostics.values()
     assert other.status == one.status == (fp.Status.NOT_CONVERGED if iterations == 1 else fp.Status.OK)
     np.testing.assert_allclose(other.inputs, one.inputs, atol=1e-4)
     assert other.cost == pytest.approx(factor * one.cost, rel=1e-8)
-
-
-BEST: dict[Any, fp.Plan] = {}  # of the problems with these costs
-COUPLED = {
-    "rate": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, effort={"Q1": 1e-3}, rate={"Q1": 1e-3, "Q2": 1e-2}),
-    "lqr": fp.Quadratic(states={"q1": 1e3, "q2": 1e3}, deviation={"Q1": 1e-3, "Q2": 1e-3}, terminal=fp.LQRTerminal()),
-    "general": fp.CustomCost(
-        terms=lambda v: {
-            "error": 1e3 * ca.sqrt((v.state.q1 - v.reference.q1) ** 2 + (v.state.q2 - v.reference.q2) ** 2 + 1e-2),
-            "input": 1e-3 * (v.input.Q1 - v.input.Q2) ** 2 + 1e-3 * v.input.Q1**2,
-        }
-    ),
-}
-
-
-@pytest.mark.parametrize("cost", COUPLED.values(), ids=COUPLED)
-@pytest.mark.parametrize("optimiser", BACKENDS, ids=ids[2:])
-def test_costs_that_couple_states_and_inputs(optimiser, cost):
-    """Hessians with entries off the diagonal, the stage state augmented by the last command: all backends agree."""
-    p = SHIPPED.two_mass.problem
-    ocp = transcribe(p.plant, p.reference, p.horizon, cost, BOXES["active"])
-    data = stage_data(p.plant, p.reference, p.horizon, cost)(0.0, p.plant.approximate)
-    first = np.concatenate([p.start_state, np.zeros(ocp.state.size - p.plant.state.size)])
-    plan = fp.solve(ocp, optimiser, first, data)
-    if cost not in BEST:  # the same for all backends
-        BEST[cost] = fp.solve(ocp, fp.ReducedGradient(iterations=1000, tolerance=1e-6), first, data)
-    assert plan.status == BEST[cost].status == fp.Status.OK
-    assert plan.cost == pytest.approx(BEST[cost].cost, rel=1e-6)
 
 
 def broken(ocp, data, first):
@@ -253,11 +171,10 @@ def test_broken_problems_are_statuses_and_leave_no_trace(optimiser, capfd):
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e200])
-@pytest.mark.parametrize("limits", [BOXES["free"], BOXES["active"]], ids=["free", "active"])
 @pytest.mark.parametrize("optimiser", EVERY, ids=ids)
-def test_poisoned_warm_start_is_forgotten(optimiser, limits, poison):
+def test_poisoned_warm_start_is_forgotten(optimiser, poison):
     """A memory of nonsense costs at most one failed call, and never a plan that is not finite."""
-    ocp, data, first = two_mass(limits)
+    ocp, data, first = two_mass(BOXES["active"])
     step, memory = optimiser.step(ocp), np.full(optimiser.memory(ocp).size, poison)
     for _ in range(3):
         inputs, diagnostics, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
@@ -291,17 +208,6 @@ def test_multipliers_of_state_limits_are_verified_without_the_solver(optimiser, 
         assert float(residual) > 1.0
 
 
-def test_multipliers_away_from_a_limit_do_not_count():
-    """A solver cannot buy stationarity with multipliers of limits that are not active."""
-    ocp, data, first = two_mass(RIDING["upper"])
-    inputs, bounds = np.zeros((2, ocp.stages)), (ocp.input_lower, ocp.input_upper)
-    invented = np.random.default_rng(0).normal(size=(4, ocp.stages))
-    states = rollout(ocp)(first, inputs, data)[0].full()[:, 1:]
-    inside = (states < ocp.state_upper[:, None] - 1e-3) & (states > ocp.state_lower[:, None] + 1e-3)
-    without = judge(ocp)(inputs, first, data, *bounds, np.zeros_like(invented))[1]
-    assert float(judge(ocp)(inputs, first, data, *bounds, invented * inside)[1]) == float(without)
-
-
 def test_a_first_state_outside_its_limits_is_infeasible():
     """Too far out to come back within one stage."""
     ocp, data, _ = two_mass(RIDING["upper"])
@@ -332,25 +238,6 @@ def _linear_quadratic():
     plant, reference = chain(2), fp.Trajectory(lambda t: {"y": 0 * t})
     horizon = fp.Horizon(stages=10, step=0.1)
     cost = fp.Quadratic(states={"y": 3.0, "y'": 0.5}, effort={"u": 0.2})
-    ocp = transcribe(plant, reference, horizon, cost, fp.Limits())
-    data = stage_data(plant, reference, horizon, cost)(0.0, plant.approximate)
+    ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits())
     pair = (fp.ReducedGradient(iterations=300, tolerance=1e-4), fp.SequentialQuadratic(tolerance=1e-4))
     return data, *((o.step(ocp), o.memory(ocp).start()) for o in pair)
-
-
-def test_compiled_and_interpreted_steps_are_the_same():
-    """The generated C has one copy of the stage however many stages and iterations there are."""
-    sizes = {}
-    for stages, iterations in ((20, 10), (20, 40), (80, 10)):
-        p = replace(SHIPPED.two_mass.problem, horizon=fp.Horizon(stages=stages, step=1e-2))
-        ocp = transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
-        step = fp.ReducedGradient(iterations=iterations, tolerance=1e-3).step(ocp)
-        sizes[stages, iterations] = len(generate(step)[0])
-    assert sizes[20, 40] < 1.1 * sizes[20, 10]
-    assert sizes[80, 10] < 2 * sizes[20, 10]
-    p = SHIPPED.two_mass.problem
-    ocp, data, first = two_mass(BOXES["active"])
-    step, memory = GRADIENT.step(ocp), GRADIENT.memory(ocp).start()
-    arguments = (first, data, ocp.input_lower, ocp.input_upper, memory)
-    for one, other in zip(step(*arguments), native(step).function(*arguments), strict=True):
-        np.testing.assert_allclose(one.full(), other.full(), rtol=1e-12, atol=1e-12)

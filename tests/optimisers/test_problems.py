@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.kinds import slow_but
-from test_certificate import PROBLEMS, first_horizon
+from helpers.horizons import horizon_of
+from helpers.plants import pendulum
 
 import fpirhc as fp
-from fpirhc.controllers.contract import with_optimiser
+from fpirhc.conformance import posed
 from fpirhc.errors import InvalidShape, InvalidValue
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
+
+PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_masses")
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("share", [1.0, 0.3])
 def test_same_optimum_as_ipopt(name, share):
     """Cost to 1e-6 and inputs to 1e-5 of their range, with the problem's limits and with tighter ones."""
-    ocp, data, first = first_horizon(name)
+    ocp, first, data = posed(fp.load_problem(name).problem)
     middle, half = (ocp.input_upper + ocp.input_lower) / 2, (ocp.input_upper - ocp.input_lower) / 2
     ocp = replace(ocp, input_lower=middle - share * half, input_upper=middle + share * half)
     scale = float(half.max())
@@ -47,54 +47,17 @@ def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
     for controller in ("RHC", "RHC+FPI"):
         once: Any = task.controllers[controller]
         costs = []
-        for selection in (once, with_optimiser(once, replace(once.planner.optimiser, iterations=12))):
+        for selection in (once, replace(once, optimiser=replace(once.optimiser, iterations=12))):
             run = fp.simulate(problem, selection, seed=0)
             assert run.stop is None
             costs.append(run["cost"].sum())
         assert costs[0] <= 1.01 * costs[1]
 
 
-@pytest.mark.parametrize("name", slow_but(PROBLEMS, "two_mass", "cart_pole"))
-def test_iterations_in_closed_loop(name):
-    """Converged to 1e-6 of the input's range, the median plan needs at most six iterations; limits become active."""
-    problem = fp.load_problem(name).problem
-    assert problem.horizon is not None
-    assert problem.cost is not None
-    plant, step = problem.plant, problem.horizon.step
-    ocp = transcribe(plant, problem.reference, problem.horizon, problem.cost, problem.limits)
-    data_of = stage_data(plant, problem.reference, problem.horizon, problem.cost)
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6 * float((ocp.input_upper - ocp.input_lower).max()) / 2)
-    layout, solve = optimiser.memory(ocp), optimiser.converging(ocp)
-    advance = fp.RungeKutta4(4).step(plant, step)
-    state, before, memory, iterations, active = problem.start_state, np.zeros(ocp.input.size), layout.start(), [], 0
-    shift = shifted(optimiser, ocp)
-    for k in range(60):
-        first = ocp.start(state, before)
-        inputs, diagnostics, memory = solve(
-            first, data_of(k * step, plant.approximate), ocp.input_lower, ocp.input_upper, memory
-        )
-        assert int(diagnostics[4]) in (fp.Status.OK, fp.Status.NOT_CONVERGED)
-        iterations.append(float(diagnostics[3]))
-        before, memory = inputs.full()[:, 0], shift(memory)
-        active += bool(np.any(np.isclose(before, ocp.input_upper) | np.isclose(before, ocp.input_lower)))
-        state = advance(state, before, plant.exact, np.zeros(len(plant.names))).full().ravel()
-    assert np.median(iterations) <= 6
-    assert active > 0 or name == "two_mass", "two_mass has generous limits; the others are driven into theirs"
-
-
-def shifted(optimiser, ocp):
-    import casadi as ca
-
-    memory = ca.MX.sym("m", optimiser.memory(ocp).size)
-    return ca.Function("fpirhc_shifted", [memory], [optimiser.shifted(ocp, memory)])
-
-
 def test_indefinite_costs_are_refused_with_what_to_use_instead():
     """A cost that bends downwards has no quadratic model with a minimum."""
-    from helpers.plants import pendulum
-
     cost = fp.CustomCost(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
-    ocp = transcribe(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost, fp.Limits())
+    ocp, _ = horizon_of(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost)
     with pytest.raises(fp.FpirhcError, match=r"bends upwards.*Use ReducedGradient"):
         fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.zeros(2), np.zeros((ocp.data.size, 6)))
 
@@ -105,25 +68,13 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
     valves = dict(task.problem.plant.parameters)
     valves["s2"] = replace(valves["s2"], approximate=4.4e-5)
     problem = replace(task.problem, plant=replace(task.problem.plant, parameters=valves), duration=60.0)
-    assert problem.horizon is not None
-    assert problem.cost is not None
-    ocp = transcribe(
-        problem.plant, problem.reference, problem.horizon, problem.cost, problem.limits, start=problem.start_state
-    )
-    data = np.asarray(
-        stage_data(problem.plant, problem.reference, problem.horizon, problem.cost)(
-            0.0, problem.plant.approximate
-        ).full()
-    )
-    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
+    ocp, first, data = posed(problem)
     optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6)
     empty = fp.solve(ocp, optimiser, first, data, start=np.zeros((1, ocp.stages)))
     assert empty.status == fp.Status.OK
     assert not empty.inputs.any()
     found = fp.solve(ocp, optimiser, first, data)
     assert found.cost == pytest.approx(fp.solve(ocp, fp.Ipopt(tolerance=1e-6), first, data).cost, rel=1e-6)
-    assert empty.cost is not None
-    assert found.cost is not None
     assert found.cost < 1e-3 * empty.cost
     run = fp.simulate(problem, task.controllers["RHC"], seed=0, compiled=False)
     assert run["command"].min() > 40.0
@@ -140,7 +91,7 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
     ],
 )
 def test_what_is_solved_has_its_shape(change, error, text):
-    ocp, data, first = first_horizon("two_mass")
+    ocp, first, data = posed(fp.load_problem("two_mass").problem)
     optimiser = fp.FixedPoint(iterations=1, tolerance=1e-8)
     every = {"state": first, "data": data, **change}
     with pytest.raises(error, match=re.escape(text)):

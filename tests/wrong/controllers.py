@@ -7,11 +7,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 import fpirhc as fp
-from fpirhc import Identity
-from fpirhc.contracts import Block, Controller, Deformation, Layout, closing_blocks, like, reference_block
-from fpirhc.controllers.contract import PlantModel
+from fpirhc.contracts import Block, Controller, Deformation, Layout, PlantModel, closing_blocks, like, reference_block
 from fpirhc.errors import NotSupported
-from fpirhc.plant.motion import with_exact_parameters
 
 
 @dataclass(frozen=True)
@@ -19,7 +16,7 @@ class Gentle(Controller):
     """q''Des = q''N + rate^2 e + 2 rate e', saturated; a controller that keeps every law."""
 
     rate: float
-    deformation: Deformation = field(default_factory=Identity)
+    deformation: Deformation = field(default_factory=fp.Identity)
     limit: float = 40.0
 
     def blocks(self, problem):
@@ -102,7 +99,7 @@ class TellsAnotherModel(Gentle):
     """Names a plant as its model that is neither the problem's nor the real one."""
 
     def plant_model(self, problem):
-        return PlantModel(with_exact_parameters(problem.plant, problem.plant.exact * 1.1), problem.signals)
+        return PlantModel(problem.with_exact(problem.plant.exact * 1.1).plant, problem.signals)
 
 
 class IsGivenTheExactParameters(Gentle):

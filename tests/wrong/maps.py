@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.contracts import Deformation
-from fpirhc.deformation.base import Iteration
+from fpirhc.contracts import Deformation, Iteration
 
 
 @dataclass(frozen=True)

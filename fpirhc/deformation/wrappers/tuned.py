@@ -14,8 +14,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.checked import checked_call
-from fpirhc.fields.kinds import Count, Range
+from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import asin, larger, power, sqrt
 
@@ -111,24 +110,11 @@ def examples(inner: Deformation) -> tuple[Deformation, ...]:
     return (Tuned(inner, largest_gain=1.2 * inner.effective_gain()),)
 
 
-@checked_call
-def expected_sign(product: Annotated[float, Range("a product from 0 to 2", 0.0, 2.0)], components: Count) -> float:
-    """Return the mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2.
+def _mean_sign(product: float, components: int) -> float:
+    """The mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2; the product may be live.
 
     I is the regularised incomplete beta function; the proof stands in docs/theory.md.
-
-    Args:
-        product: g = a lambda, effective gain times eigenvalue, 0 to 2.
-        components: m of the response.
-
-    Raises:
-        InvalidValue: a product outside [0, 2], fewer than one component.
     """
-    return _mean_sign(product, components)
-
-
-def _mean_sign(product: float, components: int) -> float:
-    """The formula of `expected_sign`; the product may be live."""
     correlation = -0.5 * product
     # Integration by parts: the mean for m + 2 components is the mean for m plus one term.
     size = 1 if components % 2 else 2

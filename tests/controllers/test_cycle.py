@@ -1,0 +1,169 @@
+"""One cycle of a controller by value: loops written out in numpy, commands at their limits, and automatic settings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers.iteration import affine
+from helpers.plants import simulated
+
+import fpirhc as fp
+from fpirhc.errors import InvalidValue
+
+PERIOD, RATE = 0.05, 2.0
+EXACT, BELIEVED, LOAD = np.array([2.0, 4.0]), np.array([1.0, 8.0]), np.array([0.0, 3.0])
+LIMITS = {"u": (-4.0, 5.0), "w": (-1.0, np.inf)}
+
+
+def masses(**settings: Any) -> fp.Problem:
+    """Two masses, 2 and 4 kg, taken for 1 and 8; b'' also feels a force of 3 N. Along sin 2t and cos t."""
+    plant = fp.Plant(
+        coordinates={"a": "m", "b": "rad"},
+        inputs={"u": "N", "w": "N"},
+        parameters={"m": fp.Parameter(1.0, 2.0, "kg"), "n": fp.Parameter(8.0, 4.0, "kg")},
+        response=lambda q, v, u, p: {"a": u.u / p.m, "b": (u.w - 3.0) / p.n},
+    )
+    usual: dict[str, Any] = {"start": {"a": 0.5, "b": 1.0}, "period": PERIOD, "duration": 8.0}
+    reference = fp.Trajectory(lambda t: {"a": ca.sin(2 * t), "b": ca.cos(t)})
+    return fp.Problem(plant, reference, **(usual | settings))
+
+
+def by_hand(gain: float, referenced: bool, cycles: int) -> dict[str, np.ndarray]:
+    """Computed torque without an integral, with the affine iteration on requests or on differences from the model's response."""
+    low, high = (np.array([ends[k] for ends in LIMITS.values()]) for k in (0, 1))
+    q, v, request, delta, before = np.array([0.5, 1.0]), np.zeros(2), None, np.zeros(2), None
+    log: dict[str, list[np.ndarray]] = {
+        n: [] for n in ("state", "desired", "realised", "deformed", "command", "clipped")
+    }
+    for k in range(cycles):
+        t = k * PERIOD
+        at, rate, bend = (
+            np.array(x)
+            for x in ([np.sin(2 * t), np.cos(t)], [2 * np.cos(2 * t), -np.sin(t)], [-4 * np.sin(2 * t), -np.cos(t)])
+        )
+        desired = bend + 2 * RATE * (rate - v) + RATE**2 * (at - q)
+        realised = (np.zeros(2) if before is None else before - LOAD) / EXACT
+        if referenced:
+            modelled = (np.zeros(2) if before is None else before - LOAD) / BELIEVED
+            delta = delta if before is None else delta - gain * (realised - (modelled - delta))
+            wanted = desired + delta
+        else:
+            wanted = desired if request is None else request - gain * (realised - desired)
+        unclipped = BELIEVED * wanted + LOAD
+        command = np.clip(unclipped, low, high)
+        request = wanted + (command - unclipped) / BELIEVED  # what the clipped command means is stored
+        values = np.concatenate([q, v]), desired, realised, request, command, [float(np.any(command != unclipped))]
+        for name, value in zip(log, values, strict=True):
+            log[name].append(np.asarray(value))
+        response = (command - LOAD) / EXACT
+        q, v, before = q + PERIOD * v + PERIOD**2 / 2 * response, v + PERIOD * response, command
+    return {name: np.array(rows) for name, rows in log.items()}
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("referenced", [False, True])
+def test_a_run_is_the_loop_by_hand(gain, referenced):
+    """Also where commands are clipped, on one side or on both."""
+    problem, map = masses(limits=fp.Limits(inputs=LIMITS)), affine(gain) if gain else fp.Identity()
+    form = fp.ModelReferenced(map) if referenced and gain else map
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE, integral=False), form))
+    expected = by_hand(gain or 0.0, referenced, run.cycles) if gain else {**by_hand(0.0, True, run.cycles)}
+    for name in ("state", "desired", "command", "clipped"):
+        np.testing.assert_allclose(run[name], expected[name], atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(run["realised"][1:], expected["realised"][1:], atol=1e-9)
+    if gain and not referenced:
+        np.testing.assert_allclose(run["deformed"], expected["deformed"], atol=1e-9)
+    assert 5 < run["clipped"].sum() < run.cycles - 5
+
+
+def test_a_clipped_command_of_a_curved_response_means_what_the_response_is_there():
+    """u^3 / m: the stored request is that of the command that was sent, and of one that was not clipped the wanted one."""
+    plant = fp.Plant(
+        coordinates={"a": "m"},
+        inputs={"u": "N"},
+        parameters={"m": fp.Parameter(1.0, 1.5, "kg")},
+        response=lambda q, v, u, p: {"a": u.u**3 / p.m},
+        inverse=lambda q, v, r, p: {"u": ca.sign(r.a) * ca.fabs(p.m * r.a) ** (1 / 3)},
+    )
+    wave = fp.Trajectory(lambda t: {"a": 3 * ca.sin(2 * t)})
+    limits = fp.Limits(inputs={"u": (-2.0, 2.0)})
+    problem = fp.Problem(plant, wave, {"a": 0.0, "a'": 6.0}, period=PERIOD, duration=6.0, limits=limits)
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Affine(-0.4)))
+    assert 5 < run["clipped"].sum() < run.cycles - 5
+    np.testing.assert_allclose(run["deformed"], run["command"] ** 3, rtol=1e-9, atol=1e-9)
+
+
+def test_a_command_that_is_no_number_is_held():
+    """A heater by the square of its current, of which too little is asked for a while: the last command, and the status says so."""
+    plant = fp.Plant(
+        coordinates={"y": "K"},
+        inputs={"i": "A"},
+        order=1,
+        parameters={"c": fp.Parameter(1.0, 1.2, "1")},
+        response=lambda q, u, p: {"y": p.c * u.i**2 - q.y},
+        inverse=lambda q, r, p: {"i": ca.sqrt((r.y + q.y) / p.c)},
+    )
+    falling = fp.Trajectory(lambda t: {"y": 1.5 + ca.sin(4 * t)})
+    problem = fp.Problem(plant, falling, {"y": 1.5}, period=PERIOD, duration=4.0)
+    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=1.0)))
+    impossible = run["deformed.y"] + run["state.y"] < 0
+    held = run["status"][:, 0] == fp.Status.NON_FINITE
+    assert 5 < held.sum() < run.cycles - 5
+    assert not (impossible & ~held).any()
+    assert np.isfinite(run["command"]).all()
+    later = np.flatnonzero(held[1:]) + 1
+    np.testing.assert_array_equal(run["command"][later], run["command"][later - 1])
+
+
+def test_a_map_with_a_memory_remembers_nothing_of_an_absurd_response():
+    """Beyond 10 000 times what the limits allow the request stays, and the filter forgets nothing; a large one is learned from."""
+    problem = masses(limits=fp.Limits(inputs={"u": (-5.0, 5.0), "w": (-5.0, 11.0)}))
+    controller = fp.ComputedTorque(fp.Exponential(rate=RATE), fp.Filtered(fp.Affine(-0.5), pole=0.5))
+    stepper, memory = fp.Stepper(problem, controller, compiled=False), None
+    memory = stepper.start()
+    for k in range(4):
+        _, memory = stepper.step(k * PERIOD, problem.start_state, np.array([0.1, -0.2]), memory)
+    following = {}
+    for size in (1e2, 1e9):
+        _, after = stepper.step(4 * PERIOD, problem.start_state, np.array([size, 0.0]), memory)
+        following[size] = stepper.memory.unpack(after)
+    kept = stepper.memory.unpack(memory)
+    filters = [name for name in kept if "filter" in name]
+    assert filters
+    for name in filters:
+        np.testing.assert_array_equal(following[1e9][name], kept[name])
+        assert not np.array_equal(following[1e2][name], kept[name])
+
+
+# Automatic settings
+
+
+PLANNED = {
+    "limits": fp.Limits(inputs={"u": (-2.0, 3.0), "w": (-8.0, 8.0)}),
+    "horizon": fp.Horizon(stages=8, step=PERIOD),
+    "cost": fp.Quadratic(states={"a": 9.0, "b": 9.0}, effort={"u": 0.1, "w": 0.1}),
+    "duration": 0.5,
+}
+PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=4, tolerance=1e-6), fp.Sigmoid(gain=-0.5))
+
+
+@pytest.mark.parametrize(
+    ("wrap", "masses_known"), [(lambda c: c, (1, 8)), (fp.ExactModel, (2, 4))], ids=["alone", "inside"]
+)
+def test_the_scale_of_a_plan_covers_a_jump_between_the_limits(wrap, masses_known):
+    """5 N on 1 kg and 16 N on 8 kg: (5, 2). In a wrapper it is chosen on the problem that the inner controller sees."""
+    problem, jump = masses(**PLANNED), np.hypot(5.0 / masses_known[0], 16.0 / masses_known[1])
+    scale = jump / fp.Sigmoid(gain=-0.5, scale=1.0).largest_step()
+    maps = [fp.Sigmoid(gain=-0.5, **s) for s in ({}, {"scale": scale}, {"scale": 1.2 * scale})]
+    chosen, own, other = (simulated(problem, wrap(replace(PLAN, deformation=m)))["command"] for m in maps)
+    assert np.abs(chosen - own).max() < 0.1 * np.abs(other - own).max()
+
+
+def test_a_plan_without_limits_needs_a_scale():
+    free = masses(**{**PLANNED, "limits": fp.Limits(inputs={"u": (-2.0, 3.0)})})
+    with pytest.raises(InvalidValue, match="input 'w' has no finite limits"):
+        simulated(free, PLAN)
