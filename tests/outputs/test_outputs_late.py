@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.of_outputs import OPTIMISER, hill, planned, sedated
+from helpers.of_outputs import OPTIMISER, curve, hill, planned, sedated
 from helpers.plants import simulated
 
 import fpirhc as fp
@@ -65,6 +65,21 @@ def test_outputs_ahead_of_a_right_model_are_those_that_come() -> None:
     cycles = round(LATE / problem.period)
     assert np.allclose(run["output_ahead"][:-cycles], run["output"][cycles:], atol=1e-6)
     assert np.abs(run["output_ahead"] - run["output"]).max() > 0.5
+
+
+def test_the_distance_of_a_wrong_model_moves_as_a_polynomial() -> None:
+    """Ahead is what the model has at the state ahead, and d + d' tau; d and d' are what is measured less the model's."""
+    run = simulated(late(sedated(hill(5.5))), fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE))
+
+    def model(state: np.ndarray) -> np.ndarray:
+        level, size = state[:, 1], 1e-6
+        slope = (curve(level + size, 5.5) - curve(level - size, 5.5)) / (2 * size)
+        return np.column_stack([curve(level, 5.5), slope * 0.5 * (state[:, 0] - level)])
+
+    distance = run["output"] - model(run["state"])
+    moved = np.column_stack([distance[:, 0] + LATE * distance[:, 1], distance[:, 1]])
+    np.testing.assert_allclose(run["output_ahead"], model(run["state_ahead"]) + moved, atol=1e-6)
+    assert np.abs(LATE * distance[:, 1]).max() > 0.1
 
 
 def test_a_prediction_helps_behind_dead_time_and_leaves_no_error_at_rest() -> None:
