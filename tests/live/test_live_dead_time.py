@@ -135,34 +135,3 @@ def test_a_belief_that_is_set_is_the_one_that_is_built(name, compiled):
         rebuilt = fp.simulator(changed, own, compiled=compiled).run(seed=0)
         assert same_signals(ready.run(seed=0, settings=numbers), rebuilt), numbers
         assert np.ptp(rebuilt["command"]) > 0
-
-
-THROUGH = fp.Cascade(fp.ComputedTorque(LAW), fp.Affine(gain=-0.3), fp.ThroughModel(lag=0.05))
-OWNERS: dict[str, tuple[str, str | Controller, dict[str, tuple[float, float]]]] = {
-    "regressor": ("planar_arm", "AID+FPI", {"inputs.tau1": (2.0, 3.4), "measurement": (1.0, 1.7)}),
-    "error of another instant": ("planar_arm", "Slotine-Li", {"inputs.tau2": (2.0, 0.0), "measurement": (3.0, 5.5)}),
-    "estimator": ("leaking_tanks", "RHC offset-free", {"inputs.u": (2.0, 3.0)}),
-    "target": ("heat_exchanger", "Cascade", {"inputs.valve": (4.0, 6.5)}),
-    "the slowest input": ("planar_arm", THROUGH, {"inputs.tau1": (2.0, 1.0), "inputs.tau2": (1.5, 2.5)}),
-}
-
-
-@pytest.mark.parametrize("name", OWNERS)
-def test_what_learns_or_shifts_a_target_follows_a_dead_time_that_is_set(name):
-    """A response belongs to the command and the target that caused it, also where a run says how long they take."""
-    problem_name, own, cycles = OWNERS[name]
-    task = getattr(tasks, problem_name)
-    controller = task.controllers[own] if isinstance(own, str) else own
-    problem = replace(task.problem, duration=30 * task.problem.period, measure_from=0.0)
-
-    def late(which: int) -> fp.Problem:
-        times = {path: both[which] * problem.period for path, both in cycles.items()}
-        inputs = {path.removeprefix("inputs."): value for path, value in times.items() if path != "measurement"}
-        return replace(problem, dead_time=fp.DeadTime(inputs, times.get("measurement", 0.0)))
-
-    paths = {f"dead_time.{path}": both[1] * problem.period for path, both in cycles.items()}
-    ready = fp.simulator(late(0), controller, compiled=False, live=list(paths))
-    first, run = ready.run(seed=0), ready.run(seed=0, settings=paths)
-    assert same_signals(first, fp.simulator(late(0), controller, compiled=False).run(seed=0))
-    assert same_signals(run, fp.simulator(late(1), controller, compiled=False).run(seed=0))
-    assert not np.array_equal(first["command"], run["command"])

@@ -46,16 +46,6 @@ def test_with_the_last_target_only_a_small_gain_serves():
         assert step > 0.2
 
 
-@pytest.mark.parametrize(("lag", "dead_time"), [(10.0, 5.0), (40.0, 5.0), (20.0, 3.0), (20.0, 8.0)])
-def test_a_wrong_lag_or_dead_time_changes_little(lag, dead_time):
-    """Half or twice the lag, 3 or 8 s of dead time in place of 5."""
-    error, step = rms(
-        tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=lag, dead_time=dead_time))
-    )
-    assert error < 0.2 * rms(tasks.heat_exchanger.problem, STATIC)[0]
-    assert step < 0.01
-
-
 def test_the_shift_is_that_of_the_recursion_by_hand():
     """Logged outputs through the formulas in numpy: reference and shift in force, undeformed target, map."""
     run = fp.simulate(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.4), SETTLING), seed=1, compiled=False)
@@ -113,21 +103,6 @@ def test_the_plain_form_bears_every_slope_below_two_over_the_gain(gain):
         run = fp.simulate(problem, plain, seed=1, compiled=False)
         early, late = (np.abs(run["error.y"][k : k + 100]).max(initial=0.0) for k in (100, 800))
         assert bool(run.stop is None and late < early) is settles, (share, early, late)
-
-
-def test_the_plain_form_begins_at_what_is_in_force():
-    """From a start at rest away from the reference, the first target is the output itself and not the reference."""
-    plain = fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=5.0, plain=True))
-    run = fp.simulate(linear(1.0), plain, seed=1, compiled=False)
-    assert run["target.y"][0] == pytest.approx(0.0, abs=1e-12)
-    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_a_right_model_leaves_the_target_alone():
-    """The model's target in force is the output, so there is nothing to iterate on."""
-    run = fp.simulate(linear(1.0), fp.Cascade(STATIC, affine(0.8), LAGGED), seed=1, compiled=False)
-    assert np.abs(run["shift"]).max() < 1e-6  # of the integrator
-    assert run["state.y"][-1] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_the_output_settles_at_the_reference_whatever_the_map_is():

@@ -76,31 +76,6 @@ def test_coordinates_as_outputs_change_no_signal(name: str) -> None:
     assert np.ptp(run["command"], axis=0).max() > 0
 
 
-def tanks() -> fp.Problem:
-    """The leaking tanks by their states, with the levels as outputs."""
-    plant, cost = tasks.leaking_tanks.problem.plant, tasks.leaking_tanks.problem.cost
-    assert isinstance(cost, fp.Quadratic)
-    states = fp.Plant.of_states(
-        states=plant.coordinates,
-        inputs=plant.inputs,
-        parameters=plant.parameters,
-        rates=plant.response,
-        outputs={name: fp.Output("m", lambda x, p, name=name: x[name]) for name in plant.names},
-        controlled=("h1",),
-    )
-    return replace(tasks.leaking_tanks.problem, plant=states, cost=replace(cost, states={}, outputs=cost.states))
-
-
-def test_tanks_with_their_levels_as_outputs_are_the_tanks() -> None:
-    """Every controller, in noise. Only h1 is controlled; the distance of h2 is held, and is zero."""
-    one, other = (replace(p, duration=40.0, measure_from=0.0) for p in (tasks.leaking_tanks.problem, tanks()))
-    for name, controller in tasks.leaking_tanks.controllers.items():
-        plain, run = (simulated(p, controller) for p in (one, other))
-        for signal in ("state", "command", "realised", "command_shift"):
-            np.testing.assert_allclose(run[signal], plain[signal], rtol=1e-9, atol=1e-9, err_msg=name)
-        assert np.ptp(run["command"]) > 10
-
-
 # Plants whose outputs are linear in the state, and the same plants with their outputs as coordinates.
 
 UNIT = "1"

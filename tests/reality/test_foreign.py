@@ -105,15 +105,6 @@ def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
         assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
 
 
-def test_the_lateness_of_a_run_is_that_of_the_body_and_what_is_simulated_before_it():
-    """One cycle of the loop before two of the body, and three of the loop before a body without."""
-    late = task(reality=fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002}))
-    late = replace(late, dead_time=replace(late.dead_time, inputs={"u": 0.003}))
-    alone = outside(task(dead_time=fp.DeadTime(inputs={"u": 0.003})))
-    one, other = (run(p, CONTROLLERS["computed torque"]) for p in (late, alone))
-    assert np.abs(one["plant_state"] - other["plant_state"]).max() < 1e-12
-
-
 def test_positions_alone_are_enough_for_an_estimator():
     """A body that measures y only runs with an estimator; errors are then those of the estimate."""
     problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))

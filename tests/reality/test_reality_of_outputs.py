@@ -127,53 +127,6 @@ def test_it_moves_as_scipy_says():
     np.testing.assert_allclose(result["output.bis"], 93 / (1 + (np.array(states)[:, 3] / 4.1) ** 1.36), rtol=2e-6)
 
 
-def arm() -> fp.Plant:
-    """A rigid arm whose output is the angle of its joint."""
-    return fp.Plant(
-        {"q": "rad"},
-        {"u": "N m"},
-        {"J": fp.Parameter(1.3, 1.0, "kg m^2")},
-        lambda q, v, u, p: {"q": (u.u - 5 * ca.sin(q.q)) / p.J},
-        outputs={"angle": fp.Output("rad", lambda q, v, p: q.q)},
-    )
-
-
-def flexible() -> fp.Plant:
-    """A motor and a link behind a damped spring; the angle is the link's, which is a coordinate of its own."""
-
-    def response(q: Any, v: Any, u: Any, p: Any) -> dict[str, Any]:
-        force = p.k * (q.motor - q.angle) + 40 * (v.motor - v.angle)
-        return {"angle": (force - 5 * ca.sin(q.angle)) / 0.8, "motor": (u.u - force) / 0.2}
-
-    return fp.Plant(
-        {"angle": "rad", "motor": "rad"}, {"u": "N m"}, {"k": fp.Parameter(4000.0, 4000.0, "N m/rad")}, response
-    )
-
-
-JOINT = fp.KalmanFilter(measured={"angle": 1e-4}, noise={"q": 10.0})
-
-
-@pytest.mark.parametrize("estimator", [fp.Measured(), fp.PositionDifference()], ids=["measured", "estimated"])
-def test_a_flexible_joint_behind_a_rigid_model(estimator):
-    """The output is a coordinate of the reality; its motor is nobody's. The increment form leaves half of the error at most."""
-    still = {"angle": 0.0, "angle'": 1.0, "motor": 0.0, "motor'": 1.0}
-    problem = fp.Problem(
-        plant=arm(),
-        reference=fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}),
-        start={"q": 0.0, "q'": 1.0},
-        period=1e-3,
-        duration=2.0,
-        measure_from=1.0,
-        reality=fp.Reality(flexible(), start=still, integrator=fp.RungeKutta4(substeps=4)),
-        sensing=fp.Sensing(estimator=estimator, observer=JOINT),
-        limits=fp.Limits(inputs={"u": (-40.0, 40.0)}),
-    )
-    law, map_ = fp.Exponential(rate=6.0), fp.Increment(fp.Sigmoid(gain=-0.3, scale=60.0), cycles=0)
-    runs = [run(problem, fp.ComputedTorque(law, d)) for d in (fp.Identity(), map_)]
-    errors = [fp.measure(problem, one).rms_error["angle"] for one in runs]
-    assert errors[1] < 0.5 * errors[0]
-
-
 # A body outside
 
 

@@ -147,18 +147,6 @@ def test_its_covariance_is_that_of_its_errors():
     assert np.mean(squares) == pytest.approx(2.0, abs=4 * 2 / np.sqrt(60))
 
 
-def test_an_accelerometer_may_correct_it():
-    """A measured response has the model's Jacobian; the observer of the speed is then better than from the angle alone."""
-    sensors = {"angle": fp.Sensor(noise=fp.Noise(2e-3)), "angle''": fp.Sensor(noise=fp.Noise(0.05))}
-    with_it = replace(ANGLE, measured={"angle": 2e-3, "angle''": 0.05}, noise={"angle": 0.05})
-    errors = []
-    for filter in (with_it, replace(ANGLE, noise={"angle": 0.05})):
-        sensing = fp.Sensing(sensors, fp.Measured(), measured=["angle", "angle''"], observer=filter)
-        result = run(swing(filter, believed=1.0, sensing=sensing), TRACK)
-        errors.append(np.sqrt(np.mean((result["state"] - result["plant_state"])[50:, 1] ** 2)))
-    assert errors[0] < errors[1]
-
-
 def test_adaptation_works_on_believed_states():
     """The patient is another one than the model's: with FPI the plasma errs a tenth, though three compartments are believed."""
     errors = {}

@@ -206,13 +206,6 @@ def test_a_run_that_ended_at_once_has_no_numbers():
     assert metrics.broken == fp.measure(problem(), run(1.0)).broken == {}
 
 
-def test_one_cycle_is_enough_for_a_solve():
-    solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
-    metrics = fp.measure(problem(measure_from=0.0), cut(run(0.0, solve=solve), 1))
-    assert metrics.solve["plans"] == 1
-    assert metrics.solve["worst_iterations"] == 1
-
-
 def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
     """Two held cycles of that status, and the one in which the run ended; a status that never occurred counts zero."""
     status = np.where(np.arange(CYCLES) < 2, float(fp.Status.NON_FINITE), 0.0)
@@ -226,13 +219,6 @@ def test_plans_that_return_are_counted_once():
     assert of_solves(np.arange(CYCLES) // 10 % 2).solve["plans"] == 2
     assert of_solves(np.zeros(CYCLES)).solve["plans"] == 1
     assert of_solves(np.arange(CYCLES)).solve["plans"] == CYCLES
-
-
-def test_plans_that_differ_by_one_everywhere_are_two():
-    """Cost, residuals, iterations and status of one are each larger by one than those of the other, whichever is first."""
-    for first in (0, 1):
-        solve = np.repeat((first + np.arange(CYCLES))[:, None] % 2, 5, axis=1)
-        assert fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve))).solve["plans"] == 2
 
 
 def test_a_plan_that_is_not_finite_has_iterations_and_no_residual():

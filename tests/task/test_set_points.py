@@ -104,21 +104,6 @@ def test_steps_within_a_run_equal_the_trajectory(controller):
         np.testing.assert_allclose(ours[signal], theirs[signal], rtol=0, atol=1e-11 if signal == "desired" else 1e-12)
 
 
-@pytest.mark.parametrize("controller", ["RHC", "RHC+FPI"])
-def test_stages_of_several_lengths_see_the_motion_of_the_filter(controller):
-    """The filter's free motion at uneven nodes is its closed form, so plans are those of the trajectory."""
-    starts, steps = {"q1": 2.2, "q2": 5.4}, {"q1": [(0.0, 2.5)], "q2": [(0.0, 5.0)]}
-    known = closed_form(10.0, 2, starts, {"q1": [(0.0, 2.2), (0.0, 2.5)], "q2": [(0.0, 5.4), (0.0, 5.0)]})
-    runs = []
-    for problem in (two_mass(values=steps, start=starts), on(tasks.two_mass.problem, known)):
-        lengths = tuple(1.0 + 0.5 * (k // 3) for k in range(problem.horizon.stages))
-        task = replace(problem, horizon=replace(problem.horizon, lengths=lengths), duration=0.1)
-        runs.append(fp.simulate(task, tasks.two_mass.controllers[controller], seed=0, compiled=False))
-    ours, theirs = runs
-    assert np.abs(ours["reference"] - ours["reference"][0]).max() > 0.05
-    np.testing.assert_allclose(ours["planned"], theirs["planned"], rtol=0, atol=1e-8)
-
-
 def test_a_horizon_knows_announced_set_points_and_no_others():
     """Announced steps at nodes of the horizon equal the trajectory; unannounced ones move nothing before their time."""
     controller, starts = tasks.two_mass.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}
@@ -291,20 +276,6 @@ def test_predicted_says_that_set_points_are_late():
     late = round(0.06 / problem.period)
     lag = run[f"plant_state.{name}"][late:] - run[f"reference.{name}"][:-late]
     assert np.abs(lag).max() < 0.2 * np.abs(run[f"true_error.{name}"]).max()
-
-
-def test_unannounced_steps_of_two_mass():
-    """The adapted horizon follows steps at 1 s and 2 s far better than the plain one, and with smaller jumps of the command."""
-    steps = {"q1": [(0.0, 2.2), (1.0, 2.4), (2.0, 2.2)], "q2": [(0.0, 5.4), (1.0, 5.6), (2.0, 5.4)]}
-    problem, errors, jumps = two_mass(3.0, values=steps, rate=6.0), {}, {}
-    for name in ("RHC", "RHC+FPI"):
-        run = fp.simulate(problem, tasks.two_mass.controllers[name], seed=0)
-        late = run.time > 0.9
-        errors[name] = np.abs(run["error"][late]).max(axis=0)
-        jumps[name] = np.abs(np.diff(run["command"][late], axis=0)).max()
-    assert np.all(errors["RHC+FPI"] < 0.5e-3)
-    assert np.all(errors["RHC"] > 8e-3)
-    assert jumps["RHC+FPI"] < 0.3 * jumps["RHC"]
 
 
 def test_a_stepper_names_set_points_of_outputs():
