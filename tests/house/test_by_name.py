@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import pickle
 import re
 from collections.abc import Iterator, Mapping
-from copy import deepcopy
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -17,7 +14,6 @@ from helpers import tasks
 
 import fpirhc as fp
 from fpirhc.errors import InvalidName, NotSupported
-from fpirhc.fields.checked import ByName, Fixed
 
 shortened = cache(
     lambda: replace(tasks.two_mass, problem=replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
@@ -105,38 +101,6 @@ def test_the_nearest_name_is_offered():
         tasks.two_mass.problem.plant.parameters["mm"]
     with pytest.raises(KeyError):
         tasks.two_mass.controllers["nothing like it"]
-
-
-def test_what_is_found_by_name_is_a_dictionary():
-    """Equal to one, copied, pickled, taken apart and merged as one; what is asked for with a default has it."""
-
-    @dataclass(frozen=True)
-    class Holder:
-        entries: Mapping[str, Any]
-
-    plain = {"a": 1.0, "b": {"c": 2.0}}
-    named, fixed = ByName(plain, "here"), Fixed(plain, "here")
-    forms: tuple[Any, ...] = (
-        named,
-        fixed,
-        deepcopy(fixed),
-        pickle.loads(pickle.dumps(fixed)),
-        asdict(Holder(fixed))["entries"],
-        deepcopy(named),
-        pickle.loads(pickle.dumps(named)),
-        asdict(Holder(named))["entries"],
-    )
-    for same in forms:
-        assert same == plain
-        assert json.loads(json.dumps(same)) == plain
-        with pytest.raises(InvalidName):
-            same["c"]
-        with pytest.raises(InvalidName, match=r"has no 'a'\. Valid: c"):
-            same["b"]["a"]
-        assert same.get("c") is None
-    assert {**named, "d": 0} == named | {"d": 0} == {**plain, "d": 0}
-    plain["a"] = 5.0
-    assert named["a"] == 1.0
 
 
 def test_what_a_frozen_value_holds_stays():

@@ -1,70 +1,60 @@
-"""What meets the world around: files that are written, names of letters, processes that were forked, runs that are not finite."""
+"""What meets the world around: files that are written, names of letters, runs that are not finite."""
 
 from __future__ import annotations
 
 import os
 import stat
-import subprocess
-import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
+from helpers import tasks
 
 import fpirhc as fp
-from fpirhc.symbolic import native
-from fpirhc.whole_file import write_whole
 
-posix = pytest.mark.skipif(os.name != "posix", reason="links, modes and forks of POSIX")
+posix = pytest.mark.skipif(os.name != "posix", reason="links and modes of POSIX")
+
+
+def page(path: Path) -> None:
+    """Write the page of a comparison without a row."""
+    fp.write_report(empty(), path)
+
+
+@cache
+def empty() -> Any:
+    controllers = {"it": fp.ComputedTorque(fp.Exponential(rate=6.0))}
+    short = replace(driven("mu"), duration=0.05, measure_from=0.0)
+    return replace(fp.compare(tasks.made(short, controllers), seed=0, compiled=False), entries=())
 
 
 def test_what_a_killed_process_left_blocks_no_write(tmp_path):
-    """Numbers of processes come again in containers."""
-    path = tmp_path / "report.html"
-    (tmp_path / f".report.html.{os.getpid()}").write_text("torn")
-    write_whole("x", path, "report")
-    assert path.read_text() == "x"
-    assert sorted(one.name for one in tmp_path.iterdir()) == [f".report.html.{os.getpid()}", "report.html"]
+    """Numbers of processes come again in containers; the longest name of a file system is written."""
+    torn = tmp_path / f".report.html.{os.getpid()}"
+    torn.write_text("torn")
+    for name in ("report.html", "n" * 251):
+        page(tmp_path / name)
+        assert "<html" in (tmp_path / name).read_text(encoding="utf-8")
+    assert sorted(one.name for one in tmp_path.iterdir()) == sorted([torn.name, "report.html", "n" * 251])
 
 
 @posix
 def test_links_and_modes_stay(tmp_path):
-    target, link, new = tmp_path / "target.json", tmp_path / "link.json", tmp_path / "new.json"
+    target, link, new = tmp_path / "target.html", tmp_path / "link.html", tmp_path / "new.html"
     target.write_text("old")
     target.chmod(0o600)
     link.symlink_to(target)
     for path in (link, new):
-        write_whole("new", path, "baseline")
+        page(path)
     assert link.is_symlink()
-    assert target.read_text() == "new"
+    assert "<html" in target.read_text(encoding="utf-8")
     assert stat.S_IMODE(target.stat().st_mode) == 0o600
     mask = os.umask(0)
     os.umask(mask)
     assert stat.S_IMODE(new.stat().st_mode) == 0o666 & ~mask
-
-
-def test_the_longest_name_is_written(tmp_path):
-    path = tmp_path / ("n" * 251)
-    write_whole("x", path, "report")
-    assert path.read_text() == "x"
-
-
-@posix
-def test_a_forked_child_leaves_the_cache_of_its_parent():
-    """And the parent removes it at its own end."""
-    code = (
-        "import os, sys\nfrom fpirhc.symbolic.native import cache_folder\nfolder = cache_folder()\nchild = os.fork()\n"
-        "if child == 0:\n    sys.exit()\nos.waitpid(child, 0)\nprint(folder, folder.is_dir())"
-    )
-    environment = {**os.environ, "FPIRHC_CACHE": "/dev/null", "PYTHONPATH": str(Path(fp.__file__).parents[1])}
-    words = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    ).stdout.split()
-    assert words[1] == "True"
-    assert not Path(words[0]).exists()
-    assert native.cache_folder() != Path(words[0])
 
 
 def driven(friction: str, angle: str = "x") -> fp.Problem:

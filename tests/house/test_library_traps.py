@@ -6,21 +6,15 @@ superfluous; where a later one fails, the guard does not hold.
 
 from __future__ import annotations
 
-import gc
 import pickle
 import warnings
+from typing import Any
 
 import casadi as ca
 import numpy as np
-import pytest
 
 import fpirhc as fp
-from fpirhc import Ipopt, SequentialQuadratic, signed_power
 from fpirhc.contracts import is_finite, status_of
-from fpirhc.horizon.problem import OptimalControl, rollout
-from fpirhc.horizon.transcription import transcribe
-from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.live import SMOOTHING
 
 PLANT = fp.Plant(
     coordinates={"y": "m"},
@@ -31,9 +25,12 @@ PLANT = fp.Plant(
 REST = fp.Trajectory(lambda t: {"y": 0 * t})
 
 
-def horizon(limits: fp.Limits, stages: int = 5) -> OptimalControl:
+def planned(optimiser: Any, limits: fp.Limits) -> fp.Run:
+    """Two cycles of plans from (2 m, 1 m/s)."""
     cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.1})
-    return transcribe(PLANT, REST, fp.Horizon(stages, 0.2), cost, limits)
+    horizon, start = fp.Horizon(5, 0.2), {"y": 2.0, "y'": 1.0}
+    problem = fp.Problem(PLANT, REST, start, period=0.1, duration=0.2, limits=limits, horizon=horizon, cost=cost)
+    return fp.simulate(problem, fp.RecedingHorizon(optimiser), seed=0, compiled=False)
 
 
 def test_a_clamp_turns_nan_into_a_full_command():
@@ -57,37 +54,20 @@ def test_a_maximum_hides_nan_in_a_residual():
 
 def test_osqp_fills_infeasible_answers_with_finite_numbers():
     """A plan without solution is not called a success."""
-    ocp = horizon(fp.Limits(inputs={"u": (-0.1, 0.1)}, states={"y": (-0.2, 0.2)}))
-    optimiser = SequentialQuadratic(tolerance=1e-3)
-    memory = optimiser.memory(ocp).start()
-    first = np.array([2.0, 1.0])
-    _, diagnosis, _ = optimiser.step(ocp)(first, ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)
-    assert fp.Status(int(diagnosis[4])) != fp.Status.OK
+    limits = fp.Limits(inputs={"u": (-0.1, 0.1)}, states={"y": (-0.2, 0.2)})
+    run = planned(fp.SequentialQuadratic(tolerance=1e-3), limits)
+    assert fp.Status.OK not in {fp.Status(int(one)) for one in np.ravel(run["status"])}
 
 
 def test_ipopt_prints_nothing(capfd):
     """Its banner would spoil what --json prints."""
-    ocp, optimiser = horizon(fp.Limits()), Ipopt(tolerance=1e-3)
-    memory = optimiser.memory(ocp).start()
-    optimiser.step(ocp)(np.array([0.1, 0.0]), ocp.nodes[2], ocp.input_lower, ocp.input_upper, memory)
+    planned(fp.Ipopt(tolerance=1e-3), fp.Limits())
     assert capfd.readouterr().out == ""
 
 
 def test_optimisers_are_sent_as_values():
     """A pickled solver has megabytes; workers get the settings and build their own."""
-    assert len(pickle.dumps(Ipopt(tolerance=1e-3))) < 10_000
-
-
-def test_the_owner_of_a_buffer_lives_as_long_as_its_handle():
-    """CasADi's handle does not keep the memory that it writes to; the evaluator's does."""
-    x = ca.SX.sym("x", 4)
-    evaluator = Evaluator(ca.Function("f", [x], [ca.sin(x)]))
-    evaluate, results = evaluator.evaluate, evaluator.results
-    evaluator.arguments[0][:] = 1.0
-    del evaluator
-    gc.collect()
-    evaluate()
-    np.testing.assert_allclose(results[0], np.sin(1.0), rtol=1e-15, equal_nan=False)
+    assert len(pickle.dumps(fp.Ipopt(tolerance=1e-3))) < 10_000
 
 
 def test_no_adaptation_is_no_frozen_request():
@@ -116,15 +96,9 @@ def test_a_power_has_no_finite_derivatives_at_its_kink():
         return [float(v) for v in ca.Function("derivatives", [e], [gradient, hessian])(0.0)]
 
     assert not np.isfinite(derivatives(ca.sign(e) * ca.fabs(e) ** 1.5)).all()
-    slope, curvature = derivatives(signed_power(e, 1.5))
-    assert slope == pytest.approx(SMOOTHING**0.5)
+    slope, curvature = derivatives(fp.signed_power(e, 1.5))
+    assert 0 < slope < 1e-2
     assert np.isfinite(curvature)
-
-
-def test_a_longer_horizon_is_no_longer_code():
-    """Stages are accumulated calls of one Function: written out one by one they would compile for seconds."""
-    short, long = (rollout(horizon(fp.Limits(), stages)).n_nodes() for stages in (10, 40))
-    assert long < 2 * short
 
 
 def test_the_package_is_pickled_by_its_name():

@@ -2,12 +2,9 @@
 
 A form is a way to say a plant (coordinates of any order, outputs of states, a static map, a map of steps) or what lies between
 plant and controller (dead time, estimators, beliefs, another plant, a body outside). The law of a pair: the run with a wrong
-model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A controller decides
-what a Stepper is composed of, so each is tried and replayed on all forms; its parts are blocks in it, and are replayed on two
-forms each, in turn. Parts are tried on every second form, in turn, and on the others in the slow lane. Examples of one member
-share the forms, each with those of its turn. A pair that is not served stands below with the
-sentence that its user reads; every other refusal is a defect. Members are found by search, so a new one is tried on all forms, and
-a new form with all members.
+model stays near its reference, and a Stepper that is given the run's measurements has the run's commands. A pair that is not served
+stands below with the sentence that its user reads; every other refusal is a defect. Members are found by search, so a new one is
+tried on all forms, and a new form with all members: a third of the pairs at once, a Latin square, the others in the slow lane.
 """
 
 from __future__ import annotations
@@ -22,12 +19,12 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.forms import CYCLE, FORMS
+from helpers.replay import samples
 
 import fpirhc as fp
+from fpirhc.conformance import examples, member_classes
 from fpirhc.contracts import Controller
 from fpirhc.errors import FpirhcError
-from fpirhc.members import examples, member_classes
-from fpirhc.simulation.step_arguments import raw_measurements
 
 REPLAYED = 20
 NEAR = 0.2  # m, rms in the last quarter; that of the reference is 0.42
@@ -163,7 +160,7 @@ def test_the_tables_name_what_there_is():
 def replayed(problem: fp.Problem, controller: Controller, run: fp.Run) -> np.ndarray:
     """Commands of a Stepper that is given what the run measured."""
     stepper = fp.Stepper(problem, controller, compiled=False, bounded=False)
-    memory, measured, commands = stepper.start(), raw_measurements(run), []
+    memory, measured, commands = stepper.start(), samples(run), []
     for k in range(REPLAYED):
         command, memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
         commands.append(command)
@@ -171,16 +168,15 @@ def replayed(problem: fp.Problem, controller: Controller, run: fp.Run) -> np.nda
 
 
 def pairs() -> list[Any]:
-    """Every member on every form, its examples in turn, and every pair of the tables."""
+    """A Latin square, every third form of a member in turn, with its examples in turn; all other pairs are slow."""
     turns = [
-        pytest.param(
-            group[k // 2 % len(group)], form, marks=[pytest.mark.slow] * (name not in CONTROLLERS and (j + k) % 2)
-        )
-        for j, (name, group) in enumerate(OF_CLASS.items())
+        pytest.param(group[k // 3 % len(group)], form, marks=[pytest.mark.slow] * bool((j + k) % 3))
+        for j, group in enumerate(OF_CLASS.values())
         for k, form in enumerate(FORMS)
     ]
     tried = {one.values for one in turns}
-    return turns + [pytest.param(*pair) for pair in (*REFUSED, *FARTHER) if pair not in tried]
+    rest = [pair for pair in (*REFUSED, *FARTHER) if pair not in tried]
+    return turns + [pytest.param(*pair, marks=[pytest.mark.slow] * bool(k % 3)) for k, pair in enumerate(rest)]
 
 
 @pytest.mark.parametrize(("member", "form"), pairs())
@@ -199,6 +195,5 @@ def test_a_member_serves_a_form_or_says_why_not(member: str, form: str) -> None:
     assert run.stop is None
     error = float(np.sqrt(np.mean(run["true_error"][-run.cycles // 4 :] ** 2)))
     assert (error < NEAR) == ((member, form) not in FARTHER)
-    turn = list(MEMBERS).index(member) - list(FORMS).index(form)
-    if member in CONTROLLERS or turn % (len(FORMS) // 2) == 0:
+    if member in CONTROLLERS or (list(MEMBERS).index(member) - list(FORMS).index(form)) % (len(FORMS) // 2) == 0:
         np.testing.assert_allclose(replayed(problem, controller, run), run["command"][:REPLAYED], rtol=1e-9, atol=1e-9)

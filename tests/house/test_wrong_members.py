@@ -15,13 +15,13 @@ from wrong.tables import CONTROLLER_MEMBERS, CONTROLLERS, MAP_MEMBERS, MAPS, OBS
 
 import fpirhc as fp
 from fpirhc import conformance
-from fpirhc.conformance import check_deformation, check_observer, deformation_facts
+from fpirhc.conformance import check_deformation, check_observer, deformation_facts, two_masses
 from fpirhc.conformance import controller as controller_laws
 from fpirhc.conformance import deformation as deformation_laws
 from fpirhc.conformance import optimiser as optimiser_laws
 from fpirhc.conformance.horizons import Trial as OptimiserTrial
 from fpirhc.conformance.laws import keep
-from fpirhc.conformance.loops import Trial, two_masses
+from fpirhc.conformance.loops import Trial
 from fpirhc.contracts import Controller, Deformation
 
 DEFORMATION = fp.Sigmoid(gain=-0.5)
