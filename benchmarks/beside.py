@@ -17,7 +17,7 @@ Step = Callable[[float, np.ndarray], np.ndarray]  # time and measured state -> c
 def flown(
     step: Step, start: np.ndarray, move: Callable[[np.ndarray, np.ndarray], np.ndarray], period: float, cycles: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return states (cycles + 1, nx), commands (cycles, nu), and the median wall time of a command, ms.
+    """Return states (cycles + 1, nx), commands (cycles, nu), and the median CPU time of a command, ms.
 
     Args:
         step: the controller; its command is timed.
@@ -28,9 +28,9 @@ def flown(
     """
     states, commands, seconds = [np.asarray(start, float)], [], []
     for k in range(cycles):
-        begun = time.perf_counter()
+        begun = time.process_time()
         command = np.ravel(step(k * period, states[-1]))
-        seconds.append(time.perf_counter() - begun)
+        seconds.append(time.process_time() - begun)
         commands.append(command)
         states.append(np.ravel(move(states[-1], command)))
     return np.array(states), np.array(commands), 1e3 * float(np.median(seconds))

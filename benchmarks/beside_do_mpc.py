@@ -7,7 +7,7 @@ The reactor, its first state, set-point, weights, limits, period and horizon are
 Engell 1998). Every controller has the nominal model, alpha = beta = 1; the simulator moves with each of the example's nine pairs.
 The rivals have their best information: do-mpc's robust controller plans over all nine pairs, of which the true one is one; "knows
 the values" is told the true pair. All controllers measure the four states without noise. The error is the root mean square of
-C_b - 0.6 mol/l in the second half of the run; the time is the median wall time of a command.
+C_b - 0.6 mol/l in the second half of the run; the time is the median CPU time of a command.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The closed loop of two_mass, CTC with eq (6), written by hand: in Python for floats, numpy, numba and JAX, and in C."""
+"""The closed loop of two_mass, CTC with eq (6), written by hand in Python, for floats and modules like numpy."""
 
 from __future__ import annotations
 
@@ -61,52 +61,3 @@ def cycle_of(m: Any, compiled: Callable[[Any], Any] = lambda function: function)
         return (x1, x2, v1, v2, i1 + h * e1, i2 + h * e2, r1, r2, f1, f2), (e1, e2)
 
     return cycle
-
-
-IN_C = """
-#include <math.h>
-static void response(const double* x, const double* v, const double* u, const double* p, double* a) {
-  double d1 = x[0] - p[6], d2 = x[1] - x[0] - p[7];
-  double f1 = p[4] * d1 * pow(d1 * d1 + 1e-12, (p[2] - 1) / 2), f2 = p[5] * d2 * pow(d2 * d2 + 1e-12, (p[3] - 1) / 2);
-  a[0] = p[10] + (-f1 + f2 - p[8] * v[0] + u[0]) / p[0];
-  a[1] = p[10] + (-f2 - p[9] * v[1] + u[1]) / p[1];
-}
-void run(long plants, long cycles, long first, const double* exact, const double* model, double* squares) {
-  const double h = 1e-3, rest[2] = {0, 0}, fixed = FIXED;
-  long n, k;
-  int i;
-  for (n = 0; n < plants; ++n) {
-    const double* p = exact + 11 * n;
-    double x[2] = {2.2, 5.4}, v[2] = {0, 0}, sum[2] = {-18 * .6 / 216, -18 * .9 / 216}, r[2] = {0, 0}, f[2] = {0, 0};
-    squares[2 * n] = squares[2 * n + 1] = 0;
-    for (k = 0; k < cycles; ++k) {
-      double t = k * h, s[2] = {sin(2 * t), sin(3 * t)}, c[2] = {cos(2 * t), cos(3 * t)}, e[2], off[2], size, grow, g[2], u[2];
-      double a[4][2], y[4][2], w[4][2];
-      e[0] = 2.2 + .3 * s[0] - x[0], e[1] = 5.4 + .3 * s[1] - x[1];
-      off[0] = f[0] - (-1.2 * s[0] + 216 * sum[0] + 108 * e[0] + 18 * (.6 * c[0] - v[0]));
-      off[1] = f[1] - (-2.7 * s[1] + 216 * sum[1] + 108 * e[1] + 18 * (.9 * c[1] - v[1]));
-      size = sqrt(off[0] * off[0] + off[1] * off[1] + 1e-18);
-      grow = (atanh(.5 * tanh(-.5 * size + fixed + .3)) - fixed) / size;
-      response(x, v, rest, model, g);
-      for (i = 0; i < 2; ++i) {
-        r[i] += grow * off[i];
-        u[i] = fmin(300, fmax(-300, (r[i] - g[i]) * model[i]));
-        sum[i] += h * e[i];
-        if (k >= first) squares[2 * n + i] += e[i] * e[i];
-        y[0][i] = x[i], w[0][i] = v[i];
-      }
-      for (i = 0; i < 4; ++i) {
-        double reach = i == 2 ? h : h / 2;
-        int j;
-        response(y[i], w[i], u, p, a[i]);
-        for (j = 0; i < 3 && j < 2; ++j) y[i + 1][j] = x[j] + reach * w[i][j], w[i + 1][j] = v[j] + reach * a[i][j];
-      }
-      for (i = 0; i < 2; ++i) {
-        x[i] += h / 6 * (w[0][i] + 2 * w[1][i] + 2 * w[2][i] + w[3][i]);
-        v[i] += h / 6 * (a[0][i] + 2 * a[1][i] + 2 * a[2][i] + a[3][i]);
-      }
-      response(x, v, u, p, f);
-    }
-  }
-}
-""".replace("FIXED", repr(_FIXED))
