@@ -44,7 +44,8 @@ class FixedPoint(Optimiser):
         tolerance: of the stationarity and of the move that a sweep wants (in the unit of the inputs), below which a plan is
             converged; None: 1e-4 of half the smallest range of an input, or of its size along the reference. The status of a call
             is OK where the plan that it returns is below it, and NOT_CONVERGED elsewhere, also after so many iterations.
-        feasible: violation of a state bound, as a share of half its range, below which a plan counts as converged.
+        feasible: violation of a state bound, as a share of half its range, below which a call may end; what is sent is rolled out,
+            which moves it, and counts as converged up to ten times as much.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
             Gauss-Newton first where a remembered plan is improved.

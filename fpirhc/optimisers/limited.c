@@ -118,8 +118,8 @@ static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* 
   return worst;
 }
 
-static int is_done(const Certificate* c) {
-  return c->left <= TOLERANCE && c->broken <= FEASIBLE && c->error <= SCALED_TOLERANCE;
+static int is_done(const Certificate* c, casadi_real feasible) {
+  return c->left <= TOLERANCE && c->broken <= feasible && c->error <= SCALED_TOLERANCE;
 }
 
 /* The stationarity with which a plan is returned: multipliers of limits that are not near count as zero. */
@@ -451,7 +451,7 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
     ok = expand(p, m.room->move.k, rolled, m.descends && m.phase == INTERIOR ? m.room->gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), room->shared.partials);
     accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
     if (accepted) other = best, best = p, p = other, m.rolled = rolled && !m.descends;
-    ended = !m.fresh && m.phase == PURE && is_done(&m.last) && (left = returned_left(&m, best)) <= TOLERANCE;
+    ended = !m.fresh && m.phase == PURE && is_done(&m.last, FEASIBLE) && (left = returned_left(&m, best)) <= TOLERANCE;
     if (final || m.stuck || ended) break;
     if (!m.fresh && (accepted || m.again)) m.again = 0, direct(&m, best, s0, data, lower, upper);
   }
@@ -474,7 +474,7 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   }
   /* A call that ends at its most iterations may still get inside, unless multipliers prove that it does not; one that has tried
      everything has not. */
-  if (is_done(&c)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
+  if (is_done(&c, ROLLED_OUT * FEASIBLE)) status = ok && outside(&m.limits, best) > KEPT_SHARE ? INFEASIBLE : CONVERGED;
   else if (outside(&m.limits, best) > NEAR_LIMIT && (m.stuck || cannot_be_kept(&m.limits, best, m.room->y.z))) status = INFEASIBLE;
   else status = NOT_CONVERGED;
   status = empty ? INFEASIBLE : !ok ? NON_FINITE : status;

@@ -211,7 +211,7 @@ def _status(call: Call, s: State, p: Expansion, c: Certified, ok: ca.MX) -> ca.M
     # everything has not.
     far = ca.logic_and(call.limits.outside(p) > FEASIBLE, ca.logic_or(s["stuck"], _cannot_be_kept(call, p, s["z"])))
     unsolved = ca.if_else(far, int(Status.INFEASIBLE), int(Status.NOT_CONVERGED))
-    status = ca.if_else(ok, ca.if_else(call.is_done(c), solved, unsolved), int(Status.NON_FINITE))
+    status = ca.if_else(ok, ca.if_else(call.is_done(c, constants.ROLLED_OUT), solved, unsolved), int(Status.NON_FINITE))
     return ca.if_else(ca.mmax(call.lower - call.upper) > 0, int(Status.INFEASIBLE), status)
 
 

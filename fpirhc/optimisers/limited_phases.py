@@ -58,10 +58,10 @@ class Call:
         """Return how far a plan with multipliers z is from the first-order conditions."""
         return certified(self.ocp, self.limits, self.scales, p, z)
 
-    def is_done(self, c: Certified) -> ca.MX:
-        """Whether a plan meets the first-order conditions to the tolerances."""
+    def is_done(self, c: Certified, room: float = 1) -> ca.MX:
+        """Whether a plan meets the first-order conditions to the tolerances; limits to `room` times theirs."""
         t = self.settings
-        feasible = ca.logic_and(c.broken <= t.feasible, c.error <= t.scaled_tolerance(self.scales))
+        feasible = ca.logic_and(c.broken <= room * t.feasible, c.error <= t.scaled_tolerance(self.scales))
         return ca.logic_and(c.left <= t.tolerance, feasible)
 
 

@@ -14,6 +14,8 @@ PATIENCE = 3  # pure steps in a row that may fail to halve the error: the active
 HOPELESS = 1e2  # scaled error from which on there is no patience: multipliers are at their largest value
 AHEAD = 0.1  # of the tolerance: where one more step by Gauss-Newton is expected to arrive, the exact Hessian is not computed
 PURE_STEPS = 10
+# Times the violation at which a call ends: what is sent counts as converged, because the roll-out of a plan moves it in its limits.
+ROLLED_OUT = 10.0
 MU_WARM, MU_MOST = 1e-4, 0.1  # barrier parameter of a remembered plan, and how far it is raised, in units of the cost
 # Where pure steps are tried first, and last: at the last one limits whose multipliers nearly vanish are 1e-7 of a unit away.
 MU_END, MU_LEAST = 1e-5, 1e-15
@@ -36,7 +38,7 @@ class LimitedSettings:
     """Settings of one Function."""
 
     tolerance: float  # of the stationarity, in the unit of the inputs
-    feasible: float  # violation of a state bound, as a share of its unit, below which a plan counts as converged
+    feasible: float  # violation of a state bound, as a share of its unit, below which a call may end
     map: Deformation  # the deformation of pure steps
     hessian: HessianModel | None  # second derivatives of the quadratic model; None: exact
     damping: float  # added to the curvature of the inputs, in units of it

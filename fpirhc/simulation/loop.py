@@ -87,13 +87,13 @@ def start_memory(
         live = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
         starts |= {name: value for name, value in live.items() if name in loop.memory}
         starts |= {**derived.signals, **derived.memory()}
-    elif INNER in loop.memory and _plans_exactly(loop, problem, controller):
+    elif INNER in loop.memory and plans_exactly(loop, problem, controller):
         starts[INNER] = compose_with_sensing(problem, controller).memory.start()
     return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
 
 
-def _plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
-    """Whether the first plan is one of exact parameters, which are not those of the build."""
+def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
+    """Return whether plans know the exact parameters, and those of this problem are not those of the build."""
     if controller.planner is None or not controller.plant_model(problem).exact:
         return False
     model = controller.plant_model(problem)

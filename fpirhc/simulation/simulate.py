@@ -27,7 +27,7 @@ from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.simulation.changes import Changes, InForce, in_force
-from fpirhc.simulation.loop import close_loop, start_memory
+from fpirhc.simulation.loop import close_loop, plans_exactly, start_memory
 from fpirhc.simulation.path import LOGGED, REALITY_STATE, Exchange, cycles_per_call, moving
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.replay import replaying
@@ -82,13 +82,24 @@ class Simulator:
         Raises:
             InvalidProblem: unknown states, or values that the problem refuses.
         """
-        problem = replace(self.problem, start={**self.problem.start, **start})
+        return self.built_for(replace(self.problem, start={**self.problem.start, **start}))
+
+    def built_for(self, problem: Problem) -> Simulator:
+        """Return the loop of another form of the problem; it is not compiled again where its code is the same."""
         live = live_settings(problem, self.live.unresolved, self.live.paths)
         loop = close_loop(problem, live.controller, live if live.paths else None)
         if loop.function.serialize() == self.loop.function.serialize():
             return replace(self, problem=problem, controller=live.controller, loop=loop, live=live)
         anew = ComposedLoop.of(problem, self.live.unresolved, self.live.paths)
         return anew.simulator(self.compiled)
+
+    def outdated_by(self, problem: Problem) -> bool:
+        """Whether a variant needs a loop of its own: plans that know the exact parameters begin their line search with a step that
+        was measured with those of the build, which a plan that is solved forgets, and one of so many iterations does not.
+        """
+        planner = self.controller.planner
+        counted = planner is not None and "iterations" in planner.optimiser.most_work
+        return counted and plans_exactly(self.loop, problem, self.controller)
 
     @property
     def remembers(self) -> bool:
@@ -124,7 +135,8 @@ class Simulator:
         Args:
             seed: of the noise of disturbances and sensors.
             name: of the controller in the results; '': the name of its class.
-            variant: the simulator's problem with other exact parameters or another duration; None: the problem itself.
+            variant: the simulator's problem with other exact parameters or another duration; None: the problem itself. A loop is
+                built for it where plans with the exact model have a fixed number of iterations.
             disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build. None: all have them.
@@ -140,20 +152,15 @@ class Simulator:
             NotSupported: a change of a device where something that follows from the setting must not stay.
         """
         problem = variant or self.problem
-        force = in_force(
-            self.live,
-            self.loop,
-            problem,
-            {} if settings is None else settings,
-            {} if changes is None else changes,
-            deployed,
-        )
+        own = self.built_for(problem) if self.outdated_by(problem) else self
+        given = {} if settings is None else settings, {} if changes is None else changes
+        force = in_force(own.live, own.loop, problem, *given, deployed)
         problem, controller = force.problem, force.controller
-        start = start_memory(self.loop, problem, controller, force.numbers)
+        start = start_memory(own.loop, problem, controller, force.numbers)
         rows, talk = _padded(problem, force.patches), moving(problem).exchange(seed)
         tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints, later=force.later)
-        logged, stop = run_cycles(problem, start, self.loop, self.evaluator, tables, talk, progress, force.patches)
-        layout, log = with_common_columns(self.loop.trace, logged)
+        logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress, force.patches)
+        layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)
         step_limit = controller.deformation.largest_step()
         planner = controller.planner
@@ -166,8 +173,8 @@ class Simulator:
             "parameters": [float(v) for v in model.parameters(model.plant)],
             "controller": _DESCRIBED.of((controller,), (), lambda: describe(controller)),
             "problem": describe(problem),
-            "backend": "compiled C" if self.compiled else "CasADi virtual machine",
-            "why not compiled": self.why_not_compiled,
+            "backend": "compiled C" if own.compiled else "CasADi virtual machine",
+            "why not compiled": own.why_not_compiled,
         }
         if controller.deformation.iteration.weights is not None:
             facts["weights"] = [list(row) for row in controller.deformation.iteration.weights]
@@ -178,8 +185,8 @@ class Simulator:
             facts["setpoints"] = points
         if problem.reality is not None:
             facts["model is reality"] = model.plant is not problem.plant
-        title = name or type(self.controller).__name__
-        return Run(problem.name, title, seed, problem.period, layout, log, stop, self.compiled, facts)
+        title = name or type(own.controller).__name__
+        return Run(problem.name, title, seed, problem.period, layout, log, stop, own.compiled, facts)
 
 
 @checked_call

@@ -195,6 +195,25 @@ def same_optimum(seed: int) -> bool:
     return solvable
 
 
+def test_what_the_roll_out_of_a_solved_plan_adds_to_a_limit_is_no_failure():
+    """A rocket's plan with gaps keeps its limits to 1e-8 of their ranges, and rolled out to 4e-8: OK, in C and in the graph."""
+    case, number = FOREIGN["rocket"](), 112
+    ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, case.limits, time=11.2)
+    start = case.first(ocp, first_states(case, 150, 3)[:, number])
+    near = start * (1 + 1e-3 * np.random.default_rng(number).normal(size=start.size))
+    limited = np.isfinite(ocp.state_lower)
+    low, high = ocp.state_lower[limited, None], ocp.state_upper[limited, None]
+    graph = (optimiser := fp.FixedPoint(tolerance=2e-3)).step(ocp)
+    for step in (graph, compiled(graph)):
+        memory = optimiser.memory(ocp).start()
+        for first in (start, near):
+            plan, diagnostics, after = step(first, data, ocp.input_lower, ocp.input_upper, memory)
+            memory = ca.evalf(optimiser.shifted(ocp, ca.MX(after)))
+        states = rolled(ocp, near, np.asarray(plan.full()), data).states[limited, 1:]
+        worst = (np.maximum(low - states, states - high) / (0.5 * (high - low))).max()
+        assert (1e-8 < worst < 1e-7, int(diagnostics[4])) == (True, fp.Status.OK)
+
+
 def least_violation(ocp, first, data):
     """The smallest largest violation of the states' limits by inputs within theirs, by a linear program (HiGHS)."""
     n, nu = ocp.stages, ocp.input.size
