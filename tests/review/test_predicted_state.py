@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -10,7 +11,6 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.contracts import Controller, Deformation
-from fpirhc.controllers.wrappers.predicted import Predictor
 
 RATE, PERIOD, FORCE = 3.0, 0.01, 1.0  # 1/s, s, m/s^2
 KP, KD = RATE**2, 2 * RATE
@@ -35,7 +35,7 @@ def mass(late: float) -> fp.Problem:
     )
 
 
-def law(late: float, form: Deformation | None = None, by: Predictor | None = None) -> Controller:
+def law(late: float, form: Deformation | None = None, by: Any = None) -> Controller:
     tracking = fp.Exponential(RATE, integral=False)
     plain = fp.ComputedTorque(tracking) if form is None else fp.ComputedTorque(tracking, form)
     return fp.Predicted(plain, inputs=late) if by is None else fp.Predicted(plain, inputs=late, by=by)

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from helpers.reviewed import answers, mass, torque
-from typer.testing import CliRunner
 
 import fpirhc as fp
-from fpirhc.cli import app
+from fpirhc.__main__ import main
 
 LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
 NAMES = {  # of numbers by key, which scripts read
@@ -115,12 +114,11 @@ controllers = {{"CTC+FPI": fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine
 
 
 @pytest.mark.parametrize(("gain", "code"), [(-0.5, 0), (0.5, 1)])
-def test_the_command_writes_fixed_names_and_says_no_by_its_exit_code(tmp_path: Path, gain: float, code: int):
+def test_the_command_writes_fixed_names_and_says_no_by_its_exit_code(tmp_path: Path, gain: float, code: int, capsys):
     """A gain of the wrong sign is a no."""
     (tmp_path / "mine.py").write_text(FILE.format(gain=gain))
-    done = CliRunner().invoke(app, ["review", str(tmp_path / "mine.py"), "--json"])
-    assert done.exit_code == code, done.output
-    told = json.loads(done.stdout)
+    assert main(["review", str(tmp_path / "mine.py"), "--json"]) == code
+    told = json.loads(capsys.readouterr().out)
     assert told["ready"] is (code == 0)
     for answer in (a for some in told["answers"].values() for a in some):
         assert set(answer) == {"key", "question", "verdict", "numbers", "of", "change"}

@@ -19,7 +19,6 @@ from helpers import reviewed, tasks
 from helpers.reviewed import ball, biased, levitation, plans, turntable
 
 import fpirhc as fp
-from fpirhc.review.review import Answer
 
 UNWRAP = "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error."
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
@@ -188,7 +187,7 @@ CASES: dict[str, Case] = {
 
 
 @cache
-def said(name: str) -> dict[tuple[str, str], Answer]:
+def said(name: str) -> dict[tuple[str, str], Any]:
     """All answers of a case, by whom they are about and their key."""
     problem, controllers = CASES[name].task()
     found = fp.review(problem, controllers, mismatch=0.0, seed=0).answers
