@@ -40,7 +40,7 @@ NAMED = '''
 """A controller under another name."""
 from dataclasses import dataclass
 
-from fpirhc.controllers.base import Controller
+from fpirhc.contracts import Controller
 
 
 @dataclass(frozen=True)
@@ -122,14 +122,12 @@ def run(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
 def test_members_from_abroad_are_found_and_keep_the_laws(abroad: Path) -> None:
     """Every family lists them, `fp.NAME` finds them by their file, the laws try their examples; the optimiser is a choice."""
     script = (
-        "import json; import fpirhc as fp; from fpirhc.studies.open_loop import optimiser_choices\n"
-        "from fpirhc.members import FAMILIES, examples, member_classes\n"
+        "import json; import fpirhc as fp; from fpirhc.conformance import FAMILIES, examples, member_classes\n"
         "from fpirhc.conformance import check_deformation, check_optimiser, check_tracking\n"
         "mine = lambda f: [e for e in examples(f) if type(e).__module__.startswith('abroad')]\n"
         "[check_deformation(m, seed=1) for m in mine('deformations')]\n"
         "[check_tracking(m, seed=1, period=2e-3, duration=6.0) for m in mine('tracking laws')]\n"
         "[check_optimiser(m, tolerance=1e-6, seed=1) for m in mine('optimisers')]\n"
-        "assert 'projected-gradient' in optimiser_choices()\n"
         "families = {f: [c.__name__ for c in member_classes(f)] for f in FAMILIES}\n"
         "print(json.dumps([families, [len(mine(f)) for f in families], fp.Poles.__module__, fp.Named.__module__]))"
     )
@@ -157,6 +155,8 @@ def test_review_speaks_of_members_from_abroad(abroad: Path) -> None:
 
 def test_compare_runs_members_from_abroad(abroad: Path) -> None:
     """The table has them all, the plan's metrics reach through two wrappers."""
+    wrong = run(abroad, "-m", "fpirhc", "compare", "masses.py", "--plans", "--optimisers", "projected-gradien")
+    assert "Did you mean 'projected-gradient'" in wrong.stderr
     answer = run(abroad, "-m", "fpirhc", "compare", "masses.py", "--json", "--no-compile")
     assert answer.returncode == 0, answer.stderr
     document = json.loads(answer.stdout)
