@@ -7,11 +7,9 @@ there, and what to write instead. `test_wrong_files` has the mistakes of people 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pytest
 from mutated_problems import SOURCE
@@ -19,12 +17,7 @@ from raw_errors import raw_error
 
 import fpirhc as fp
 from fpirhc.contracts import Deformation
-from fpirhc.controllers.check import checked
 from fpirhc.errors import InvalidField
-from fpirhc.fields.checked import Checked, expects_whole_number
-from fpirhc.symbolic.live import SymbolicNumber
-
-# The name of a mistake, the old piece of the correct file and the new one, and what must be said: the cause and the mend.
 
 
 def test_all_mistakes_of_a_value_are_said_together():
@@ -32,22 +25,6 @@ def test_all_mistakes_of_a_value_are_said_together():
     with pytest.raises(InvalidField, match=r"(?s)3 mistakes.*no field 'scal'.*Sigmoid.gain.*Sigmoid.shift") as caught:
         fp.Sigmoid(**wrong)
     assert "test_mistakes.py, line" in str(caught.value)
-
-
-# --- The mechanism ----------------------------------------------------------------------------------------------------
-
-
-class Live(SymbolicNumber):
-    """A number that stands for a symbol."""
-
-
-def test_a_number_that_stands_for_a_symbol_is_a_number_and_a_bare_symbol_is_none():
-    live: Any = Live()
-    assert fp.Parameter(approximate=live, exact=1.0, unit="kg").approximate is live
-    for symbol in (ca.SX.sym("a"), ca.MX.sym("a")):
-        bare: Any = symbol
-        with pytest.raises(InvalidField, match="a CasADi symbol"):
-            fp.Parameter(approximate=bare, exact=1.0, unit="kg")
 
 
 @dataclass(frozen=True)
@@ -101,41 +78,15 @@ def test_a_class_of_another_distribution_is_checked_without_a_line_of_its_own(se
     assert ExternalPlant(np.float64(1.0), ExternalPlant(2), {"a": (1, whole)}).gain == 1.0
 
 
-def test_what_an_annotation_does_not_say_is_not_checked():
-    class Open(Checked):
-        def __init__(self, one, *more: int, two: NotThere = 3, **rest: int) -> None:  # type: ignore[name-defined]  # noqa: F821
-            self.all = (one, more, two, rest)
-
-    text: Any = "3"
-    opened: Any = Open(1, 2, text, two=4, other=5)
-    assert opened.all == (1, (2, "3"), 4, {"other": 5})
-
-
-def test_a_contract_is_no_value():
-    class Contract(Checked, ABC):
-        @abstractmethod
-        def act(self) -> None: ...
-
-    with pytest.raises(InvalidField, match="Contract is a contract"):
-        Contract()  # type: ignore[abstract]
-
-
-def test_the_tuner_knows_whole_numbers_with_a_range():
-    assert expects_whole_number(fp.Ipopt, "iterations")
-    assert not expects_whole_number(fp.Ipopt, "accuracy")
-    assert not expects_whole_number(fp.Ipopt, "nothing")
-
-
-# --- The command line -------------------------------------------------------------------------------------------------
-
-
 # --- Random mistakes --------------------------------------------------------------------------------------------------
 
 
 def test_the_file_without_mistakes_is_accepted(tmp_path):
     (tmp_path / "mine.py").write_text(SOURCE, encoding="utf-8")
     task = fp.load_problem(str(tmp_path / "mine.py"))
-    assert [type(checked(task.problem, one)).__name__ for one in task.controllers.values()]
+    short = replace(task.problem, duration=2 * task.problem.period, measure_from=0.0)
+    for one in task.controllers.values():
+        assert fp.simulate(short, one, seed=0, compiled=False).stop is None
 
 
 @pytest.mark.filterwarnings("ignore")

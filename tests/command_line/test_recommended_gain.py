@@ -9,7 +9,6 @@ import abroad
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.plant.motion import with_exact_parameters
 
 steering = cache(lambda: abroad.load("vehicle_steering"))
 REFERENCED, PLAIN, TORQUE = "RHC+model-referenced", "RHC+FPI", "CTC+FPI"
@@ -38,8 +37,8 @@ def test_with_the_recommended_gain_the_wheel_moves_as_without_adaptation():
 
 def test_the_limit_of_the_poles_is_where_a_loop_of_the_box_loses_them():
     """The plant is the model, an end of the box: below its limit the wheel comes to rest after the lane change, above it never."""
-    exact = with_exact_parameters(steering().problem.plant, steering().problem.plant.approximate)
-    problem = replace(steering().problem, plant=exact, duration=16.0)
+    exact = steering().problem.with_exact(steering().problem.plant.approximate)
+    problem = replace(exact, duration=16.0)
     sizes = []
     for effective in (1.6, 1.75):
         run = fp.simulate(problem, with_gain(TORQUE, effective), seed=0, compiled=False)
