@@ -14,7 +14,7 @@ from typing import Any
 from typer import Abort, Exit
 from typer.main import get_command
 
-from fpirhc.cli import MADE, app
+from fpirhc.cli import MADE, app, list_
 
 _INTERRUPTED = "interrupted; finished results are kept, and the same command goes on"
 
@@ -51,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> Any:
+    if words == ["list"]:  # what comes first is quick: typer reads even no options with pydantic, longer to import than casadi
+        return list_()
     command: Any = get_command(app)
     if not words or words[0] == "help":  # as git, pip and cargo have it
         words = [*words[1:2], "--help"]
