@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = _INTERRUPTED if code == 130 else ""  # typer turns an interruption into a code
         sys.stdout.flush()  # a reader that has gone shows here, and not at the end of the program
     except BaseException as error:  # noqa: BLE001 -- the last resort of a program
-        if "--debug" in words:
+        if "--debug" in words and not isinstance(error, KeyboardInterrupt):
             traceback.print_exc()
         text, code = _ended_by(error)
     finally:
@@ -51,7 +51,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> Any:
-    if words == ["list"]:  # what comes first is quick: typer reads even no options with pydantic, longer to import than casadi
+    if words == [
+        "list"
+    ]:  # what comes first is quick: typer reads even no options with pydantic, longer to import than casadi
         return list_()
     command: Any = get_command(app)
     if not words or words[0] == "help":  # as git, pip and cargo have it

@@ -278,6 +278,7 @@ HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", 
     ("first", "absent"),
     [
         ("from fpirhc.__main__ import main; main([]); main(['list'])", HEAVY),
+        ("from fpirhc.__main__ import main; main(['list'])", (*HEAVY, "pydantic")),
         ("import fpirhc as fp; fp.Problem", HEAVY[2:]),
         ("import fpirhc as fp; fp.load_problem('two_mass')", ("matplotlib", "rich", "jinja2", "pandas", "joblib")),
         ("from fpirhc.__main__ import main; main(['compare', 'wrong.py'])", HEAVY[3:]),
