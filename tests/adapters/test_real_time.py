@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tank import PERIOD, TANK, Tank
+from helpers.tank import PERIOD, TANK, Tank
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem, InvalidValue
