@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from runpy import run_path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,22 +17,20 @@ from scipy.linalg import expm
 from scipy.signal import lsim
 
 import fpirhc as fp
-from fpirhc.problem_files.problem_file import Task, _imported
-from fpirhc.problem_files.shipped import find_problem
 
 NAME = "anaesthesia_people"
 KE0, APPROACH, CYCLE = 0.309, 1.5, 1 / 12
 
 
 @cache
-def task(name: str = NAME) -> Task:
+def task(name: str = NAME) -> Any:
     return fp.load_problem(name)
 
 
 @cache
 def written() -> Any:
     """The module of the problem file."""
-    return _imported(find_problem(NAME))
+    return SimpleNamespace(**run_path(str(task().path)))
 
 
 def patient(name: str) -> SimpleNamespace:

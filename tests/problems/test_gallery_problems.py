@@ -222,22 +222,6 @@ def test_sub_steps_follow_the_bristles():
     assert abs(now[0] - state[end, 0]) < 0.01 * rms(name, controller)
 
 
-@pytest.mark.slow
-def test_an_explicit_stage_of_10_ms_diverges_and_review_says_so():
-    """The exact model's bristles move at 1 000 per second: without sub-steps no plan has digits, which is refused."""
-    fine = task("stick_slip")
-    exact = {"RHC exact model": fine.controllers["RHC exact model"]}
-    coarse = replace(fine.problem, horizon=replace(fine.problem.horizon, discretisation=fp.RungeKutta4()))
-    answered = {
-        what: [a.verdict.value for a in fp.review(problem, exact, mismatch=0.0, seed=0).controllers["RHC exact model"]]
-        for what, problem in (("coarse", coarse), ("fine", fine.problem))
-    }
-    assert "no" in answered["coarse"]
-    assert "no" not in answered["fine"]
-    with pytest.raises(fp.FpirhcError, match=r"multiplies a motion by 291 in a stage.*Collocation"):
-        fp.simulate(coarse, exact["RHC exact model"], seed=0)
-
-
 # Tumour
 
 
@@ -263,16 +247,6 @@ def test_a_dose_of_a_c_over_b_holds_the_tumour():
     assert float(hold) == pytest.approx(6.485, abs=1e-3)
     grown = solve_ivp(rate_of(plant, 0.0), (0, 20), [np.log(2000.0), 0.27], rtol=1e-9).y[0, -1]
     assert np.exp(grown) == pytest.approx(4.43e5, rel=5e-3)
-
-
-@pytest.mark.parametrize("name", ["tumour", pytest.param("tumour_daily", marks=pytest.mark.slow)])
-def test_doses_are_never_negative(name):
-    """Whatever the controller asks for; and the largest dose is used at the start."""
-    for controller in task(name).controllers:
-        doses = run_of(name, controller)["command.dose"]
-        assert doses.min() >= 0.0
-        assert doses.max() <= 20.0
-    assert run_of(name, "RHC")["command.dose"].max() == pytest.approx(20.0)
 
 
 # Turbojet
@@ -324,28 +298,6 @@ def test_the_form_that_comes_first_is_as_good_as_the_published_one(name):
     assert isinstance(task(name).controllers[SAFE].deformation, fp.ModelReferenced)
     assert list(task(name).controllers).index(SAFE) < list(task(name).controllers).index("RHC+FPI")
     assert rms(name, SAFE) < 1.05 * rms(name, "RHC+FPI")
-
-
-@pytest.mark.parametrize("name", GALLERY)
-def test_limits_act_for_a_part_of_the_run(name):
-    """Some controller is at a limit of its input, and nobody who finishes well is there after the transient."""
-    problem = task(name).problem
-    [(low, high)] = problem.limits.inputs.values()
-    commands = run_of(name, "RHC+FPI")["command"][:, 0], run_of(name, "RHC")["command"][:, 0]
-    touched = [np.isclose(c, low) | np.isclose(c, high) for c in commands]
-    assert any(t.any() for t in touched)
-    assert touched[0].mean() < 0.05
-    assert problem.disturbances
-
-
-@pytest.mark.parametrize("name", GALLERY)
-def test_every_task_is_complete(name):
-    """A headline pair in the form that a right model leaves alone, ways to tune each rival that adapts, pictures, and figures."""
-    one = task(name)
-    assert one.headline == ("RHC", SAFE)
-    assert {"CTC+FPI", SAFE, "RHC+FPI", "RHC offset-free"} <= set(one.tuning)
-    assert one.pictures
-    assert "seed 0" in one.description
 
 
 # A ball on a plate

@@ -13,9 +13,7 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc import compare
 from fpirhc.errors import NotContractive
-from fpirhc.studies.comparison.verdict import Outcome
 
 
 def late_error(controller, problem=None, since=3.0):
@@ -82,7 +80,7 @@ def test_wrong_sign_is_refused():
 @pytest.fixture(scope="module")
 def comparison():
     """All shipped controllers."""
-    return compare(tasks.two_mass, seed=0)
+    return fp.compare(tasks.two_mass, seed=0)
 
 
 def rms(entry, since=2.0):
@@ -116,14 +114,14 @@ def test_real_plant_under_adaptation_moves_like_the_model(comparison):
 def test_cases_that_do_not_work_are_named(comparison):
     """Absolute effort, and a scale below the slew of the desired response: worse, with what was measured of them."""
     found = {finding.pair[1]: finding for finding in comparison.findings if finding.pair}
-    assert {found[name].outcome for name in ("RHC+FPI, absolute effort", "RHC+FPI, stiff, small S")} == {Outcome.WORSE}
+    assert {str(found[name].outcome) for name in ("RHC+FPI, absolute effort", "RHC+FPI, stiff, small S")} == {"worse"}
     assert "stands at a limit" in found["RHC+FPI, stiff, small S"].text
     assert min(found["RHC+FPI, stiff, small S"].ratios.values()) > 100
 
 
 def test_headline_is_about_the_named_pair(comparison):
     first = comparison.findings[0]
-    assert (first.pair, first.outcome) == (("RHC", "RHC+FPI"), Outcome.BETTER)
+    assert (first.pair, str(first.outcome)) == (("RHC", "RHC+FPI"), "better")
     assert first.text.startswith("RHC+FPI against RHC: better")
 
 
