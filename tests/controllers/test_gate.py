@@ -113,7 +113,7 @@ def sample(random, bad):
 
 
 def told(gated):
-    """Status of the last step; what it says of a gap is of who replays it (tests/simulation/test_replay.py)."""
+    """Status of the last step; what it says of a gap is of who replays it (tests/sensing/test_lost_samples.py)."""
     status = fp.Status(int(gated.trace()["status"][0]))
     return fp.Status.OK if status == fp.Status.SETTLING else status
 

@@ -49,6 +49,7 @@ def test_the_default_leak_damps_every_dead_time_within_the_uncertainty(form):
 
 def test_without_a_leak_one_cycle_is_too_much():
     """A tenth of the dead time is tolerated by default, at least a cycle; a triangular mean does not decay."""
+    assert form_leak(30, None) == form_leak(30, 3)  # a tenth of 30 is a little more than 3 in floating point
     assert form_leak(20, None) == form_leak(20, 2) > form_leak(1, None) == form_leak(1, 1) > form_leak(0, None) == 0
     assert iteration_radius(fp.Increment(affine(1.0), cycles=20, uncertainty=0), 21) > 1
     assert iteration_radius(fp.Paired(affine(1.0), cycles=20, uncertainty=2), 20) > 0.999
