@@ -66,7 +66,7 @@ problem = fp.Problem(
 )
 
 schedule = fp.Periodic({"cart": 1.4, "angle": 3.9})  # s
-optimiser = fp.FixedPoint(iterations=2, tolerance=1e-2)  # N
+optimiser = fp.FixedPoint()
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=10.0)  # scale in m/s^2 or rad/s^2
 
 

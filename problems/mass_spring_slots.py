@@ -57,7 +57,7 @@ problem = fp.Problem(
 )
 
 schedule = fp.Periodic({"q2": 1.0, "q1": 3.0})  # s
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # N
+optimiser = fp.FixedPoint()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=100.0)  # scale in m/s^2 or m/s^4
 
 

@@ -59,7 +59,7 @@ problem = fp.Problem(
 )
 
 schedule = fp.Periodic({"h2": 80.0, "h1": 40.0})  # s
-optimiser = fp.FixedPoint(iterations=2, tolerance=1e-3)  # l/s
+optimiser = fp.FixedPoint()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0)  # scale in dm/s or dm/s^2
 
 
