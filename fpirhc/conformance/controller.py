@@ -89,7 +89,7 @@ def desired_response_is_deformed(trial: Trial, generator: np.random.Generator) -
         return
     before, missed, moved = None, 0.0, 0.0
     for k, cycle in enumerate(Replay(trial.problem, probe, trial.run).cycles()):
-        free = cycle["clipped"][0] == 0 and k > trial.problem.longest_warm_up
+        free = cycle["clipped"][0] == 0 and k > trial.problem.warm_up_cycles
         if free and before is not None:
             expected = before - gain * (trial.run["realised"][k] - cycle["desired"])
             size = 1 + np.abs(expected).max()
@@ -120,7 +120,7 @@ def learning_remembers(trial: Trial, generator: np.random.Generator) -> None:  #
         plain = _with_deformation(trial, Identity()) or plain
     replay = Replay(trial.problem, plain, trial.run)
     memories = [cycle.memory for cycle in replay.cycles()]
-    begin = min(int(np.ceil(trial.problem.longest_warm_up)) + 2, len(memories) - 1)
+    begin = min(int(np.ceil(trial.problem.warm_up_cycles)) + 2, len(memories) - 1)
     early, late = (replay.cycle(begin, memories[k])["command"] for k in (begin, -1))
     hold(
         not np.array_equal(early, late),
@@ -157,7 +157,7 @@ def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  
     law = tracking_law(ready)
     if law is None or ready.planner is not None or ready.feeds:
         return
-    k = min(int(np.ceil(trial.problem.longest_warm_up)) + 2, trial.run.cycles - 1)
+    k = min(int(np.ceil(trial.problem.warm_up_cycles)) + 2, trial.run.cycles - 1)
     replay = Replay(trial.problem, ready, trial.run)
     memory = [cycle.memory for cycle, _ in zip(replay.cycles(), range(k), strict=False)][-1]
     on = replay.cycle(k, memory)["reference"]

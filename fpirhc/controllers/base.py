@@ -116,7 +116,7 @@ def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[
     `judged` are solver statuses.
     """
     delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
-    return [_limit_block(problem), _judge_block(judged), warm_up_block(problem.longest_warm_up)], delays
+    return [_limit_block(problem), _judge_block(judged), warm_up_block(problem.warm_up_cycles)], delays
 
 
 def warm_up_block(warm_up_cycles: float) -> Block:

@@ -309,21 +309,16 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
     lags, inputs = problem.moves.lag, tuple(problem.plant.inputs)
     times = problem.dead_time.inputs
     known = {
-        "cycles": [nominal(times.get(name, 0.0)) / problem.period for name in inputs],
+        "cycles": [times.get(name, 0.0) / problem.period for name in inputs],
         "lag": [lags.get(name, 0.0) for name in inputs],
     }
     left_open = [
         f.name for f in fields(deformation) if f.metadata.get("of_problem") and getattr(deformation, f.name) is None
     ]
     square = len(inputs) == len(problem.plant.controlled_names)
-    longest = [problem.dead_time.longest[name] / problem.period for name in inputs if name in problem.dead_time.longest]
-    # a dead time that is live has others in a run
-    reached = {"cycles": [*known["cycles"], *longest], "lag": known["lag"]}
-    late = [name for name in left_open if max(reached[name]) >= least]
-    each = {n: square and len(inputs) > 1 and bool(len({*known[n]}) > 1 or (longest and n == "cycles")) for n in late}
+    late = [name for name in left_open if max(known[name]) >= least]
+    each = {n: square and len(inputs) > 1 and len({*known[n]}) > 1 for n in late}
     values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in late}
-    if "cycles" in values and longest and getattr(deformation, "longest", 0.0) is None:
-        values["longest"] = max(reached["cycles"])
     return replace(deformation, **values) if values else deformation
 
 

@@ -25,7 +25,7 @@ from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import ANEW, PREFIX, copied, live_number, not_live
-from fpirhc.symbolic.paths import changed_at, content_at, names_in, opened, paths_to
+from fpirhc.symbolic.paths import changed_at, content_at, entry, names_in, paths_to
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -253,8 +253,6 @@ class LiveSettings:
 def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:
     """Return the live settings of a loop, with the controller resolved."""
     every = tuple(dict.fromkeys(end for path in paths for end in _ends(problem, controller, path)))
-    of_problem = [path for path in every if _owner(problem, controller, path) is problem]
-    problem, controller = opened(problem, of_problem), opened(controller, [p for p in every if p not in of_problem])
     ready = resolved(problem, controller)
     automatic = tuple(_differences(controller, ready)) if every else ()
     return LiveSettings(problem, controller, ready, every, automatic)
@@ -270,7 +268,7 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
             raise InvalidValue(f"setting '{path}' is {content!r}: there is no limit that could change")
         return ends
     if isinstance(content, bool) or (isinstance(content, int | float) and _is_structure(owner, path)):
-        what = f"{content!r} is a whole number or a switch, or stands for one, and decides what the loop is made of"
+        what = f"{content!r} decides what the loop is made of, as whole numbers, switches and lengths of queues do"
         raise not_live([path], f"{what}; {ANEW}")
     if not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
@@ -300,12 +298,13 @@ def _farthest(accepts: Callable[[float], bool], value: float, size: float, reach
 
 
 def _is_structure(owner: object, path: str) -> bool:
-    parent, _, name = path.rpartition(".")
-    value = content_at(owner, parent) if parent else owner
-    if not is_dataclass(value):
-        return False
-    declared = {f.name: f.metadata.get("structure") for f in fields(value)}
-    return bool(declared.get(name)) or expects_whole_number(type(value), name)
+    value = owner
+    for name in path.split("."):
+        declared = {f.name: f.metadata.get("structure") for f in fields(value)} if is_dataclass(value) else {}
+        if declared and (declared.get(name) or expects_whole_number(type(value), name)):
+            return True
+        value = entry(value, name)
+    return False
 
 
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:

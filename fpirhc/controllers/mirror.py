@@ -44,7 +44,7 @@ def mirror_blocks(problem: Problem, deformation: Deformation) -> tuple[list[Bloc
 def believed_path(problem: Problem, deformation: Deformation, owner: str = "mirror") -> CommandPath:
     """Return the way of the commands to the model of a deformation; `owner` begins the names of what is remembered."""
     mirror, inputs = deformation.mirror, problem.plant.input
-    last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles, longest=mirror.longest)
+    last, waits = Signal("_command_before", inputs.elements, inputs.units), Queue(mirror.cycles)
     return CommandPath(problem, owner, last, waits, mirror.measurement, mirror.lag, counts=False)
 
 

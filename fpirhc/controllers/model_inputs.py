@@ -21,7 +21,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import ceil, larger, left_after, left_in_mean, nominal, numbers, stays
+from fpirhc.symbolic.live import left_after, left_in_mean, numbers, stays
 from fpirhc.task.dead_time import DeadTime, Queue, every
 from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
 from fpirhc.task.problem import Problem
@@ -267,7 +267,7 @@ class ResponsePairs:
         """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
         late = self.dead_time.measurement / self.problem.period
         first = self.problem.sensing.warm_up_cycles(self.problem.plant, late)
-        return larger(first, ceil(late - NONE) + 1)
+        return max(first, math.ceil(late - NONE) + 1)
 
     @property
     def late(self) -> float:
@@ -309,9 +309,6 @@ class ResponsePairs:
 
     @property
     def _commands(self) -> Queue:
-        cycles = self._cycles(self.dead_time)
-        return Queue.up_to(cycles, max(self._cycles(nominal(self.dead_time).at_longest)))
-
-    def _cycles(self, late: DeadTime) -> tuple[float, ...]:
-        waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
-        return tuple(wait / self.problem.period + self._delay for wait in waits)
+        late, names = self.dead_time, self.problem.plant.inputs
+        waits = (late.inputs.get(name, 0.0) + late.measurement for name in names)
+        return Queue(tuple(wait / self.problem.period + self._delay for wait in waits))

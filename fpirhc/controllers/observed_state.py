@@ -28,7 +28,6 @@ from fpirhc.sensing.base import Evidence, Model, StateObserver, members, slowest
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem, nominal_start
 
@@ -143,12 +142,9 @@ def sample_path(problem: Problem) -> CommandPath:
     """
     inputs, period = problem.plant.input, problem.period
     last = Signal("_commanded", inputs.elements, inputs.units, tuple(map(float, problem.inputs_before)))
-    waits = [problem.dead_time.wait(name, period) for name in inputs.elements]
-    cycles = tuple(cast(float, wait.cycles) for wait in waits)
-    rooms = [nominal(c) if wait.longest is None else wait.longest for c, wait in zip(cycles, waits, strict=True)]
-    longest = max(rooms) if any(wait.longest is not None for wait in waits) else None
+    cycles = tuple(cast(float, problem.dead_time.wait(name, period).cycles) for name in inputs.elements)
     late = problem.dead_time.measurement / period
-    return CommandPath(problem, "observer", last, Queue(cycles, longest=longest), late)
+    return CommandPath(problem, "observer", last, Queue(cycles), late)
 
 
 _INSTANTS = 25

@@ -32,7 +32,6 @@ class Mirror:
         cycles: dead time of the inputs, control cycles; a tuple gives one per input.
         measurement: dead time of the measurement, cycles.
         lag: time constant of the actuators, s; a tuple gives one per input.
-        longest: longest dead time of the inputs that a run may set, cycles; None: it is not live.
     """
 
     request: ClassVar[str] = "_modelled"  # the signal that the map is given as the request which caused the response
@@ -42,7 +41,6 @@ class Mirror:
     cycles: float | tuple[float, ...] = 0.0
     measurement: float = 0.0
     lag: float | tuple[float, ...] = 0.0
-    longest: float | None = None
 
     @property
     def bare(self) -> bool:

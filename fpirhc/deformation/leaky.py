@@ -11,7 +11,7 @@ import math
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
-from fpirhc.symbolic.live import between, ceil, larger, largest, positive, smaller, sqrt
+from fpirhc.symbolic.live import between, smaller, sqrt
 from fpirhc.task.dead_time import MOST, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
@@ -22,29 +22,20 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
     """Return the pole of a leaky pairing: `pole` itself, or for None the one that follows from the gain and the uncertainty."""
     if pole is not None:
         return pole
-    error = default_uncertainty(largest(every(cycles))) if uncertainty is None else uncertainty
+    error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
     return default_pole(between(abs(gain), 1.0, _LARGEST_PRODUCT), error)
 
 
 def default_uncertainty(cycles: float) -> float:
     """A tenth of the dead time, at least one cycle; 0 without dead time."""
-    return positive(cycles) * larger(ceil(0.1 * cycles - 1e-9), 1)
+    return max(math.ceil(0.1 * cycles - 1e-9), 1) if cycles > 0 else 0
 
 
 def default_pole(product: float, uncertainty: float) -> float:
     """The pole of the theorem and a little more, below one; 0 where the dead time is certain."""
     least = _least_pole(product, uncertainty)
     factor, amount = _BEYOND
-    return positive(uncertainty) * smaller(factor * least + amount, 0.5 * (1 + least))
-
-
-def check_longest(owner: str, longest: float | None, cycles: Cycles) -> None:
-    """Raise InvalidValue for a longest dead time that is shorter than one of the dead times, or beyond 1000 cycles."""
-    if longest is not None and not max(every(cycles)) <= longest <= MOST:
-        raise InvalidValue(
-            f"{owner}: cycles={cycles!r} with longest={longest!r}: expected a longest dead time between the dead time and {MOST} "
-            "control cycles"
-        )
+    return smaller(factor * least + amount, 0.5 * (1 + least)) if uncertainty > 0 else 0.0
 
 
 def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:

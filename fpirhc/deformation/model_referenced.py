@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, memory_of_map
-from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import nominal, stays
-from fpirhc.task.dead_time import Cycles, Queue, every, longest_of, several
+from fpirhc.symbolic.live import stays
+from fpirhc.task.dead_time import Cycles, Queue, every, several
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,6 @@ class ModelReferenced(Wrapper):
             nearly harmless, too short a lag is not, and no lag is worst. None: what an external plant states, else 0.
         uncertainty: by how many cycles the sum of the dead times may be wrong; None: the default of `Increment`.
         pole: of the leak, in [0, 1); None: from the uncertainty, as in `Increment`.
-        longest: longest dead time of the inputs that a run may set, `live=["deformation.cycles"]`; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time, lag, uncertainty or pole out of range.
@@ -41,15 +40,13 @@ class ModelReferenced(Wrapper):
 
     chooses_pair: ClassVar[bool] = True
 
-    cycles: Cycles | None = field(default=None, metadata={"of_problem": True})
+    cycles: Cycles | None = field(default=None, metadata={"of_problem": True, "structure": True})
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
     lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"of_problem": True})
     uncertainty: int | None = None
     pole: BelowOne | None = None
-    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given", "structure": True})
 
     def __post_init__(self) -> None:
-        check_longest("ModelReferenced", self.longest, self._cycles)
         check_cycles("ModelReferenced", self._cycles)
         check_cycles("ModelReferenced", self.measurement, "measurement")
         check_cycles("ModelReferenced", self._delays)
@@ -58,16 +55,11 @@ class ModelReferenced(Wrapper):
 
     @property
     def mirror(self) -> Mirror:
-        return Mirror(self._cycles, self.measurement, self._lag, self.longest)
-
-    def opened(self, paths: tuple[str, ...]) -> Self:
-        """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
-        longest = longest_of(self.longest, self._cycles, paths)
-        return self if longest is self.longest else replace(self, longest=longest)
+        return Mirror(self._cycles, self.measurement, self._lag)
 
     @property
     def iteration(self) -> Iteration:
-        longest, several_channels = max(every(nominal(self._delays))), isinstance(self._cycles, tuple)
+        longest, several_channels = max(every(self._delays)), isinstance(self._cycles, tuple)
         return replace(
             self.map.iteration,
             leak=self._leak,
@@ -113,7 +105,7 @@ class ModelReferenced(Wrapper):
 
     @property
     def _queue(self) -> Queue:
-        return Queue(self._delays, longest=None if self.longest is None else self.longest + self.measurement)
+        return Queue(self._delays)
 
 
 def require_map_of_plan(owner: str, deformation: Deformation) -> None:

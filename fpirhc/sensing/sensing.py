@@ -7,6 +7,7 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -22,7 +23,7 @@ from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObser
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.live import ceil, expressed, stays
+from fpirhc.symbolic.live import expressed, stays
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.disturbance import Disturbance
 
@@ -187,7 +188,7 @@ class Sensing(Checked):
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
-        return ceil(late) + max(self.estimator.fills(plant.chains[name]) for name in plant.controlled_names)
+        return math.ceil(late) + max(self.estimator.fills(plant.chains[name]) for name in plant.controlled_names)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:

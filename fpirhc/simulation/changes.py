@@ -13,7 +13,6 @@ from fpirhc.errors import InvalidField, InvalidValue, NotSupported
 from fpirhc.fields.kinds import described, finite_number, named_entries
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.live import PREFIX
-from fpirhc.symbolic.paths import opened
 from fpirhc.task.problem import Problem
 
 Changes = Mapping[float, Numbers]  # by time, s
@@ -41,13 +40,7 @@ def in_force(
     _check_times(changes)
     if not (live.paths or settings or changes):
         return InForce(problem, live.controller, {}, (), ())
-    problem = opened(problem, live.of_problem)
     first = replace(live, problem=problem)
-    if problem.dead_time.longest != live.problem.dead_time.longest:
-        raise InvalidValue(
-            f"the loop is built for longest={dict(live.problem.dead_time.longest)} of its dead times; the variant states "
-            f"longest={dict(problem.dead_time.longest)}"
-        )
     if not settings and not changes:  # a variant of the problem runs as it does without live settings
         numbers = first.start
         return InForce(problem, live.controller, numbers, (), [(0.0, numbers)])

@@ -61,10 +61,10 @@ def _forgets(problem: Problem) -> int:
     """Number of samples on a line after which an estimate no longer shows what was before them."""
     plant, estimator, period = problem.plant, problem.sensing.estimator, problem.period
     late = problem.dead_time
-    queued = max((*late.inputs.values(), *late.longest.values(), 0.0)) / period
+    queued = max(late.inputs.values(), default=0.0) / period
     weights = [np.cumsum(estimator.weights(plant.chains[name], period)) for name in plant.controlled_names]
     longest = max(int(np.argmax(w >= w[-1] - _FORGOTTEN)) + 1 for w in weights)
-    return math.ceil(problem.longest_warm_up + queued) + longest
+    return math.ceil(problem.warm_up_cycles + queued) + longest
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ import operator
 from abc import ABC
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from functools import reduce
 from types import FunctionType
 from typing import NoReturn, TypeVar, cast
 from weakref import WeakValueDictionary
@@ -365,7 +364,7 @@ def _of_any(number: Callable[[float], float], expression: Callable[..., object])
 
 tanh, atanh, asin = _of_any(math.tanh, ca.tanh), _of_any(math.atanh, ca.atanh), _of_any(math.asin, ca.asin)
 exp, cos, sqrt = _of_any(math.exp, ca.exp), _of_any(math.cos, ca.cos), _of_any(math.sqrt, ca.sqrt)
-ceil, rounded = _of_any(math.ceil, ca.ceil), _of_any(round, _nearest_even)
+rounded = _of_any(round, _nearest_even)
 
 
 def signed(size: float, sign: float) -> float:
@@ -411,16 +410,6 @@ def smaller(x: float, y: float) -> float:
 def larger(x: float, y: float) -> float:
     """Return the larger of two numbers, live or not."""
     return _of_both(x, y, max, ca.fmax)
-
-
-def largest(values: Iterable[float]) -> float:
-    """Return the largest of some numbers, live or not."""
-    return reduce(larger, values)
-
-
-def positive(x: float) -> float:
-    """Return 1 for a positive number, live or not, and 0 for another one."""
-    return x.called(lambda v: float(v > 0), lambda v: v > 0) if isinstance(x, LiveNumber) else float(x > 0)
 
 
 def stays(x: float, value: float) -> bool:

@@ -66,21 +66,6 @@ def paths_to(name: str, value: object, depth: int = 4) -> Iterator[str]:
             yield from (f"{one}.{rest}" for rest in paths_to(name, entry(value, one), depth - 1))
 
 
-def opened(value: T, paths: Sequence[str]) -> T:
-    """Return a value whose numbers at some paths are to become live, with what its structure needs for that.
-
-    A part that has a structure says so in a method `opened(paths)`, which returns the part, changed where it must be: a queue, for
-    example, gets room for longer dead times.
-    """
-    for name in dict.fromkeys(path.partition(".")[0] for path in paths if "." in path):
-        inside = [path.partition(".")[2] for path in paths if path.startswith(f"{name}.")]
-        part = entry(value, name)
-        content = opened(part, inside)
-        if content is not part:
-            value = changed_at(value, name, content)
-    return cast(T, value.opened(tuple(paths))) if hasattr(value, "opened") else value
-
-
 def validated(value: object, changes: Mapping[str, object]) -> object:
     """Return a dataclass with other contents of some fields, checked as a new one is."""
     return replace(value, **changes)  # type: ignore[type-var]  # only dataclasses have fields

@@ -19,7 +19,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import LiveNumber, ceil, entry_at, expressed, is_live, live_numbers, nominal, not_live
+from fpirhc.symbolic.live import entry_at
 
 MEASUREMENT = "measurement"  # the name beside those of the inputs
 
@@ -36,16 +36,13 @@ class DeadTime(Checked):
         measurement: dead time of the state and the response. At first the queue holds the start.
         before: commands that are on their way at the start, by input. `Problem(input_before=...)` says the
             same, and also serves problems without dead time.
-        longest: longest dead time, by input or "measurement", that a run may set; there is then a queue even where the dead time is
-            zero. Twice the dead time where it is not named.
         outside: the part of `inputs` that an external plant has itself, so that it is not simulated. `Problem` fills it in from
             `ExternalPlant(dead_time=...)`.
     """
 
-    inputs: Mapping[str, NotNegative] = field(default_factory=dict)
-    measurement: NotNegative = 0.0
+    inputs: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"structure": True})
+    measurement: NotNegative = field(default=0.0, metadata={"structure": True})
     before: Mapping[str, Finite] = field(default_factory=dict)
-    longest: Mapping[str, float] = field(default_factory=dict, metadata={"setting": "where given"})
     outside: Mapping[str, float] = field(default_factory=dict, kw_only=True, repr=False, metadata={"setting": False})
 
     @cached_property
@@ -53,10 +50,7 @@ class DeadTime(Checked):
         """The dead time that a run adds: all but the part that the external plant has."""
         if not self.outside:
             return self
-        inputs, longest = (
-            {n: time - self.outside.get(n, 0.0) for n, time in times.items()} for times in (self.inputs, self.longest)
-        )
-        return replace(self, inputs=inputs, longest={n: t for n, t in longest.items() if t > 0}, outside={})
+        return replace(self, inputs={n: time - self.outside.get(n, 0.0) for n, time in self.inputs.items()}, outside={})
 
     @cached_property
     def all_simulated(self) -> DeadTime:
@@ -87,37 +81,22 @@ class DeadTime(Checked):
     def over(self, period: float) -> DeadTime:
         """Return it without dead times that are below the rounding of a cycle, as .3 - .1 - .2 is."""
         least = _WHOLE * period
-        small = [n for n, late in self.inputs.items() if 0 < nominal(late) < least and not is_live(late)]
-        measurement = (
-            0.0 if 0 < nominal(self.measurement) < least and not is_live(self.measurement) else self.measurement
-        )
-        if not small and measurement is self.measurement:
+        inputs = {n: late for n, late in self.inputs.items() if not 0 < late < least}
+        measurement = 0.0 if 0 < self.measurement < least else self.measurement
+        if len(inputs) == len(self.inputs) and measurement is self.measurement:
             return self
-        return replace(self, inputs={n: v for n, v in self.inputs.items() if n not in small}, measurement=measurement)
+        return replace(self, inputs=inputs, measurement=measurement)
 
     @property
     def queued(self) -> tuple[str, ...]:
         """Names of the inputs that wait in a queue, and "measurement" where measurements do."""
         late = {**self.inputs, MEASUREMENT: self.measurement}
-        return tuple(n for n in dict.fromkeys((*late, *self.longest)) if n in self.longest or nominal(late[n]))
-
-    @property
-    def at_longest(self) -> DeadTime:
-        """The dead time with the longest numbers that a run may set."""
-        inputs = {n: self.longest.get(n, late) for n, late in self.inputs.items()}
-        return replace(self, inputs=inputs, measurement=self.longest.get(MEASUREMENT, self.measurement))
-
-    def opened(self, paths: tuple[str, ...]) -> DeadTime:
-        """Return it with queues of twice the dead time where one becomes live and no longest one is stated; none for zero."""
-        late = {**self.inputs, MEASUREMENT: self.measurement}
-        names = [path.removeprefix("inputs.") for path in paths]
-        more = {n: room(late[n]) for n in names if late.get(n) and n not in self.longest}
-        return replace(self, longest={**self.longest, **more}) if more else self
+        return tuple(n for n in late if late[n])
 
     def wait(self, name: str, period: float) -> Queue:
         """Return the queue in which commands of an input, or measurements, wait."""
         late = self.measurement if name == MEASUREMENT else self.inputs.get(name, 0.0)
-        return Queue(late / period, longest=self.longest[name] / period if name in self.longest else None)
+        return Queue(late / period)
 
     def measurement_wait(self, period: float) -> Queue | None:
         """Return how long measurements wait; None where there is no queue."""
@@ -132,26 +111,18 @@ class DeadTime(Checked):
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
-        mistakes.unknown("longest: input or measurement", self.longest, (*plant.inputs, MEASUREMENT))
         for name, least in self.outside.items():
-            if nominal(self.inputs.get(name, 0.0)) < least - _WHOLE * period:
+            if self.inputs.get(name, 0.0) < least - _WHOLE * period:
                 mistakes.add(
-                    f"'{name}' is {nominal(self.inputs.get(name, 0.0)):g} {unit}, less than the {least:g} {unit} that the external "
+                    f"'{name}' is {self.inputs.get(name, 0.0):g} {unit}, less than the {least:g} {unit} that the external "
                     "plant states; state less there, ExternalPlant(dead_time=...)"
                 )
-        for name, value in nominal({**self.inputs, MEASUREMENT: self.measurement}).items():
+        for name, value in {**self.inputs, MEASUREMENT: self.measurement}.items():
             if value > MOST * period:
                 mistakes.add(
                     f"'{name}' is {value:g} {unit}, more than {MOST} control cycles of {period:g} {unit}; "
                     "use a longer period for the run"
                 )
-            elif value > self.longest.get(name, value):
-                mistakes.add(
-                    f"'{name}' is {value:g} {unit}, longer than its stated longest={{'{name}': {self.longest[name]:g}}}"
-                )
-        for name, value in self.longest.items():
-            if not 0 < value <= MOST * period:
-                mistakes.add(f"longest: '{name}' must be from above 0 to {MOST} control cycles, got {value!r} {unit}")
         mistakes.raise_if_any()
 
 
@@ -195,47 +166,23 @@ class Queue:
 
     A delay of (d + phi) control cycles, 0 <= phi < 1, is the mean over the cycle of the delayed, held value,
 
-        (1 - phi) u_{k-d} + phi u_{k-d-1}.        A delay may be live up to `longest`: the place in the queue is then data.
+        (1 - phi) u_{k-d} + phi u_{k-d-1}.
 
     The column of past values holds the newest value of every entry first, then the values of the cycle before, and so on.
     """
 
     cycles: Cycles  # delay of all entries, or a tuple with one per entry
     width: int = 0  # of the triangular mean around the delay, cycles to either side
-    longest: float | None = None  # longest delay that a run may set, cycles; None: no delay is live
-
-    @classmethod
-    def up_to(cls, cycles: Cycles, longest: float) -> Queue:
-        """Return the queue with room for the longest delay where one is live, and else for the delays themselves."""
-        return cls(cycles, longest=longest if is_live(cycles) else None)
-
-    @property
-    def live(self) -> bool:
-        """Whether a delay is data of a run."""
-        return is_live(self.cycles)
 
     @property
     def length(self) -> int:
         """Number of cycles that are remembered, the newest included."""
-        if self.longest is not None:
-            return math.ceil(self.longest - _WHOLE) + self.width + 1
-        for path in live_numbers(self.cycles):
-            raise not_live(
-                [path], "it is the length of a queue; state it as longest=...", " here without its longest value"
-            )
-        return self._reach(nominal(self.cycles))
+        return max(max(self._shares(c)) for c in every(self.cycles)) + 1
 
     def later(self, cycles: int) -> Queue:
         """Return the queue with every delay longer by whole cycles."""
         delays = tuple(c + cycles for c in self.cycles) if isinstance(self.cycles, tuple) else self.cycles + cycles
-        return Queue(delays, self.width, None if self.longest is None else self.longest + cycles)
-
-    def needed(self, beside: Expression) -> Expression | int:
-        """Return how many of them the delays reach back to; `beside` is an expression of the same kind."""
-        if not self.live:
-            return self._reach(nominal(self.cycles))
-        ends = [expressed(ceil(c), beside) for c in every(self.cycles)]
-        return ca.mmax(ca.vertcat(*ends)) + self.width + 1
+        return Queue(delays, self.width)
 
     def pushed(self, queue: Expression, newest: Expression) -> Expression:
         """Return the column one cycle later."""
@@ -262,21 +209,17 @@ class Queue:
 
     def delayed(self, queue: Expression, size: int) -> Expression:
         """Return what was pushed `cycles` ago, entry by entry; `size` is the number of entries."""
-        if self.live:
-            each = every(self.cycles) * (1 if isinstance(self.cycles, tuple) else size)
-            return ca.vertcat(*(self._read(queue[j::size], c) for j, c in enumerate(each)))
-        cycles = nominal(self.cycles)
-        if not isinstance(cycles, tuple):
-            shares = self._shares(cycles)
+        if not isinstance(self.cycles, tuple):
+            shares = self._shares(self.cycles)
             return total(share * queue[size * k : size * (k + 1)] for k, share in shares.items())
-        channels = [self._shares(c) for c in cycles]
+        channels = [self._shares(c) for c in self.cycles]
         entries = (
             total(share * queue[size * k + j] for k, share in shares.items()) for j, shares in enumerate(channels)
         )
         return ca.vertcat(*entries)
 
     def at(self, queue: Expression, size: int, cycles: Expression) -> Expression:
-        """Return what was pushed so many cycles ago, all entries alike; the number is known at run time, up to the longest."""
+        """Return what was pushed so many cycles ago, all entries alike; the number is known at run time."""
         return ca.vertcat(*(self._read(queue[j::size], cycles) for j in range(size)))
 
     def driven(
@@ -289,33 +232,18 @@ class Queue:
             queue: the past values; those that entered less than `cycles` ago are on their way.
         """
         assert not isinstance(self.cycles, tuple)
-        longest = int(nominal(self.cycles)) if not self.live else self.length - 1
+        longest = int(self.cycles)
         if not longest:
             return state
         columns = ca.horzcat(*(queue[size * k : size * (k + 1)] for k in reversed(range(longest))))
         repeated = (ca.repmat(v, 1, longest) for v in held)
-        if not self.live:
-            return step.mapaccum("fpirhc_driven", longest)(state, columns, *repeated)[:, -1]
-        # Where fewer values are on their way than the queue holds, the first steps leave the state as it is.
-        x, u, due = ca.SX.sym("x", state.numel()), ca.SX.sym("u", size), ca.SX.sym("due")
-        same = [ca.SX.sym(f"held{k}", v.numel()) for k, v in enumerate(held)]
-        one = ca.Function("fpirhc_due", [x, u, *same, due], [ca.if_else(due, step(x, u, *same), x)])
-        acts = expressed(self.cycles, state) > ca.DM(list(reversed(range(longest)))).T
-        return one.mapaccum("fpirhc_driven", longest)(state, columns, *repeated, acts)[:, -1]
+        return step.mapaccum("fpirhc_driven", longest)(state, columns, *repeated)[:, -1]
 
-    def _reach(self, cycles: Cycles) -> int:
-        return max(max(self._shares(c)) for c in every(cycles)) + 1
-
-    def _read(self, past: Expression, cycles: float | Expression) -> Expression:
-        """What was pushed a live number of cycles ago: the sum of `_shares`, in the same operations."""
-        delay = expressed(cycles, past) if isinstance(cycles, float | int | LiveNumber) else cycles
-        whole = ca.floor(delay + _WHOLE)
-        part = ca.if_else(whole < ca.ceil(delay - _WHOLE), ca.fmax(delay - whole, 0), 0)
-        heights = [self._height(j) for j in range(-self.width, self.width + 1)]
-        shares = [
-            before * part + own * (1 - part) for before, own in zip([0.0, *heights], [*heights, 0.0], strict=True)
-        ]
-        return total(share * entry_at(past, whole + k - self.width) for k, share in enumerate(shares))
+    def _read(self, past: Expression, cycles: Expression) -> Expression:
+        """What was pushed a number of cycles ago that is known at run time, interpolated."""
+        whole = ca.floor(cycles + _WHOLE)
+        part = ca.if_else(whole < ca.ceil(cycles - _WHOLE), ca.fmax(cycles - whole, 0), 0)
+        return entry_at(past, whole) * (1 - part) + entry_at(past, whole + 1) * part
 
     def _height(self, j: int) -> float:
         """Of the triangle, `j` cycles from its middle."""
@@ -332,17 +260,6 @@ class Queue:
                 if share > 0:
                     shares[place] = shares.get(place, 0.0) + share
         return shares
-
-
-def room(delay: float) -> float:
-    """Return the longest delay that a run may set where none is stated: twice the delay of the build."""
-    return 2 * delay
-
-
-def longest_of(longest: float | None, cycles: Cycles, paths: Sequence[str]) -> float | None:
-    """Return the longest delay of a queue whose `cycles` may become live: the stated one, or else twice the delay."""
-    live = any(path.startswith("cycles") for path in paths)
-    return max(1.0, room(max(every(cycles)))) if live and longest is None else longest
 
 
 def every(cycles: Cycles) -> tuple[float, ...]:

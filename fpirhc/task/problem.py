@@ -402,12 +402,6 @@ class Problem(Checked):
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
         return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
 
-    @property
-    def longest_warm_up(self) -> float:
-        """The same with the longest dead time that a run may set."""
-        late = max(nominal(self.dead_time.measurement), self.dead_time.longest.get(MEASUREMENT, 0.0))
-        return self.sensing.warm_up_cycles(self.plant, late / self.period)
-
 
 def _check_times(problem: Problem, mistakes: Mistakes) -> None:
     unit = problem.time_unit

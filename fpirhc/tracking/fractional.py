@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import casadi as ca
@@ -64,10 +64,6 @@ class Fractional(IntegralLaw):
             raise InvalidValue(
                 f"Fractional(memory={self.memory!r}): expected at least 1 / rate = {1 / self.rate:.4g}; 20 / rate is usual"
             )
-
-    def opened(self, paths: tuple[str, ...]) -> Fractional:
-        """Return it with its memory stated, where a rate that becomes live would change its length."""
-        return replace(self, memory=_REACH / self.rate) if "rate" in paths and self.memory is None else self
 
     def cycles(self, period: float) -> int:
         """Length L of the memory in control cycles.

@@ -271,7 +271,7 @@ problem = fp.Problem(
     start={"bis": 92.0},
     period=CYCLE,
     duration=60.0,
-    dead_time=fp.DeadTime(inputs={"target": 0.65}, longest={"target": 2.6}),
+    dead_time=fp.DeadTime(inputs={"target": 0.65}),
     limits=fp.Limits(inputs={"target": (LEAST, MOST)}),
     input_before={"target": LEAST},
     signals={"surgery": fp.Unknown(surgery)},

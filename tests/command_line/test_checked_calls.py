@@ -76,7 +76,6 @@ def test_signatures_of_classes_show_their_arguments():
     """Notebooks and editors ask for them; the check of the arguments does not hide them."""
     assert list(inspect.signature(fp.Affine).parameters) == ["gain", "weights"]
     increment = inspect.signature(fp.Increment).parameters
-    assert list(increment) == ["map", "cycles", "uncertainty", "pole", "longest"]
-    assert increment["longest"].kind is inspect.Parameter.KEYWORD_ONLY
+    assert list(increment) == ["map", "cycles", "uncertainty", "pole"]
     assert increment["cycles"].default is inspect.Parameter.empty
     assert increment["pole"].default is None

@@ -17,7 +17,7 @@ from fpirhc.errors import FpirhcError, InvalidValue
 
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=50.0)
 TRACKING = fp.Exponential(rate=8.0)
-STRUCTURE = "decides what the loop is made of", "does not use it", "which is the length of a queue"
+STRUCTURE = "decides what the loop is made of", "does not use it"
 WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}, "deviation": {"Fa": 1e-3, "Fb": 1e-3}}
 
 

@@ -197,7 +197,6 @@ def compare_curves(page: Any, data: Any) -> None:
     ("name", "path", "factor"),
     [
         ("crane_slots", "setpoints.cart.0", 0.5),
-        ("anaesthesia_people", "dead_time.inputs.target", 2.0),
         ("turbojet", "approximate.B_T", 0.625),  # with another first plan the error would be 20 % larger
         ("two_mass", "reference.scale", 0.5),
         ("fishery", "reference.scale", 3.9),  # with another scale of the plans 1e-8

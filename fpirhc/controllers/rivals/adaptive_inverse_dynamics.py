@@ -22,8 +22,8 @@ from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import following, live_numbers, nominal, settled
-from fpirhc.task.dead_time import Queue, room
+from fpirhc.symbolic.live import following, live_numbers, settled
+from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
@@ -144,9 +144,9 @@ _EARLIER = "_target_earlier"
 def _earlier_targets(problem: Problem) -> Block:
     """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
     plant, period, pairs = problem.plant, problem.period, ResponsePairs(problem, problem.dead_time)
-    late = nominal(problem.dead_time.at_longest)
+    late = problem.dead_time
     whole = late.measurement + max(late.inputs.values(), default=0.0)
-    queue = Queue(0.0, longest=room(whole) / period + problem.sensing.delay(plant, period))
+    queue = Queue(2 * whole / period + problem.sensing.delay(plant, period))
     target, time = like(plant.output, "_target"), time_signal(plant)
     first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
     memory = queue.memory("targets", target.elements, tuple(map(float, first)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
@@ -52,7 +53,7 @@ from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.live import ceil, exp, signed, stays
+from fpirhc.symbolic.live import exp, signed, stays
 from fpirhc.task.problem import Problem
 
 
@@ -265,7 +266,7 @@ def _usable_from(problem: Problem, one: Channel, measurement: float) -> float:
     """Number of the first cycle whose y^(r) is of samples of this run; `measurement` is its dead time."""
     if reads_equations(problem):
         return 1
-    plant, estimator, late = problem.plant, problem.sensing.estimator, ceil(measurement / problem.period)
+    plant, estimator, late = problem.plant, problem.sensing.estimator, math.ceil(measurement / problem.period)
     chain, name = one.chain, one.slot.coordinate
     if not one.differences:
         return 1 if estimator.measures_all else late + estimator.fills(chain.order)
@@ -275,8 +276,8 @@ def _usable_from(problem: Problem, one: Channel, measurement: float) -> float:
 
 def _count_block(problem: Problem, channels: Sequence[Channel]) -> Block:
     """Block that counts the cycles until every y^(r) may be used."""
-    late = problem.dead_time.at_longest.measurement
-    return warm_up_block(max(live.nominal(_usable_from(problem, c, late)) for c in channels))
+    late = problem.dead_time.measurement
+    return warm_up_block(max(_usable_from(problem, c, late) for c in channels))
 
 
 def _mirror(problem: Problem, one: Channel, name: str) -> Block:

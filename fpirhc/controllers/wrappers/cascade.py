@@ -28,7 +28,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay
 from fpirhc.symbolic.expression import Signals, expression, is_finite, kind
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import largest, nominal
 from fpirhc.task.dead_time import MOST, DeadTime, Queue, every
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Reference, Steps
@@ -139,7 +138,7 @@ class ThroughModel(Checked):
     plain: bool = field(default=False, metadata={"setting": "where given", "structure": True})
 
     def _late(self, late: DeadTime) -> float:
-        return largest((0.0, *late.inputs.values())) + late.measurement if self.dead_time is None else self.dead_time
+        return max((0.0, *late.inputs.values())) + late.measurement if self.dead_time is None else self.dead_time
 
     def decays(self, problem: Problem) -> np.ndarray:
         """Return rho of every controlled coordinate.
@@ -164,9 +163,9 @@ class ThroughModel(Checked):
         """
         late = problem.dead_time
         cycles = self._late(late) / problem.period
-        if (now := nominal(cycles)) > MOST:
-            raise InvalidValue(f"{self!r}: {now:g} cycles of dead time, more than {MOST}")
-        return Queue.up_to(cycles, self._late(nominal(late).at_longest) / problem.period)
+        if cycles > MOST:
+            raise InvalidValue(f"{self!r}: {cycles:g} cycles of dead time, more than {MOST}")
+        return Queue(cycles)
 
     def memory(self, problem: Problem, first: np.ndarray, away: np.ndarray) -> tuple[Signal, ...]:
         """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start.

@@ -29,8 +29,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import expressed, nominal, rounded
-from fpirhc.task.dead_time import MOST, DeadTime, Queue, room
+from fpirhc.symbolic.live import expressed
+from fpirhc.task.dead_time import MOST, DeadTime, Queue
 from fpirhc.task.problem import Problem
 
 
@@ -153,24 +153,16 @@ class Predicted(ControllerWrapper):
         inputs: dead time of all inputs, one number, s; the sum of both dead times is rounded to control cycles.
         measurement: dead time of the measurement, s.
         by: how the state is predicted.
-        longest: the longest sum of both dead times that a run may set, s, `live=["inputs"]`; None: twice the sum.
 
     Raises:
-        InvalidValue: a dead time that is negative or not finite; a longest one that is shorter than their sum.
+        InvalidValue: a dead time that is negative or not finite.
     """
 
     once: ClassVar[bool] = True
 
-    inputs: NotNegative
-    measurement: NotNegative = 0.0
+    inputs: NotNegative = field(metadata={"structure": True})
+    measurement: NotNegative = field(default=0.0, metadata={"structure": True})
     by: Predictor = field(default_factory=ByModel)
-    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-
-    def __post_init__(self) -> None:
-        if self.longest is not None and not self.inputs + self.measurement <= self.longest < np.inf:
-            raise InvalidValue(
-                f"Predicted(longest={self.longest!r}): expected at least {self.inputs + self.measurement:g} s, the dead time"
-            )
 
     @property
     def feeds(self) -> Mapping[str, str]:
@@ -179,7 +171,7 @@ class Predicted(ControllerWrapper):
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         notes = self.controller.notes(problem)
-        cycles = nominal(self)._queue(problem).cycles
+        cycles = self._queue(problem).cycles
         if not given_signals(problem) or not cycles:
             return notes
         late = f"{cast(float, cycles) * problem.period:g} {problem.time_unit}"
@@ -221,16 +213,9 @@ class Predicted(ControllerWrapper):
         predict = _predict_block(problem, self, self._queue(problem), before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
-    def opened(self, paths: tuple[str, ...]) -> Predicted:
-        """Return it with a queue of twice the dead time where a dead time becomes live and no longest one is stated."""
-        if self.longest is not None or not {"inputs", "measurement"} & set(paths):
-            return self
-        return replace(self, longest=room(self.inputs + self.measurement))
-
     def _queue(self, problem: Problem) -> Queue:
         """The values that are on their way; as many as the cycles over which the state is predicted."""
-        longest = None if self.longest is None else round(self.longest / problem.period)
-        return Queue(rounded((self.inputs + self.measurement) / problem.period), longest=longest)
+        return Queue(float(round((self.inputs + self.measurement) / problem.period)))
 
     def _length(self, problem: Problem) -> int:
         """Most cycles over which the state may be predicted."""

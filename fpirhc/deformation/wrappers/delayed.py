@@ -9,17 +9,17 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, memory_of_map
-from fpirhc.deformation.leaky import check_cycles, check_longest, check_uncertainty, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.live import largest, stays
-from fpirhc.task.dead_time import MOST, Cycles, Queue, every, longest_of, several
+from fpirhc.symbolic.live import stays
+from fpirhc.task.dead_time import MOST, Cycles, Queue, every, several
 
 __all__ = ["MOST", "Increment", "Paired"]
 
@@ -38,7 +38,6 @@ class _Queued(Wrapper):
     Args:
         cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
             controlled coordinate its own.
-        longest: longest dead time that a run may set, `live=["deformation.cycles"]`; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
@@ -46,20 +45,14 @@ class _Queued(Wrapper):
 
     chooses_pair: ClassVar[bool] = True
 
-    cycles: Cycles
-    longest: float | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    cycles: Cycles = field(metadata={"structure": True})
 
     @property
     def iteration(self) -> Iteration:
         """That of the map, on the pairs of the believed dead time, the longest of several."""
-        pairing = Pairing(largest(every(self.cycles)), channels=several(self.cycles))
+        pairing = Pairing(max(every(self.cycles)), channels=several(self.cycles))
         channels = len(every(self.cycles)) if several(self.cycles) else self.map.iteration.channels
         return replace(self.map.iteration, pairing=pairing, channels=channels)
-
-    def opened(self, paths: tuple[str, ...]) -> Self:
-        """Return it with queues of twice the dead time where that becomes live and no longest one is stated."""
-        longest = longest_of(self.longest, self.cycles, paths)
-        return self if longest is self.longest else replace(self, longest=longest)
 
     @property
     @abstractmethod
@@ -80,7 +73,7 @@ class _Queued(Wrapper):
         desired_then = ca.if_else(first, request, memory["queue_now"])
         past_requests = queue.pushed(memory["queue_requests"], request)
         past_desired = queue.pushed(memory["queue_desired"], desired_then)
-        valid = memory["queue_filled"] >= queue.needed(memory["queue_filled"]) - 1
+        valid = memory["queue_filled"] >= queue.length - 1
         next_request, next_memory = self._request(_Past(past_requests, past_desired), response, desired, inner)
         remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
         filled = ca.fmin(memory["queue_filled"] + 1, queue.length)
@@ -107,7 +100,6 @@ class Paired(_Queued):
         map: any deformation that iterates.
         cycles: dead time d, or one for every controlled coordinate.
         uncertainty: half width of the triangular mean over the requests around the pair, whole cycles, at most d.
-        longest: longest dead time that a run may set; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
@@ -117,7 +109,6 @@ class Paired(_Queued):
 
     def __post_init__(self) -> None:
         check_cycles("Paired", self.cycles)
-        check_longest("Paired", self.longest, self.cycles)
         check_uncertainty("Paired", self.uncertainty, self.cycles)
         if self.uncertainty > min(every(self.cycles)):
             raise InvalidValue(
@@ -128,12 +119,12 @@ class Paired(_Queued):
     @property
     def iteration(self) -> Iteration:
         return replace(
-            super().iteration, pairing=Pairing(largest(every(self.cycles)), self.uncertainty, several(self.cycles))
+            super().iteration, pairing=Pairing(max(every(self.cycles)), self.uncertainty, several(self.cycles))
         )
 
     @property
     def _queue(self) -> Queue:
-        return Queue(self.cycles, self.uncertainty, self.longest)
+        return Queue(self.cycles, self.uncertainty)
 
     def _request(
         self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
@@ -151,7 +142,6 @@ class Increment(_Queued):
         uncertainty: m, by how many cycles the dead time may be wrong, at most d rounded up; None: max(1, 10 % of d), and 0
             without dead time.
         pole: p of the leak, in [0, 1); None: from the uncertainty, by the theorem.
-        longest: longest dead time that a run may set; None: twice the dead time.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time; a pole
@@ -163,7 +153,6 @@ class Increment(_Queued):
 
     def __post_init__(self) -> None:
         check_cycles("Increment", self.cycles)
-        check_longest("Increment", self.longest, self.cycles)
         if self.uncertainty is not None:
             check_uncertainty("Increment", self.uncertainty, self.cycles)
 
@@ -192,7 +181,7 @@ class Increment(_Queued):
 
     @property
     def _queue(self) -> Queue:
-        return Queue(self.cycles, longest=self.longest)
+        return Queue(self.cycles)
 
     def _request(
         self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
