@@ -17,8 +17,8 @@ FLIPS, KILLS, MISTAKES, LINES = 400, 30, 10_000, 1000
 
 def loop() -> str:
     """Faults of sensors, actuators, clocks and memories, for every shipped controller."""
-    from attack.faults import FAULTS
-    from attack.harness import PROBLEMS, Bench, shipped
+    from helpers.attack.faults import FAULTS
+    from helpers.attack.harness import PROBLEMS, Bench, shipped
 
     tried, raw, outside, frozen, differs = (Counter[str]() for _ in range(5))
     away: dict[str, list[float]] = {fault.name: [] for fault in FAULTS}
@@ -48,7 +48,7 @@ def loop() -> str:
     return f"""{_table(rows)}
 
 {controllers} shipped controllers of {len(PROBLEMS)} problems, each through a `Stepper`, for 80 cycles and the faults of
-`tests/attack/faults.py`. A controller is frozen when it still skips every cycle, or does not move its command, long
+`tests/helpers/attack/faults.py`. A controller is frozen when it still skips every cycle, or does not move its command, long
 after the fault has ended. A single bad sample must give the same commands, bit for bit, as the tick left out. After
 {lost} faults the simulated plant itself has left its domain (a tank below its bottom); these are not judged for freezing.
 The deviation is that of the command from the run without faults, in normal movements of the command per cycle (the larger of their
@@ -62,8 +62,8 @@ movements of a millionth of its size, so there a small deviation is a large numb
 
 def files() -> str:
     """Flipped bits of everything that is read again, and killed compilations."""
-    from attack.artefacts import ARTEFACTS, flipped
-    from attack.files import flipped_bits, killed_compilations
+    from helpers.attack.artefacts import ARTEFACTS, flipped
+    from helpers.attack.files import flipped_bits, killed_compilations
 
     rows = [["attack", "tried", "raw errors", "unnoticed or failed"]]
     wrong: list[str] = []
@@ -82,7 +82,7 @@ def files() -> str:
 
 def strangers() -> str:
     """Libraries that another user may have planted."""
-    from attack.strangers import planted_and_run
+    from helpers.attack.strangers import planted_and_run
 
     with tempfile.TemporaryDirectory() as folder:
         ran = planted_and_run(Path(folder))

@@ -5,18 +5,17 @@ from __future__ import annotations
 import os
 
 import pytest
+from helpers.attack.artefacts import ARTEFACTS, flipped
+from helpers.attack.commands import prepared, random_line, raw_end
+from helpers.attack.faults import FAULTS
+from helpers.attack.files import flipped_bits, killed_compilations
+from helpers.attack.harness import PROBLEMS, Bench, shipped
+from helpers.attack.strangers import planted_and_run
+from helpers.machine import needs_compiler
 
 import fpirhc as fp
-from attack.artefacts import ARTEFACTS, flipped
-from attack.commands import prepared, random_line, raw_end
-from attack.faults import FAULTS
-from attack.files import flipped_bits, killed_compilations
-from attack.harness import PROBLEMS, Bench, shipped
-from attack.strangers import planted_and_run
-from fpirhc.symbolic.native import find_compiler
 
 QUICK = (("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("noisy_motor", None))
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="this machine has no C compiler")
 
 
 @pytest.mark.parametrize(("problem", "name"), QUICK)

@@ -6,32 +6,20 @@ The IDE, a board and their compiler are not here: the sources are built and repl
 from __future__ import annotations
 
 import subprocess
-from pathlib import Path
 
 import pytest
+from helpers.exports import COMPILERS, STRICT, exported
 
-import fpirhc as fp
-from fpirhc.export.device import Device
-from fpirhc.export.target import device_of, target_called, write
-from fpirhc.symbolic.native import find_compiler
-
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-ffp-contract=off")
+CASE = ("two_mass", "CTC+FPI (eq 6)")
 
 
-def exported(folder: Path, target: str = "arduino", name: str = "two_mass", title: str = "CTC+FPI (eq 6)") -> Device:
-    task = fp.load_problem(name)
-    device = device_of(task.problem, task.controllers[title], title, name="arm", cycles=300)
-    write(device, target_called(target), folder)
-    return device
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 def test_an_arduino_library_replays_in_float(tmp_path):
     """No warning, commands to a thousandth of those in double with faults among the samples; header and sketch have one name.
 
     A number may be called as a macro of Arduino's headers.
     """
-    exported(tmp_path / "board"), exported(tmp_path / "c", "c")
+    exported(tmp_path / "board", *CASE, "arduino"), exported(tmp_path / "c", *CASE)
     assert "includes=arm.h" in (tmp_path / "board" / "library.properties").read_text().splitlines()
     sketch = (tmp_path / "board" / "examples" / "arm" / "arm.ino").read_text()
     assert "#include <arm.h>" in sketch
@@ -45,13 +33,23 @@ def test_an_arduino_library_replays_in_float(tmp_path):
     )  # apart from the header in double beside it
     files = [*src.glob("*.c"), tmp_path / "type.c", tmp_path / "main.c"]
     program = tmp_path / "replay"
-    command = [str(find_compiler()), *STRICT, f"-I{src}", *map(str, files), "-o", str(program), "-lm"]
+    command = [
+        COMPILERS[0],
+        *STRICT,
+        "-O2",
+        "-ffp-contract=off",
+        f"-I{src}",
+        *map(str, files),
+        "-o",
+        str(program),
+        "-lm",
+    ]
     subprocess.run(command, check=True, cwd=tmp_path)
     done = subprocess.run(
         [str(program), str(tmp_path / "c" / "samples.bin")], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout
-    assert "300 cycles" in done.stdout
+    assert "2000 cycles" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -67,6 +65,6 @@ def test_an_arduino_library_replays_in_float(tmp_path):
     ],
 )
 def test_the_time_of_a_step_stands_beside_the_period(name, title, said, tmp_path):
-    exported(tmp_path, name=name, title=title)
-    assert said in (tmp_path / "clock.txt").read_text()
-    assert "TOO LONG for a period of" in (tmp_path / "examples" / "arm" / "arm.ino").read_text()
+    exported(tmp_path / "board", name, title, "arduino")
+    assert said in (tmp_path / "board" / "clock.txt").read_text()
+    assert "TOO LONG for a period of" in (tmp_path / "board" / "examples" / "arm" / "arm.ino").read_text()

@@ -2,129 +2,106 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
-from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from helpers.exports import COMPILERS, STRICT, Exported, built, exported, output
 from helpers.kinds import slow_but
 
 import fpirhc as fp
 from fpirhc import Status
-from fpirhc.errors import InvalidName, NotSupported, OutputError
-from fpirhc.export.device import Device, default_name, identifiers
-from fpirhc.export.samples import with_faults
-from fpirhc.export.target import device_of, target_called, targets, write
-from fpirhc.symbolic.native import find_compiler
+from fpirhc.__main__ import main
 
-COMPILERS = [path for path in (shutil.which("gcc"), shutil.which("clang")) if path]
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
-STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
+pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 SANITIZED = ("-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+CHANGED = """from dataclasses import replace
+import fpirhc as fp
+task = fp.load_problem("two_mass")
+problem, controllers = task.problem, dict(task.controllers)
+"""
+LIMITED = CHANGED + 'problem = replace(problem, limits=replace(problem.limits, states={"q1": (1.85, 2.35)}))\n'
+THREE_STAGES = CHANGED + "problem = replace(problem, horizon=replace(problem.horizon, stages=3))\n"
+HOSTILE = CHANGED + (
+    'names = {**problem.plant.coordinates, "q1": "m*/int bad;/*"}\n'
+    "problem = replace(problem, plant=replace(problem.plant, coordinates=names))\n"
+    'controllers["law */ #error\\nexit(1); /* "] = controllers["CTC"]\n'
+)
+WEIGHTS = CHANGED + (
+    'controllers["CTC"] = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(gain=-0.2, weights=(0.9, 0.5)))\n'
+)
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)"),
     "plan": ("two_mass", "RHC+FPI"),
-    "state limits": ("two_mass", "RHC+FPI"),
+    "state limits": (LIMITED, "RHC+FPI"),
     "outputs": ("anaesthesia", "RHC+FPI"),
     "map": ("fishery", "RHC+FPI"),
     "sensors": ("noisy_motor", "RHC+FPI"),
 }
-LIVE = ["deformation.gain", "limits.inputs.Q1"]
+LIVE = ("deformation.gain", "limits.inputs.Q1")
 
 
-def exported(name: str, folder: Path, *, live: tuple[str, ...] = (), cycles: int = 400, **changes: Any) -> Device:
-    """The files of a case in a folder, with the prefix 'arm'."""
-    of, title = CASES[name]
-    task = fp.load_problem(of)
-    problem = replace(task.problem, **changes)
-    if name == "state limits":
-        problem = replace(problem, limits=replace(problem.limits, states={"q1": (1.85, 2.35)}))
-    device = device_of(problem, task.controllers[title], title, name="arm", live=live, cycles=cycles)
-    write(device, target_called("c"), folder)
-    return device
+def of_case(name: str, folder: Path, live: tuple[str, ...] = ()) -> Exported:
+    """The files of a case in a new folder."""
+    problem, title = CASES[name]
+    return exported(folder / "device", of_text(problem, folder), title, live=live)
 
 
-def built(folder: Path, *flags: str, main: str = "main.c", compiler: str = "", without: str = "") -> Path:
-    """The program of a folder, with one file that has a function `main`."""
-    mains = {"main.c", main} - {main}
-    sources = [str(path) for path in sorted(folder.glob("*.c")) if path.name not in mains and path.name != without]
-    program = folder / "program"
-    command = [compiler or str(find_compiler()), *STRICT, *(flags or ("-O2",)), *sources, "-o", str(program), "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return program
+def of_text(problem: str, folder: Path) -> str:
+    """The name of a problem; a text becomes a file."""
+    if "\n" not in problem:
+        return problem
+    (folder / "own.py").write_text(problem, encoding="utf-8")
+    return str(folder / "own.py")
 
 
-def output(program: Path, *arguments: object) -> str:
-    done = subprocess.run([str(program), *map(str, arguments)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-@needs_compiler
 @pytest.mark.parametrize("name", slow_but(CASES, "torque", "state limits", "map"))
 def test_a_replay_with_faults_is_the_stepper_bit_by_bit(name, tmp_path):
     """Commands, memory and trace of 2000 cycles, by every compiler here, and with sanitizers; no warning of the strict ones."""
-    exported(name, tmp_path, cycles=2000)
-    for compiler in COMPILERS or [str(find_compiler())]:
+    of_case(name, tmp_path)
+    for compiler in COMPILERS:
         # Both loops in C with sanitizers, which find the same with every compiler; the rest of their code is that of the others.
-        sanitized = name in ("plan", "state limits") and compiler == (*COMPILERS, compiler)[0]
+        sanitized = name in ("plan", "state limits") and compiler == COMPILERS[0]
         for flags in (("-O2",), SANITIZED) if sanitized else (("-O2",),):
-            said = output(built(tmp_path, *flags, compiler=compiler), tmp_path / "samples.bin")
+            said = output(built(tmp_path / "device", *flags, compiler=compiler), tmp_path / "device" / "samples.bin")
             assert "2000 cycles: command off by at most 0 " in said
             assert "differ in a bit: command 0, memory 0, trace 0" in said
             for status in (Status.BAD_SAMPLE, Status.BAD_TIME, Status.BRIDGED):
                 assert f" {int(status)} (" in said, said
 
 
-@needs_compiler
+def test_a_replay_tells_what_differs(tmp_path):
+    """The comparison can fail: one bit of a recorded command is turned."""
+    of_case("torque", tmp_path)
+    file = tmp_path / "device" / "samples.bin"
+    data = bytearray(file.read_bytes())
+    data[16 + 8 * 8] ^= 1  # the head, then the first cycle's sample of 7 numbers and its damage
+    file.write_bytes(data)
+    done = subprocess.run([str(built(file.parent)), str(file)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "command 1, memory 0, trace 0" in done.stdout
+
+
 @pytest.mark.skipif(shutil.which("nm") is None, reason="no nm")
 @pytest.mark.parametrize("name", ["torque", "state limits"])
 def test_a_controller_has_no_heap_no_files_and_no_globals(name, tmp_path):
     """Of other files it calls functions of numbers and of memory alone, and it writes into nothing but its struct."""
-    exported(name, tmp_path, live=("deformation.gain",), cycles=1)
-    own = [str(path) for path in sorted(tmp_path.glob("arm*.c"))]
-    subprocess.run([str(find_compiler()), *STRICT, "-O1", "-c", *own], cwd=tmp_path, check=True)
-    said = subprocess.run(
-        ["nm", *(f"{Path(one).stem}.o" for one in own)], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+    folder = of_case(name, tmp_path, live=("deformation.gain",)).folder
+    own = [str(path) for path in sorted(folder.glob("arm*.c"))]
+    subprocess.run([COMPILERS[0], *STRICT, "-O1", "-c", *own], cwd=folder, check=True)
+    objects = [f"{Path(one).stem}.o" for one in own]
+    said = subprocess.run(["nm", *objects], cwd=folder, capture_output=True, text=True, check=True)
     symbols = [line.split()[-2:] for line in said.stdout.splitlines() if line and not line.endswith(":")]
     outside = {symbol for kind, symbol in symbols if kind == "U" and not symbol.startswith("arm_")}
     numbers = "exp log pow sin cos sincos tan asin acos atan tanh atanh sqrt fmin fmax floor ceil fmod lrint"
     assert outside <= {*numbers.split(), "memcpy", "memset", "memmove"}
     assert not [symbol for kind, symbol in symbols if kind in "DdBbC"]
+    named = re.findall(r"\S+\.c\b", (folder / "CMakeLists.txt").read_text())
+    assert {*named} == {path.name for path in folder.glob("*.c")}
 
-
-@needs_compiler
-def test_a_replay_tells_what_differs(tmp_path):
-    """The comparison can fail: one bit of a recorded command is turned."""
-    exported("torque", tmp_path)
-    file = tmp_path / "samples.bin"
-    data = bytearray(file.read_bytes())
-    data[16 + 8 * 8] ^= 1  # the head, then the first cycle's sample of 7 numbers and its damage
-    file.write_bytes(data)
-    done = subprocess.run([str(built(tmp_path)), str(file)], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "command 1, memory 0, trace 0" in done.stdout
-
-
-def test_faults_are_in_the_samples():
-    """No numbers, outliers, a jump and missing cycles, as often as they are said to be there."""
-    problem = fp.load_problem("two_mass").problem
-    rows = with_faults(np.tile(problem.period * np.arange(400.0)[:, None], (1, 7)), problem)
-    assert np.isnan(rows).sum() == 2
-    assert np.isinf(rows).sum() == 3
-    assert (rows[:, 1] > 1e8).sum() == 3
-    assert (np.diff(rows[np.isfinite(rows[:, 0]), 0]) > 2.5 * problem.period).sum() >= 3
-
-
-# Settings, limits, instances
 
 SET = r"""
 #include "arm.h"
@@ -143,7 +120,6 @@ int main(void) {
          arm_set(&c, ARM_SET_LIMITS_INPUTS_Q1_0, -301), arm_set(&c, ARM_SET_LIMITS_INPUTS_Q1_1, 40));
   printf("%d%d ", arm_set(&c, ARM_SET_LIMITS_INPUTS_Q1_0, 40), arm_set(&c, ARM_SET_DEFORMATION_GAIN, -0.75));
   printf("%.17g %.17g\n", (double)c.settings.deformation_gain, (double)c.settings.limits_inputs_Q1_1);
-  memcpy(&in.state, &(arm_inputs){0}.state, sizeof in.state);
   in.state.q1 = 1.9, in.state.q2 = 5.4;
   c.settings.limits_inputs_Q1_0 = 1e8, c.settings.limits_inputs_Q1_1 = 1e9; /* past the check */
   for (k = 0; k < 5; ++k) {
@@ -161,17 +137,21 @@ int main(void) {
 """
 
 
-@needs_compiler
 def test_a_device_refuses_wrong_settings_and_never_leaves_the_limits_of_the_build(tmp_path):
     """Not finite, outside the bounds, beyond the other end of the interval, no setting: refused, and the old number stays."""
-    device = exported("torque", tmp_path, live=tuple(LIVE))
-    (tmp_path / "set.c").write_text(SET)
-    first, second, third, fourth = output(built(tmp_path, main="set.c")).splitlines()
+    device = of_case("torque", tmp_path, live=LIVE)
+    (device.folder / "set.c").write_text(SET)
+    first, second, third, fourth = output(built(device.folder, main="set.c")).splitlines()
     assert first == "0000 0001 01 -0.75 40"
     _, command, traced = second.split()
     assert float(command) == float(traced) == device.problem.limits.inputs["Q1"][1]
     assert third == "1 -0.75"
     assert fourth == "0"
+    header, layout = (device.folder / "arm.h").read_text(), device.layout
+    assert "    casadi_real q1_d; /* m/s */" in header
+    assert f"#define ARM_MEMORY {device.stepper.memory.size} " in header
+    assert [row["unit"] for row in layout["trace"]] == list(device.stepper.signals.units)
+    assert {*layout["bounds"]} == {"deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1"}
 
 
 PAIR = r"""
@@ -186,91 +166,30 @@ int main(void) {
 """
 
 
-@needs_compiler
 def test_two_weights_of_a_list_are_no_interval(tmp_path):
     """The first may be above the second, as Python takes them."""
-    problem, _ = two_mass()
-    controller = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(gain=-0.2, weights=(0.9, 0.5)))
     live = ("deformation.weights.0", "deformation.weights.1")
-    write(device_of(problem, controller, "CTC", name="arm", live=live, cycles=1), target_called("c"), tmp_path)
-    (tmp_path / "set.c").write_text(PAIR)
-    assert output(built(tmp_path, main="set.c")) == "11"
+    device = exported(tmp_path / "device", of_text(WEIGHTS, tmp_path), "CTC", live=live)
+    (device.folder / "set.c").write_text(PAIR)
+    assert output(built(device.folder, main="set.c")) == "11"
 
-
-def test_a_number_that_must_follow_from_a_setting_is_not_left_behind():
-    """The law's exact step for another rate is computed in Python, so its rate cannot be live on a device."""
-    task = fp.load_problem("two_mass")
-    law = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0))
-    assert device_of(task.problem, law, "law", live=["tracking.rate"], cycles=1).bounds["tracking.rate"][0] >= 0
-    fractional = replace(law, tracking=fp.Fractional(rate=6.0, order=0.9, memory=0.2))
-    with pytest.raises(NotSupported, match="must not stay as it was"):
-        device_of(task.problem, fractional, "fractional", live=["tracking.rate"], cycles=1)
-
-
-# A solver that fails
-
-FAILING = r"""
-#include "arm.h"
-int arm_raw(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem);
-int arm_real(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem);
-static int called;
-int arm_raw(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
-  ++called;
-  if ((called >= 40 && called < 44) || called == 60) return 1;
-  return arm_real(arg, res, iw, w, mem);
-}
-"""
-
-
-@needs_compiler
-def test_a_solver_that_fails_holds_as_the_stepper_does(tmp_path, monkeypatch):
-    """The last command, the memory as it was, and the cycles made up for later: in C as where a solver raises in Python.
-
-    Scalar code has no loop that can fail.
-    """
-    calls, real = [0], fp.Stepper._run
-
-    def failing(self):
-        evaluate = self._evaluate
-
-        def counted():
-            calls[0] += 1
-            if 40 <= calls[0] < 44 or calls[0] == 60:
-                raise RuntimeError("a solver raised")
-            return evaluate()
-
-        self._evaluate = counted
-        try:
-            return real(self)
-        finally:
-            self._evaluate = evaluate
-
-    monkeypatch.setattr(fp.Stepper, "_run", failing)
-    exported("plan", tmp_path, cycles=90)
-    raw = tmp_path / "arm_step.c"
-    raw.write_text(raw.read_text().replace("arm_raw", "arm_real"))
-    (tmp_path / "failing.c").write_text(FAILING)
-    said = output(built(tmp_path), tmp_path / "samples.bin")
-    assert f" {int(Status.SOLVER_FAILED)} (" in said
-    assert "command 0, memory 0" in said  # the trace of a dropped step is not defined
-
-
-# Float
 
 SINGLE = r"""
 #include "arm.h"
 #include <math.h>
 #include <stdio.h>
 #include <string.h>
+ROWS
 int main(void) {
   static arm_controller good, bad;
+  static arm_command out;
   int k, j, b, wrong = 0;
   const casadi_real worse[3] = {(casadi_real)NAN, (casadi_real)INFINITY, (casadi_real)-INFINITY};
   arm_init(&good);
   for (k = 0; k < 6; ++k) {
     arm_inputs in;
-    arm_command out, held;
-    memcpy(&in, ROWS[k], sizeof in);
+    arm_command held;
+    memcpy(&in, rows[k], sizeof in);
     for (j = 0; j < ARM_INPUTS && k > 1; ++j)
       for (b = 0; b < 3; ++b) {
         arm_inputs broken = in;
@@ -290,7 +209,6 @@ int main(void) {
 """
 
 
-@needs_compiler
 @pytest.mark.parametrize("real", ["double", "float"])
 @pytest.mark.parametrize("name", slow_but(["torque", "outputs"], "outputs"))
 def test_what_is_no_number_passes_no_gate_in_either_type(name, real, tmp_path):
@@ -298,115 +216,77 @@ def test_what_is_no_number_passes_no_gate_in_either_type(name, real, tmp_path):
 
     In float a limit of 1e300 would be infinite, and an infinite concentration would pass.
     """
-    device = exported(name, tmp_path)
-    rows = np.tile(device.inputs.start(), (6, 1))
+    device = of_case(name, tmp_path)
+    rows = np.tile([row["start"] for row in device.layout["inputs"]], (6, 1)).astype(float)
     start = device.problem.start_state
     rows[:, 0] = device.problem.period * np.arange(6)
     rows[:, 1 : 1 + start.size] = start
     text = ", ".join("{" + ", ".join(f"(casadi_real){v!r}" for v in row.tolist()) + "}" for row in rows)
-    text = f"static const casadi_real ROWS[6][ARM_INPUTS] = {{{text}}};\n"
-    place = f"enum {{ STATUS = {device.stepper.signals.slice('status').start} }};\n"
-    main = SINGLE.replace('#include "arm.h"\n', f'#include "arm.h"\n{text}{place}')
-    main = main.replace("arm_command out, held;", "static arm_command out;\n    arm_command held;")
-    (tmp_path / "single.c").write_text(main)
-    assert output(built(tmp_path, "-O2", f"-Dcasadi_real={real}", main="single.c")) == "0\n"
+    place = f"enum {{ STATUS = {device.stepper.signals.slice('status').start} }};"
+    table = f"static const casadi_real rows[6][ARM_INPUTS] = {{{text}}};\n{place}"
+    (device.folder / "single.c").write_text(SINGLE.replace("ROWS", table))
+    assert output(built(device.folder, "-O2", f"-Dcasadi_real={real}", main="single.c")) == "0\n"
 
 
-@needs_compiler
+FAILING = r"""
+#include "arm.h"
+#include <stdio.h>
+#include <string.h>
+int arm_raw(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem);
+int arm_real(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem);
+static int fails;
+int arm_raw(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+  return fails ? 1 : arm_real(arg, res, iw, w, mem);
+}
+int main(void) {
+  static arm_controller c;
+  static arm_inputs in;
+  arm_command out, held = {0};
+  int k;
+  arm_init(&c);
+  in.state.q1 = 2.2, in.state.q2 = 5.4;
+  for (k = 0; k < 12; ++k) {
+    in.time = k * ARM_PERIOD;
+    fails = k >= 4 && k < 8;
+    printf("%d%d ", arm_step(&c, &in, &out) == ARM_SOLVER_FAILED, memcmp(&held, &out, sizeof out) == 0);
+    held = out;
+  }
+  return 0;
+}
+"""
+
+
+def test_a_solver_that_fails_holds_the_last_command(tmp_path):
+    """And says so; the next cycle goes on."""
+    folder = of_case("plan", tmp_path).folder
+    raw = folder / "arm_step.c"
+    raw.write_text(raw.read_text().replace("arm_raw", "arm_real"))
+    (folder / "failing.c").write_text(FAILING)
+    said = output(built(folder, main="failing.c")).split()
+    assert [told[0] for told in said] == list("000011110000")
+    assert [held for _, held in said[4:8]] == ["1"] * 4
+
+
 def test_a_plan_in_float_is_the_plan(tmp_path):
     """Three stages: the line search's rounding is that of the type, so it does not stop at once (8 N off with that of double)."""
-    whole = fp.load_problem("two_mass").problem.horizon
-    assert whole is not None
-    horizon = replace(whole, stages=3)
-    exported("plan", tmp_path, cycles=60, horizon=horizon)
-    program = built(tmp_path, "-O2", "-Dcasadi_real=float")
-    said = subprocess.run([str(program), str(tmp_path / "samples.bin")], capture_output=True, text=True, check=False)
-    worst = float(said.stdout.split("at most ")[1].split(" ")[0])
-    assert worst < 0.01, said.stdout
+    device = exported(tmp_path / "device", of_text(THREE_STAGES, tmp_path), "RHC+FPI")
+    program = built(device.folder, "-O2", "-Dcasadi_real=float")
+    said = subprocess.run(
+        [str(program), str(device.folder / "samples.bin")], capture_output=True, text=True, check=False
+    )
+    assert float(said.stdout.split("at most ")[1].split(" ")[0]) < 0.01, said.stdout
 
 
-# What is written, and what is refused
-
-
-def test_header_and_layout_have_the_names_and_units(tmp_path):
-    device = exported("torque", tmp_path, live=tuple(LIVE), cycles=1)
-    header, layout = (tmp_path / "arm.h").read_text(), json.loads((tmp_path / "layout.json").read_text())
-    assert "    casadi_real q1_d; /* m/s */" in header
-    assert "  ARM_BAD_SAMPLE = 5," in header
-    assert f"#define ARM_MEMORY {device.stepper.memory.size} " in header
-    assert [row["name"] for row in layout["inputs"]] == list(device.inputs.columns)
-    assert [row["unit"] for row in layout["trace"]] == list(device.stepper.signals.units)
-    assert set(layout["bounds"]) == {"deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1"}
-    text = "".join(path.read_text() for path in tmp_path.glob("arm*.c"))
-    for word in ("malloc", "stdio", "__builtin_cpu_supports", "CASADI_SYMBOL_EXPORT"):
-        assert word not in text
-
-
-def test_the_cmake_file_names_files_that_are_there():
-    """A name of another file stops the very first command of the page."""
-    problem, controllers = two_mass()
-    files = target_called("c").files(device_of(problem, controllers["CTC"], "CTC", cycles=1))
-    named = re.findall(r"\S+\.c\b", str(files["CMakeLists.txt"]))
-    assert set(named) == {name for name in files if name.endswith(".c")}
-
-
-def test_names_in_c():
-    assert identifiers(["q1", "q1'", "q1''", "q1_d", "a b", "int", "2nd"]) == [
-        "q1",
-        "q1_d",
-        "q1_dd",
-        "q1_d_2",
-        "a_b",
-        "_int",
-        "_2nd",
-    ]
-    assert default_name("two_mass CTC+FPI (eq 6)") == "two_mass_ctc_fpi_eq_6"
-    assert default_name("2 tanks") == "c_2_tanks"
-
-
-@cache
-def two_mass() -> tuple[Any, Any]:
-    task = fp.load_problem("two_mass")
-    return task.problem, task.controllers
-
-
-@pytest.mark.parametrize("name", ["2nd", "a b", "int", "example", "replay", "test", "math", "", "x" * 41, "ü"])
-def test_a_name_that_c_does_not_take_is_refused(name):
-    problem, controllers = two_mass()
-    with pytest.raises(InvalidName, match=r"cannot be the name of a controller in C.*Did you mean"):
-        device_of(problem, controllers["CTC"], "CTC", name=name)
+def test_a_text_of_a_problem_file_stays_in_its_comment(tmp_path):
+    """Names and units may hold the end of a comment, the beginning of another, and more than one line."""
+    device = exported(tmp_path / "device", of_text(HOSTILE, tmp_path), "law */ #error\nexit(1); /* ")
+    assert "2000 cycles: command off by at most 0 " in output(built(device.folder), device.folder / "samples.bin")
 
 
 @pytest.mark.parametrize("optimiser", [fp.Ipopt(1e-6), fp.Fatrop(1e-6), fp.SequentialQuadratic(1e-6)])
-def test_a_solver_with_a_library_of_its_own_is_refused_by_name(optimiser):
-    problem, _ = two_mass()
-    controller = fp.RecedingHorizon(optimiser, fp.Sigmoid(gain=-0.5, scale=50.0))
-    with pytest.raises(
-        NotSupported, match=f"'rival' cannot be exported.*In place of {type(optimiser).__name__} use FixedPoint"
-    ):
-        device_of(problem, controller, "rival")
-
-
-def test_a_folder_that_is_not_empty_and_an_unknown_target_are_refused(tmp_path):
-    problem, controllers = two_mass()
-    device = device_of(problem, controllers["CTC"], "CTC", cycles=1)
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(OutputError, match="not an empty folder"):
-        write(device, target_called("c"), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-    with pytest.raises(OutputError, match="not an empty folder"):
-        write(device, target_called("c"), tmp_path / "mine.txt")
-    with pytest.raises(InvalidName, match=r"target 'x' is unknown.*c"):
-        target_called("x")
-    assert list(targets())
-
-
-@needs_compiler
-def test_a_text_of_a_problem_file_stays_in_its_comment(tmp_path):
-    """Names and units may hold the end of a comment, the beginning of another, and more than one line."""
-    problem, controllers = two_mass()
-    plant = replace(problem.plant, coordinates={**problem.plant.coordinates, "q1": "m*/int bad;/*"})
-    title = "law */ #error\nexit(1); /* "
-    device = device_of(replace(problem, plant=plant), controllers["CTC"], title, name="arm", cycles=60)
-    write(device, target_called("c"), tmp_path)
-    assert "60 cycles: command off by at most 0 " in output(built(tmp_path), tmp_path / "samples.bin")
+def test_a_solver_with_a_library_of_its_own_is_refused_by_name(optimiser, tmp_path, capsys):
+    made = f"controllers['rival'] = fp.RecedingHorizon(fp.{type(optimiser).__name__}(1e-6))\n"
+    file = of_text(CHANGED + made, tmp_path)
+    assert main(["export", file, "rival", "--out", str(tmp_path / "device")]) == 2
+    said = capsys.readouterr().err
+    assert re.search(rf"'rival' cannot be exported.*In place of {type(optimiser).__name__} use FixedPoint", said)

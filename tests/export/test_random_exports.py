@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import ctypes
-import subprocess
 from collections.abc import Iterator, Sequence
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.exports import COMPILERS, Exported, exported
 from helpers.kinds import slow_but
+from helpers.replay import samples as samples_of
 
 import fpirhc as fp
 from fpirhc import Status
-from fpirhc.export.device import Device
-from fpirhc.export.target import device_of
-from fpirhc.export.targets.c import filled, sources
-from fpirhc.symbolic.native import find_compiler
 
-pytestmark = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 # Controllers of states, of outputs, of a map and of sensors, a plan, and what of each may be live.
 CASES = {
     "torque": (
@@ -40,20 +36,11 @@ SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]
 def samples(of: str, title: str) -> np.ndarray:
     """Samples of a run of a controller, its time first, without the time."""
     task = fp.load_problem(of)
-    device = device_of(task.problem, task.controllers[title], title, cycles=1)
-    run = fp.simulate(task.problem.of_equations, task.controllers[title], seed=0)
-    parts = [np.reshape(run[name], (len(run.time), -1)) for name in device.inputs.names if name != "time"]
-    return np.resize(np.hstack(parts), (CYCLES, sum(part.shape[1] for part in parts)))
+    rows = samples_of(fp.simulate(task.problem, task.controllers[title], seed=0))
+    return np.resize(rows, (CYCLES, rows.shape[1]))
 
 
-def device(name: str, *, live: bool = True) -> Device:
-    of, title, paths = CASES[name]
-    task = fp.load_problem(of)
-    given = paths if live else ()
-    return device_of(task.problem, task.controllers[title], title, name="arm", live=given, cycles=1)
-
-
-def random_rows(name: str, device: Device, random: np.random.Generator, bad: Sequence[float]) -> np.ndarray:
+def random_rows(name: str, device: Exported, random: np.random.Generator, bad: Sequence[float]) -> np.ndarray:
     """Samples of a run with noise; one in eight has a number of `bad`, one in twenty comes after missed cycles, or once more."""
     of, title, _ = CASES[name]
     rows = samples(of, title) * (1 + 1e-3 * random.standard_normal((CYCLES, 1)))
@@ -66,20 +53,12 @@ def random_rows(name: str, device: Device, random: np.random.Generator, bad: Seq
 
 
 class Library:
-    """A controller in C, called with arrays."""
+    """A controller as a shared library, called with arrays."""
 
-    def __init__(self, device: Device, folder: Path, real: str = "double") -> None:
-        folder.mkdir()
-        call = "  return arm_set((arm_controller*)controller, (arm_setting)setting, (casadi_real)value);"
-        nothing = "  (void)controller, (void)setting, (void)value;\n  return 0;"
-        own = {**sources(device), "library.c": filled(device, "library.c", change=call if device.bounds else nothing)}
-        for file, text in own.items():
-            (folder / file).write_text(text)
-        files = [str(folder / file) for file in own if file.endswith(".c")]
-        flags = ["-std=c99", "-O1", "-ffp-contract=off", "-fPIC", "-shared", f"-Dcasadi_real={real}"]
-        subprocess.run([str(find_compiler()), *flags, *files, "-o", str(folder / "arm.so"), "-lm"], check=True)
-        self.called = ctypes.CDLL(str(folder / "arm.so"))
-        self.paths, self.commands = list(device.bounds), device.problem.plant.input.size
+    def __init__(self, device: Exported) -> None:
+        [path] = [one for one in device.folder.glob("arm_*") if one.suffix in (".so", ".dylib", ".dll")]
+        self.called = ctypes.CDLL(str(path))
+        self.paths, self.commands = list(device.layout["bounds"]), device.problem.plant.input.size
 
     def begun(self) -> ctypes.Array[ctypes.c_char]:
         """One more instance."""
@@ -100,7 +79,7 @@ class Library:
 Change = tuple[str, float]
 
 
-def random_changes(device: Device, random: np.random.Generator) -> dict[int, list[Change]]:
+def random_changes(device: Exported, random: np.random.Generator) -> dict[int, list[Change]]:
     """Numbers inside the bounds of a setting and, one in three, not: no numbers, and those far outside."""
     changes: dict[int, list[Change]] = {}
     start = settings_of(device)
@@ -114,7 +93,7 @@ def random_changes(device: Device, random: np.random.Generator) -> dict[int, lis
     return changes
 
 
-def is_allowed(device: Device, now: dict[str, float], path: str, value: float) -> bool:
+def is_allowed(device: Exported, now: dict[str, float], path: str, value: float) -> bool:
     """Whether a device is to take a number: finite, inside its bounds, and an interval stays one."""
     low, high = device.bounds[path]
     owner, _, end = path.rpartition(".")
@@ -124,7 +103,7 @@ def is_allowed(device: Device, now: dict[str, float], path: str, value: float) -
 
 
 def stepped(
-    device: Device, rows: np.ndarray, changes: dict[int, list[Change]]
+    device: Exported, rows: np.ndarray, changes: dict[int, list[Change]]
 ) -> Iterator[tuple[list[bool], list[float]]]:
     """What is to come in every cycle: whether changes are taken, and the status and command of Python with those that are."""
     stepper, now = device.stepper, settings_of(device)
@@ -132,7 +111,6 @@ def stepped(
     for k, row in enumerate(rows):
         taken = []
         for path, value in changes.get(k, []):
-            assert isinstance(stepper, fp.Stepper)
             taken.append(is_allowed(device, now, path, value))
             if taken[-1]:
                 assert stepper.change({path: value})
@@ -143,15 +121,15 @@ def stepped(
         yield taken, [float(stepper.trace()["status"].ravel()[0]), *command]
 
 
-def settings_of(device: Device) -> dict[str, float]:
+def settings_of(device: Exported) -> dict[str, float]:
     """The settings of the build, by path."""
-    start = zip(device.settings.columns, device.settings.start().tolist(), strict=True)
-    return {column.removeprefix("setting."): value for column, value in start}
+    start = zip(device.stepper.reads.columns, device.stepper.reads.start().tolist(), strict=True)
+    return {column.removeprefix("setting."): value for column, value in start if column.startswith("setting.")}
 
 
-def back(device: Device) -> None:
+def back(device: Exported) -> None:
     """The settings of the build."""
-    if isinstance(device.stepper, fp.Stepper) and device.bounds:
+    if device.bounds:
         start = settings_of(device)
         assert device.stepper.change({path: start[path] for path in device.bounds})
 
@@ -161,8 +139,9 @@ def back(device: Device) -> None:
 def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, tmp_path):
     """Cycles of three controllers in any order, settings that change in between, samples with faults: bits, statuses, refusals."""
     random = np.random.default_rng(seed)
-    one = device(name)
-    library = Library(one, tmp_path / "c")
+    of, title, live = CASES[name]
+    one = exported(tmp_path / "library", of, title, "library", live=live)
+    library = Library(one)
     bad = (np.nan, np.inf, -np.inf, 1e9, -1e200, 0.0)
     rows = [random_rows(name, one, random, bad) for _ in range(INSTANCES)]
     changes = [random_changes(one, random) for _ in range(INSTANCES)]
@@ -170,6 +149,7 @@ def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, 
     for own, changed in zip(rows, changes, strict=True):
         back(one)
         wanted.append(list(stepped(one, own, changed)))
+    assert library.called.arm_change(library.begun(), 99, ctypes.c_double(1.0)) == 0
     instances, at = [library.begun() for _ in range(INSTANCES)], [0] * INSTANCES
     for j in random.permutation(np.repeat(np.arange(INSTANCES), CYCLES)):
         k = at[j]
@@ -181,23 +161,3 @@ def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, 
     assert not all(refused)
     statuses = {answer[0] for answers in wanted for _, answer in answers}
     assert {int(Status.BAD_SAMPLE), int(Status.BRIDGED)} <= statuses
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("name", slow_but(CASES, "outputs", "torque"))
-def test_a_float_export_is_near_the_double_one(name, seed, tmp_path):
-    """A thousandth of the largest command; what is no number is a bad sample in both, and nothing stays behind it."""
-    random = np.random.default_rng(seed)
-    one = device(name, live=False)
-    single, double = Library(one, tmp_path / "float", "float"), Library(one, tmp_path / "double")
-    rows = random_rows(name, one, random, (np.nan, np.inf, -np.inf))
-    answers = [
-        np.array([library.cycle(instance, row) for row in rows])
-        for library, instance in ((single, single.begun()), (double, double.begun()))
-    ]
-    assert np.isfinite(answers[0]).all()
-    bad = [part[:, 0] == int(Status.BAD_SAMPLE) for part in answers]
-    np.testing.assert_array_equal(*bad)
-    assert bad[0].any()
-    largest = np.abs(answers[1][:, 1:]).max()
-    np.testing.assert_allclose(answers[0][:, 1:], answers[1][:, 1:], rtol=0, atol=1e-3 * largest)

@@ -8,7 +8,6 @@ import pytest
 from helpers.first_files import messages_of
 
 from fpirhc.__main__ import main
-from fpirhc.export import binaries
 
 IPOPT = """import fpirhc as fp
 
@@ -50,7 +49,6 @@ def test_what_is_refused_says_why_and_what_to_do(row, tmp_path, monkeypatch, cap
         monkeypatch.setitem(__import__("sys").modules, module, None)
     if "library" in words:
         monkeypatch.setenv("FPIRHC_CC", "none")
-        monkeypatch.setattr(binaries, "find_spec", lambda _: None)
     code = main(["export", *words, *([] if "--out" in words else ["--out", "new"])])
     assert capsys.readouterr().err == f"fpirhc: {ROWS[row]}\n"
     assert code == (3 if "full" in words else 2)

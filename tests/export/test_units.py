@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,19 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.exports import COMPILERS, Exported, exported
+from helpers.replay import samples
 
 import fpirhc as fp
-from fpirhc.errors import NotSupported
-from fpirhc.export import binaries
-from fpirhc.export.device import Device
-from fpirhc.export.target import device_of, target_called, write
-from fpirhc.symbolic.native import find_compiler
 
 REASON = "FMPy is not installed: pip install 'fpirhc[fmu]'"
 fmpy: Any = pytest.importorskip("fmpy", reason=REASON)
 fmi1 = pytest.importorskip("fmpy.fmi1", reason=REASON)
 validation = pytest.importorskip("fmpy.validation", reason=REASON)
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "limits.inputs.Q1")),
     "plan": ("two_mass", "RHC+FPI", ()),
@@ -31,12 +27,9 @@ CASES = {
 }
 
 
-def exported(name: str, folder: Path) -> tuple[Device, Path]:
+def of_case(name: str, folder: Path) -> tuple[Exported, Path]:
     of, title, live = CASES[name]
-    task = fp.load_problem(of)
-    device = device_of(task.problem, task.controllers[title], title, name="unit", live=live, cycles=1)
-    write(device, target_called("fmu2"), folder)
-    return device, folder / "unit.fmu"
+    return exported(folder / "unit", of, title, "fmu2", live=live, name="unit"), folder / "unit" / "unit.fmu"
 
 
 class Master:
@@ -83,17 +76,16 @@ def master(path: Path) -> Iterator[Master]:
         one.unit.freeInstance()
 
 
-def samples_of(device: Device) -> np.ndarray:
+def samples_of(device: Exported) -> np.ndarray:
     """What the step is given in a run, without the time."""
-    run = fp.simulate(device.problem, device.controller, seed=0)
-    return np.hstack([np.reshape(run[n], (len(run.time), -1)) for n in device.inputs.names[1:]])
+    return samples(fp.simulate(device.problem, device.controller, seed=0))
 
 
 @needs_compiler
 @pytest.mark.parametrize("name", CASES)
 def test_a_unit_is_valid_and_its_commands_are_those_of_the_stepper_bit_by_bit(name, tmp_path):
     """FMPy finds nothing wrong, and 300 samples of a run give the commands and statuses that the stepper gives."""
-    device, path = exported(name, tmp_path)
+    device, path = of_case(name, tmp_path)
     assert validation.validate_fmu(str(path)) == []
     period, samples, memory = device.problem.period, samples_of(device), device.stepper.start()
     with master(path) as unit:
@@ -108,7 +100,7 @@ def test_a_unit_is_valid_and_its_commands_are_those_of_the_stepper_bit_by_bit(na
 @needs_compiler
 def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_where_they_do_not(tmp_path):
     """A master that exchanges after each step alone is a dead time of one period: newtons off, and told on the page."""
-    device, path = exported("plan", tmp_path)
+    device, path = of_case("plan", tmp_path)
     problem, run = device.problem, fp.simulate(device.problem, device.controller, seed=0)
     plant, advance = problem.plant, problem.integrator.step(problem.plant, problem.period)
     apart = []
@@ -127,13 +119,13 @@ def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_
         apart.append(worst)
     assert apart[0] < 1e-11
     assert apart[1] > 1.0
-    assert "every command one period late" in (tmp_path / "README.md").read_text()
+    assert "every command one period late" in (tmp_path / "unit" / "README.md").read_text()
 
 
 @needs_compiler
 def test_what_a_master_may_not_do(tmp_path):
     """Wrong settings, other steps, steps that begin elsewhere, numbers that are computed: refused, and the unit stays as it was."""
-    device, path = exported("torque", tmp_path)
+    device, path = of_case("torque", tmp_path)
     period, gain = device.problem.period, "setting.deformation.gain"
     with master(path) as unit:
         start = unit.get([gain])[0]
@@ -163,7 +155,7 @@ def test_what_a_master_may_not_do(tmp_path):
 @needs_compiler
 def test_a_state_that_is_kept_comes_back_and_a_reset_begins_anew(tmp_path):
     """The same samples after both give the same commands; another unit beside it does not notice."""
-    device, path = exported("plan", tmp_path)
+    device, path = of_case("plan", tmp_path)
     period, samples = device.problem.period, samples_of(device)
     with master(path) as unit, master(path) as other:
 
@@ -192,7 +184,7 @@ def test_a_state_that_is_kept_comes_back_and_a_reset_begins_anew(tmp_path):
 def test_what_is_read_before_the_start_is_not_the_command_of_the_start(tmp_path):
     """The reference is another one at t = 5 s."""
     said = []
-    with master(exported("torque", tmp_path)[1]) as unit:
+    with master(of_case("torque", tmp_path)[1]) as unit:
         for early in (True, False):
             unit.unit.reset()
             if early:
@@ -202,22 +194,6 @@ def test_what_is_read_before_the_start_is_not_the_command_of_the_start(tmp_path)
     assert said[0] == said[1]
 
 
-def test_without_a_compiler_a_unit_holds_its_sources_and_says_so(tmp_path, monkeypatch):
-    monkeypatch.setattr(binaries, "find_compiler", lambda: None)
-    monkeypatch.setattr(binaries, "find_spec", lambda _: None)
-    _, path = exported("torque", tmp_path)
-    names = set(zipfile.ZipFile(path).namelist())
-    assert not [name for name in names if name.startswith("binaries/")]
-    assert {"modelDescription.xml", "sources/unit.c", "sources/unit_fmu.c", "sources/fmi2Functions.h"} <= names
-    assert "none: no compiler was found" in (tmp_path / "README.md").read_text()
-
-
 def test_the_same_controller_gives_the_same_archive(tmp_path):
-    first, second = (exported("torque", tmp_path / name)[1].read_bytes() for name in "ab")
+    first, second = (of_case("torque", tmp_path / name)[1].read_bytes() for name in "ab")
     assert first == second
-
-
-def test_without_fmpy_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "fmpy", None)
-    with pytest.raises(NotSupported, match=r"the target fmu2 needs fmpy.*fpirhc\[fmu\]"):
-        exported("torque", tmp_path)

@@ -11,12 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.exports import Exported, exported
 from helpers.kinds import slow_but
-
-import fpirhc as fp
-from fpirhc.errors import NotSupported
-from fpirhc.export.device import Device
-from fpirhc.export.target import device_of, target_called, write
 
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)"),
@@ -26,13 +22,9 @@ CASES = {
 LIVE = {"torque": ("deformation.gain", "limits.inputs.Q1")}
 
 
-def exported(name: str, folder: Path, target: str, cycles: int = 2000) -> Device:
+def of_case(name: str, folder: Path) -> Exported:
     of, title = CASES[name]
-    task = fp.load_problem(of)
-    live = LIVE.get(name, ())
-    device = device_of(task.problem, task.controllers[title], title, name="arm", live=live, cycles=cycles)
-    write(device, target_called(target), folder)
-    return device
+    return exported(folder, of, title, "wasm", live=LIVE.get(name, ()))
 
 
 def node(folder: Path, text: str) -> str:
@@ -47,12 +39,6 @@ def node(folder: Path, text: str) -> str:
     return done.stdout
 
 
-def test_without_zig_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "ziglang", None)
-    with pytest.raises(NotSupported, match=r"the target wasm needs ziglang.*fpirhc\[compiler\]"):
-        exported("torque", tmp_path, "wasm", cycles=1)
-
-
 @pytest.fixture
 def tools() -> None:
     pytest.importorskip("ziglang", reason="zig is not installed: pip install 'fpirhc[compiler]'")
@@ -64,7 +50,7 @@ def tools() -> None:
 @pytest.mark.parametrize("name", slow_but(CASES, "plan"))
 def test_webassembly_has_the_commands_of_python(name, tmp_path):
     """Two thousand cycles with faults: statuses, and commands to 1e-9 of their size; exp and the like are the module's."""
-    device = exported(name, tmp_path, "wasm")
+    device = of_case(name, tmp_path)
     done = subprocess.run(
         [str(shutil.which("node")), str(tmp_path / "replay.mjs")], capture_output=True, text=True, check=False
     )
@@ -74,10 +60,10 @@ def test_webassembly_has_the_commands_of_python(name, tmp_path):
     assert found == statuses(device, tmp_path)
 
 
-def statuses(device: Device, folder: Path) -> dict[int, int]:
+def statuses(device: Exported, folder: Path) -> dict[int, int]:
     """Cycles by status of the stepper, for the samples of a replay."""
     data = np.frombuffer((folder / "samples.bin").read_bytes()[16:])
-    rows = data.reshape(device.cycles, -1)[:, : device.inputs.size + 1]
+    rows = data.reshape(2000, -1)[:, : len(device.layout["inputs"]) + 1]
     memory, counts = device.stepper.start(), Counter[int]()
     for row in rows:
         if row[-1] >= 0:
@@ -92,7 +78,7 @@ def statuses(device: Device, folder: Path) -> dict[int, int]:
 @pytest.mark.usefixtures("tools")
 def test_the_wrapper_checks_what_it_is_told(tmp_path):
     """Settings by name with their bounds, samples by their number, several controllers side by side, a reset."""
-    device = exported("torque", tmp_path, "wasm", cycles=1)
+    device = of_case("torque", tmp_path)
     said = json.loads(
         node(
             tmp_path,

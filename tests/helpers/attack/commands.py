@@ -6,16 +6,14 @@ import contextlib
 import io
 import os
 import random
+import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
-import typer
-
-from attack.problems import LINE
 from fpirhc.__main__ import main
-from fpirhc.cli import app
+from helpers.attack.problems import LINE
 
-GROUP = typer.main.get_command(app)
 CHEAP = ("accept", "check", "compare", "list", "new", "review", "run", "study", "tune")
 WORDS = (
     "line.py", "line.py", "line.py", "no_such.py", "broken.py", "empty.py", "two_mas", "", ".", "/", "CTC", "CTC+FPI", "CTC+FP",
@@ -27,13 +25,24 @@ SLOW = ("--trials", "--draws", "--seeds", "--processes", "--cycles")  # options 
 CODES = {0, 1, 2, 3, 4, 5, 6}
 
 
+@cache
+def options_of(name: str) -> list[tuple[str, bool]]:
+    """Options of a command and whether a value follows them, as its help has them."""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        main([name, "--help"])
+    found = re.findall(r"^ +(?:-\w, )?(--[a-z-]+)(?: ([A-Z<\[].*?))?(?:  |$)", said.getvalue(), re.MULTILINE)
+    assert found
+    return [(option, bool(value)) for option, value in found]
+
+
 def random_line(seed: int) -> list[str]:
     """The words of one command line."""
     numbers = random.Random(seed)
     if numbers.random() < 0.05:
         return [numbers.choice((*WORDS, *FLAGS)) for _ in range(numbers.randrange(3))]
     name = numbers.choice(CHEAP)
-    options = [(o, not p.is_flag) for p in GROUP.commands[name].params for o in p.opts if o.startswith("--")]  # type: ignore[attr-defined]
+    options = options_of(name)
     words = [name, *(["line.py"] if numbers.random() < 0.7 else [])]
     for _ in range(numbers.choice((0, 0, 1, 1, 2, 3, 4))):
         if options and numbers.random() < 0.6:

@@ -6,10 +6,9 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from helpers.line import line_text
-
 import fpirhc as fp
 from fpirhc.contracts import Controller
+from helpers.line import line_text
 
 LINE = line_text(
     "period=5e-3, duration=0.2, measure_from=0.05, limits=fp.Limits(inputs={'u': (-50.0, 50.0)}), "

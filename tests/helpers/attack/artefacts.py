@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 import fpirhc as fp
-from attack.problems import line_task
 from fpirhc.errors import FpirhcError
+from helpers.attack.problems import line_task
 
 Read = Callable[[Path], object]
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from attack.faults import FIRST, Cycle, Fault
 from fpirhc import Status
-from fpirhc.contracts import Controller
-from fpirhc.controllers.check import checked
+from fpirhc.contracts import Controller, values_of
 from fpirhc.errors import FpirhcError
-from fpirhc.sensing.base import response_names
-from fpirhc.simulation.path import true_response
+from helpers.attack.faults import FIRST, Cycle, Fault
 
 _GONE = 1e12  # size of a state that no plant comes back from
 CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again
@@ -64,9 +62,11 @@ class Bench:
         self.stepper = fp.Stepper(problem, controller, compiled=False)
         self.limits = problem.limits.input_bounds(plant)
         self._advance = problem.integrator.step(plant, problem.period)
-        response = checked(problem, controller).response(problem) or true_response(problem)
-        assert response.function is not None
-        self._response = response.function
+        x, u, p = plant.symbols()
+        values = values_of(plant, x, u, p)
+        self._names = [name + "'" * order for name, order in plant.response_orders.items()]
+        rows = ca.densify(ca.vertcat(*(values[name] for name in self._names)))
+        self._response = ca.Function("response", [x, u, p], [rows])
         self._calm = np.zeros(len(plant.names))
         self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom
         self.clean = self._run(None)[0]
@@ -115,7 +115,7 @@ class Bench:
             active = fault is not None and fault.first <= k < fault.end
             if active and fault is not None and exact.size:
                 exact = np.array(plant.exact) * np.where(np.arange(exact.size) == 0, fault.heavier, 1.0)
-            realised = np.asarray(self._response(x, u, exact, self._calm).full()).ravel()
+            realised = np.asarray(self._response(x, u, exact).full()).ravel()
             cycle = Cycle(k, k * period, x.copy(), realised, memory, past)
             if active and fault is not None and fault.sample is not None:
                 fault.sample(cycle)
@@ -142,7 +142,7 @@ class Bench:
         if not self.stepper.estimates:
             return cycle.state, cycle.realised
         plant = self.problem.plant
-        names = (*plant.state.elements, *response_names(plant))
+        names = (*plant.state.elements, *self._names)
         values = dict(zip(names, (*cycle.state, *cycle.realised), strict=True))
         return (np.array([values[n] for n in self.stepper.measures]),)
 
