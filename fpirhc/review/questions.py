@@ -31,6 +31,7 @@ from fpirhc.task.problem import Problem
 
 MORE = 8  # times the optimiser's iterations, with a tenth of its tolerance
 WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size of the task
+ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
 MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing of a loop
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
@@ -264,19 +265,24 @@ def _gains(case: Case) -> Fact | None:
 def _latency(case: Case) -> Fact | None:
     if not case.asks_more():
         return None
-    bench, borne = case.bench, LATENCY
+    bench, borne, harms = case.bench, LATENCY, 0.0
+    adapts = bench.built.controller.deformation.adapts
     most, calm = max(2 * bench.share(bench.start), 0.1), bench.steps(bench.start)
     for cycles in range(1, LATENCY + 1):
         base = bench.run(latency=cycles)
         share, step = bench.share(base), bench.steps(base)
-        left = math.inf
+        left = without = math.inf
         if share <= most and step <= 2 * calm + 0.01:
             left = bench.pushed(PLACES[0], base=base, latency=cycles)[0].left
-        if left > 1:
+        if left <= 1 and adapts:
+            plain = case.plain.run(latency=cycles)
+            without = case.plain.share(plain)
+            harms = _added(case, case.plain.errors(plain), bench.errors(base))[2]
+        if left > 1 or harms > WORSE:
             borne = cycles - 1
             break
     numbers = {"cycles_borne": borne, "error": share, "mean_step": step, "mean_step_without": calm}
-    numbers |= {"left": left} if left < math.inf else {}
+    numbers |= {n: v for n, v in (("left", left), ("error_without", without)) if v < math.inf}
     return Fact(graded(borne, LATENCY, -1), numbers)
 
 
@@ -296,8 +302,9 @@ def _inner(case: Case) -> Fact | None:
         return None
     rate, left = max(map(zero_dynamics, case.slopes(9))), bench.back.left
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
-    verdict = Verdict.YES if rate * problem.duration <= math.log(2) else held
-    return Fact(verdict, {"rate_with_outputs_held": rate, "left": left})
+    if rate * problem.duration <= math.log(2):
+        return Fact(Verdict.YES, {"rate_with_outputs_held": rate})
+    return Fact(held, {"rate_with_outputs_held": rate, "left": left})
 
 
 def _noise(case: Case) -> Fact | None:
@@ -309,12 +316,9 @@ def _noise(case: Case) -> Fact | None:
     span = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.ptp(quiet["command"], axis=0), 1e-300))
     chatter = np.sqrt((steps**2).mean(axis=0)) / span
     worst = int(chatter.argmax())
-    numbers = {
-        "rms_step": chatter[worst],
-        "error_without_noise": case.bench.share(quiet),
-        "error": case.bench.share(noisy),
-    }
-    return Fact(graded(chatter[worst], 0.01, math.inf), numbers, list(case.problem.plant.inputs)[worst])
+    shares = {"error_without_noise": case.bench.share(quiet), "error": case.bench.share(noisy)}
+    numbers, verdict = {"rms_step": chatter[worst], **shares}, graded(chatter[worst], 0.01, math.inf)
+    return Fact(verdict, numbers, list(case.problem.plant.inputs)[worst])
 
 
 # Of adaptation
@@ -359,12 +363,9 @@ def gain_by_run(case: Case) -> Fact:
         good[times] = calm and bench.back.left <= 1
         if times > 1 and not good[times]:
             break
-    most = max((t for t, fine in good.items() if fine), default=math.nan)
-    best = (
-        max(most / 2, 1.0)
-        if good[1.0]
-        else min((t for t in good if good[t]), key=lambda t: errors[t], default=math.nan)
-    )
+    fine = [t for t in good if good[t]]
+    most = max(fine, default=math.nan)
+    best = max(most / 2, 1.0) if good[1.0] else min(fine, key=lambda t: errors[t], default=math.nan)
     names = {1.0: "error", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
     numbers = {names[times]: e for times, e in errors.items()} | {"recommended_times": best}
     some = Verdict.NO if most > 0 else Verdict.UNKNOWN
@@ -372,18 +373,19 @@ def gain_by_run(case: Case) -> Fact:
 
 
 def _added(
-    case: Case, without: Mapping[str, float], adapted: Mapping[str, float]
+    case: Case, without: Mapping[str, float], adapted: Mapping[str, float], slight: float | None = None
 ) -> tuple[str, dict[str, float], float]:
-    """The quantity to which adaptation adds most, its errors, and how many times it is worse."""
-    added = {
-        n: math.inf if a == math.inf else (a - without[n]) / case.plain.sizes[n]
-        for n, a in adapted.items()
-        if case.plain.sizes[n]
-    }
-    name = max(added, key=lambda n: added[n], default=next(iter(adapted)))
-    most = added.get(name, 0.0)
-    numbers = {"error_without": without[name], "error_with": adapted[name], "added": most}
-    return name, numbers, adapted[name] / max(without[name], 1e-300) if most > SLIGHT else 0.0
+    """The quantity that is made worse with most added, its errors, and how many times; `slight` is a share of the task."""
+    sizes = {n: s for n, s in case.plain.sizes.items() if s and n in adapted}
+    added = {n: math.inf if adapted[n] == math.inf else (adapted[n] - without[n]) / s for n, s in sizes.items()}
+    if slight is None:
+        most = (max((e[n] / s for n, s in sizes.items()), default=0.0) for e in (without, adapted))
+        slight = MINOR * min(most)
+    counted = [n for n, share in added.items() if share > slight and adapted[n] > ROUNDING * sizes[n]]
+    times = {n: adapted[n] / max(without[n], 1e-300) for n in counted}
+    name = max(added, key=lambda n: (times.get(n, 0.0) > WORSE, added[n]), default=next(iter(adapted)))
+    numbers = {"error_without": without[name], "error_with": adapted[name], "added": added.get(name, 0.0)}
+    return name, numbers, times.get(name, 0.0)
 
 
 def _model(case: Case) -> Fact:
@@ -392,10 +394,9 @@ def _model(case: Case) -> Fact:
     runs = [one.undisturbed for one in benches]
     if min(one.held(run) for one, run in zip(benches, runs, strict=True)) > MOSTLY:
         raise NotAsked("The command stands at a limit: run it where commands are free.")
-    name, numbers, harms = _added(case, *(one.errors(run) for one, run in zip(benches, runs, strict=True)))
-    spoils = (
-        case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
-    )  # more than it may cure
+    name, numbers, harms = _added(case, *(one.errors(run) for one, run in zip(benches, runs, strict=True)), SLIGHT)
+    # More than it may cure.
+    spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
     no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
     return Fact(Verdict.NO if no else Verdict.CAUTION if harms > WORSE else Verdict.YES, numbers, name)
 

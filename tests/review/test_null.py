@@ -118,3 +118,18 @@ def test_a_null_test_goes_on_until_errors_count():
         for one in (fp.ComputedTorque(law.tracking), law)
     ]
     assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=1e-6)
+
+
+def test_harm_is_a_no_however_small_the_errors_are():
+    """A mass rests at its set-point and its command is late: all errors are below a thousandth of the way there."""
+    ratios, law = [], fp.Exponential(6.0)
+    for seed in range(6):
+        speed, gain, cycles = np.random.default_rng(seed).uniform((1.5, -0.5, 1), (3, -0.05, 3)).tolist()
+        motion = fp.Trajectory(lambda t, w=speed: {"q": 0.5 - 0.5 * ca.exp(-((w * t) ** 2))})
+        late = {"u": 0.01 * round(cycles)}
+        problem = reviewed.mass(reference=motion, period=0.01, measure_from=2.0, dead_time=fp.DeadTime(late))
+        own = fp.ComputedTorque(law, fp.ModelReferenced(fp.Affine(gain)))
+        runs = [fp.simulate(problem, one, seed=0, compiled=False) for one in (own, fp.ComputedTorque(law))]
+        ratios.append(np.divide(*(fp.measure(problem, run).rms_error["q"] for run in runs)))
+        assert (reviewed.answers(problem, own)["pays"].verdict == "no") == (ratios[-1] > 1.2), (seed, ratios)
+    assert sum(ratio > 1.2 for ratio in ratios) == 2

@@ -27,7 +27,7 @@ NAMES = {  # of numbers by key, which scripts read
     "horizon": {"error", "error_with_twice_the_horizon"},
     "box": {"share_that_come_back", "left", "error"},
     "input_gain": {"most", "least"},
-    "latency": {"cycles_borne", "left", "error", "mean_step", "mean_step_without"},
+    "latency": {"cycles_borne", "left", "error", "error_without", "mean_step", "mean_step_without"},
     "limits": {"beyond", "share_of_cycles"},
     "inner": {"rate_with_outputs_held", "left"},
     "noise": {"rms_step", "error_without_noise", "error"},
