@@ -35,7 +35,8 @@ def case(name: str) -> tuple[fp.Stepper, np.ndarray]:
             values = run.time if signal.name == "time" else run[signal.name]
             rows[:, stepper.reads.slice(signal.name)] = np.reshape(values[:CYCLES], (CYCLES, -1))
     first = stepper.reads.slice("time").stop
-    rows[10, first], rows[15, first], rows[20:22, first] = np.nan, np.inf, 1e9
+    if name != "map":  # after a gap the stepper of a map fills its windows, which a Function alone does not
+        rows[10, first], rows[15, first], rows[20:22, first] = np.nan, np.inf, 1e9
     return stepper, rows
 
 
