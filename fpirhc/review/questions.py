@@ -394,7 +394,8 @@ def _model(case: Case) -> Fact:
     runs = [one.undisturbed for one in benches]
     if min(one.held(run) for one, run in zip(benches, runs, strict=True)) > MOSTLY:
         raise NotAsked("The command stands at a limit: run it where commands are free.")
-    name, numbers, harms = _added(case, *(one.errors(run) for one, run in zip(benches, runs, strict=True)), SLIGHT)
+    without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
+    name, numbers, harms = _added(case, without, adapted, SLIGHT)
     # More than it may cure.
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
     no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
