@@ -85,10 +85,6 @@ parameters as numbers
 unit in front
   fp.Parameter(approximate=1.4, exact=1.0, unit="kg") -> fp.Parameter("kg", 1.0, 1.4)
     mine.py, line 18 ... the values of 'approximate' and 'unit' are swapped; write Parameter(approximate=..., unit=...)
-names without units
-  {"angle": "rad"} -> ["angle"]
-  {"torque": "N m"} -> "torque"
-    Plant.coordinates: expected {name: a text}, got ['angle'] ... Plant.inputs: expected {name: a text}, got the text 'torque'
 unit as a name
   {"angle": "rad"} -> {"rad": "angle"}
     line 9): coordinate 'angle' is unknown. Valid: rad.
@@ -108,15 +104,9 @@ names of another tool
   start={ -> x0={
     no field 'x0'. Did you mean 'start'? ... no field 'dt'. Did you mean 'period'? ... no field 'T'. Did you mean 'duration'? ...
     Problem needs start, period, duration
-start as an array
-  start={"angle": 0.0} -> start=np.zeros(2)
-    Problem.start: expected {name: a finite number}, got an array of the shape (2,)
 limits by vectors
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(lbu=np.array([-15.0]), ubu=np.array([15.0]))
     mine.py, line 29 ... no field 'lbu'. Did you mean 'inputs'? ... no field 'ubu'. Did you mean 'inputs'?
-limits as a mapping
-  fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> {"torque": (-15.0, 15.0)}
-    Problem.limits: expected a Limits ... write fp.Limits(inputs=...)
 limits of unknown names
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"tau": (-15.0, 15.0)}, states={"angle_dot": (-3, 3)})
     input 'tau' is unknown. Valid: torque. ... state 'angle_dot' is unknown. Did you mean 'angle''?
@@ -135,21 +125,9 @@ cost on unknown names
 cost of an unknown member
   fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) -> fp.CustomCost(lambda v: {"e": v.x.angle**2})
     line 31): a View has no 'x' ... Valid: state, reference, input
-horizon by one number
-  fp.Horizon(stages=6, step=2e-2) -> 20
-    expected a Horizon or None, got 20; write fp.Horizon(stages=..., step=...)
-horizon of another tool
-  stages=6, step=2e-2 -> n_horizon=20, t_step=2e-2
-    no field 'n_horizon'. Did you mean 'stages'? ... no field 't_step'. Did you mean 'step'? ... Horizon needs stages, step
 terminal of a path
   stages=6, step=2e-2 -> stages=6, step=2e-2, terminal=("end",)
     mine.py, line 23: problem = fp.Problem( ... horizon: terminal: state 'end' is unknown. Valid: angle, angle'.
-step before stages
-  fp.Horizon(stages=6, step=2e-2) -> fp.Horizon(2e-2, 6)
-    Horizon.stages: expected a whole number from 1 to 1000000, got 0.02
-reference as a number
-  fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}) -> 0.8
-    Problem.reference: expected a Reference, got 0.8; one of Setpoint, Table, Trajectory
 reference without a function
   fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}) -> fp.Trajectory({"angle": 0.8})
     mine.py, line 25 ... expected a function of 1 argument ... write lambda t: {'angle': 0.8}
@@ -172,27 +150,9 @@ measured after the end
 disturbance without a name
   measure_from=0.05 -> disturbances=fp.Sine(0.1, 1.0)
     expected {name: a Disturbance}, got a value of the class Sine; write {'NAME': Sine(...)} with the name of what it belongs to
-disturbance as a number
-  measure_from=0.05 -> disturbances={"torque": 0.5}
-    expected a Disturbance, got 0.5; one of ColouredNoise, Formula, Noise
-dead time as a number
-  measure_from=0.05 -> dead_time=0.05
-    expected a DeadTime, got 0.05; write fp.DeadTime(inputs=...)
-noise as a number
-  measure_from=0.05 -> sensing=fp.Sensing(sensors={"angle": fp.Sensor(noise=0.01)})
-    Sensor.noise: expected a Disturbance or None, got 0.01
 deformation before the optimiser
   fp.RecedingHorizon(optimiser, adaptive) -> fp.RecedingHorizon(adaptive, optimiser)
     the values of 'optimiser' and 'deformation' are swapped
-deformation as a number
-  fp.ModelReferenced(fp.Sigmoid(gain=-2.6)) -> fp.ModelReferenced(-2.6)
-    ModelReferenced.map: expected a Deformation, got -2.6; one of Affine
-gains of a PID
-  {"RHC": fp.RecedingHorizon(optimiser) -> {"PID": fp.PID(Kp=9.0, Kd=1.0)
-    no field 'Kp'. Did you mean 'proportional'? ... no field 'Kd'. Did you mean 'derivative'?
-options of a solver
-  fp.FixedPoint(iterations=1, tolerance=1e-2) -> fp.Ipopt(max_iter=100)
-    Ipopt has no field 'max_iter'. Did you mean 'iterations'?
 class of another tool
   {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> {"MPC": fp.MPC(optimiser)}
     fpirhc has no name 'MPC'. Did you mean 'RecedingHorizon'? ... more.
@@ -349,15 +309,12 @@ compare mien.py => no file at 'mien.py'. Did you mean 'mine.py'?
 compare mine => problem 'mine' is unknown. Did you mean 'mine.py'?
 compare Two_Mass => Did you mean 'two_mass'?
 compare . => '.' is a folder; a problem file ends in .py, such as mine.py, two_mess.py
-compare notes.txt => 'notes.txt' is not a Python file; a problem file ends in .py
 mine.py => the command 'mine.py' is unknown. Write fpirhc compare mine.py.
 reveiw mine.py => Did you mean 'review'?
-review mine.py --controler RHC => the option '--controler' is unknown. Did you mean '--controllers'? ... See fpirhc review --help
 --verion => the option '--verion' is unknown. Did you mean '--version'? ... See fpirhc --help
 compare => PROBLEM ... See fpirhc compare --help
 run mine.py => CONTROLLER ... See fpirhc run --help
 compare mine.py --seed abc => '--seed' ... integer
-compare mine.py --seed => '--seed' requires an argument
 compare mine.py two_mass => unexpected extra argument ... two_mass
 compare mine.py --controllers RHC,RHC+FPI => controller 'RHC,RHC+FPI' is unknown ... names are separated by spaces, without commas
 study mine.py --draws 2 --mismatch x => expected percent of at least 0, such as 20%, got 'x'
@@ -369,76 +326,45 @@ run mine.py RHC+FPI --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.
 run mine.py RHC+FPI --set deformation.gain=-2 => has no 'gain'. Did you mean 'deformation.map.gain'?
 run mine.py RHC --set mass=2 => write exact.mass for the plant, approximate.mass for the model
 new ../my-arm => '../my-arm' is no name for a problem ... Try 'my_arm'; a folder is given by --dir
-new class => 'class' cannot be the name of a problem: it is a word of Python. Try 'my_class'
 new two_mass => 'two_mass' cannot be the name of a problem: a shipped problem has it ... Try 'my_two_mass'
 new numpy => a module of that name is installed, which the file would hide from everything beside it.
-review folder.py => 'folder.py' is a folder; a problem file ends in .py
 review mine.py --controllers => '--controllers' requires an argument
 review mine.py --controllers RCH abc =>
     1. controller 'RCH' is unknown. Did you mean 'RHC'? ... 2. controller 'abc' is unknown. Valid: RHC, RHC+FPI.
-review mine.py --mismatch -5 => expected percent of at least 0, such as 20%, got '-5'
 review mine.py --mismatch nan => expected percent of at least 0, such as 20%, got 'nan'
 study mine.py --draws 2 --headline rms_error => has a number for every coordinate; give one: 'rms_error.NAME'
-study mine.py --draws 2 --headline rms_error.angel => is unknown. Did you mean 'rms_error.angle'?
-study mine.py --draws 2 --headline max_error.phi => is unknown. Did you mean 'max_error.angle'? Valid: max_error.angle.
-study mine.py --draws 2 --headline effort.torque => metric 'effort.torque' has no better direction
 study mine.py --draws 2 --headline '' => metric '' is unknown. Valid: relative error, cycles, rms_error
 study mine.py --draws 0 => '--draws'
 study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
 study mine.py --over deformation.map.gian=1:2:3 => has no 'gian'. Did you mean 'gain'?
-compare two_mass --optimisers all --controllers CTC => plans with an optimiser
-run mine.py RHC RHC+FPI => unexpected extra argument ... RHC+FPI
 run mine.py RHC --duration 0 => '--duration' is unknown
-run mine.py RHC --set =3 => --set =3: expected PATH=NUMBER
-run mine.py RHC+FPI --set deformation.map.gain=abc => expected PATH=NUMBER, such as deformation.gain=-1.2
 run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number other than zero ... got nan
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
 run mine.py RHC --set optimiser.iterations=0 => FixedPoint.iterations: expected a whole number from 1
 run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file
-run mine.py RHC --draw -1 => '--draw'
 compare mine.py --plans --optimisers => '--optimisers' requires an argument
 compare mine.py --plans --optimisers ipot => optimiser 'ipot' is unknown. Did you mean 'ipopt'? Valid: fixed-point, ipopt,
-compare mine.py --plans --controllers RCH => controller 'RCH' is unknown. Did you mean 'RHC'?
 tune mine.py => no search space ... add to its file, for example, tuning =
 tune two_mass --trials 10000000000 => '--trials'
-tune mine.py --trials 0 => '--trials'
 tune two_mass --metric settling.qq => metric 'settling.qq' is unknown. Did you mean 'settling.q2'?
 check mine.py --ignore-below -1 => expected percent of at least 0, such as 20%, got '-1'
-check nofile => problem 'nofile' is unknown.
-check . => '.' is a folder; a problem file ends in .py, such as mine.py
 accept mine.py --reason '' => say why the new numbers are right
-accept mine.py --reason x --processes -1 => '--processes'
-accept two_mass => '--reason' ... See fpirhc accept --help
 accept two_mass --reason x --seeds 1 => '--seeds'
 export mine.py RHC --live optimiser.iterations => decides what the loop is made of
-export two_mass RHX => problem 'two_mass': controller 'RHX' is unknown. Did you mean 'RHC'? Valid: 'CTC', 'CTC+FPI (eq 3)'
 export two_mass RHC --to matlab => the target 'matlab' is unknown. ... Valid: arduino, c, fmu2, library, wasm, lab
 export two_mass CTC --name int => 'int' cannot be the name of a controller in C: expected at most 40 letters,
 export two_mass CTC --live gain =>
     setting 'gain': neither the controller nor the problem's cost, limits, dead_time, reference
-probe mine.py --amplitude -1 => expected a number of at least 0, in the unit of the signal
 probe mine.py --chatter 0 => expected a number above 0, in the unit of the signal
-probe two_mass --controller X => problem 'two_mass': controller 'X' is unknown. Valid: 'CTC', 'CTC+FPI (eq 3)'
 probe two_mass --cycles 3 => probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual
-probe mine.py --recording words.csv --cycles 7 =>
-    cycles is of an excitation, and a recording has been excited: leave one of them out
 probe mine.py --recording words.csv => recording words.csv ... abc
-probe mine.py --recording gone.csv => gone.csv
-study two_mass --limits nosuch => quantity 'nosuch' is unknown. Did you mean 'noise'? Valid: mismatch,
 study two_mass --cases heavy => problem 'two_mass' has no cases; add to its file cases = fpirhc.Cases(
-study two_mass --draws 5 => all 5 plants would be the same ... give --mismatch
-new 'two mass' => 'two mass' is no name for a problem: it must begin with a letter and go on with letters, digits
 new 2mass => Try 'plant_2mass'; a folder is given by --dir
-list --x => the option '--x' is unknown
-run two_mass RHC+FPI --set deformation.gian=-1 => (Sigmoid) has no 'gian'. Did you mean 'gain'? Valid: gain, shift, scale.
-run two_mass RHC --set m1.exact=nan => --set: 'm1.exact': expected a finite number, got nan
-compare two_mass --set exact.m9=1 => --set: 'exact.m9': 'exact.NAME' has a parameter of what moves, and there is no 'm9'.
 run two_mass RHC --set deformation.gain=-1 =>
     setting 'deformation.gain': 'deformation' of the controller (Identity) has no 'gain'. ... It has no settings; the controller
     has settings in:
 run two_mass RHC+FPI --set limits.inputs.Q3=1,2 =>
     setting 'limits.inputs.Q3': 'limits.inputs' of the problem has no 'Q3'. Did you mean 'Q2'? Valid: Q1, Q2.
-run two_mass CTC --set limits.inputs.Q1=5,-5 => problem: limits: 'Q1' has lower 5.0 above upper -5.0; swap them
 """
 NOT_WRITABLE = """
 new mine => 'mine.py' exists already and is kept; choose another name or --dir

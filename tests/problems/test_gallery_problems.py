@@ -2,7 +2,7 @@
 
 References: Hodgkin and Huxley's equations as printed in 1952 (depolarisations negative, rest at zero); LuGre friction in
 steady sliding and at break-away as printed in 1995; the rated thrust of the P220; Drexler's equations in volumes instead of
-their logarithm; SciPy's stiff integrators. Figures of the descriptions are read by `test_descriptions`.
+their logarithm; SciPy's stiff integrators.
 """
 
 from __future__ import annotations
