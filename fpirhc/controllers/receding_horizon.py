@@ -27,7 +27,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import SCALE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
+from fpirhc.horizon.stage_data import SCALE, SIZE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -43,7 +43,7 @@ from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, l
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 
-_SCALE, _STEEPEST = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST))
+_SCALE, _STEEPEST, _SIZE = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, SIZE))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
 
@@ -127,14 +127,15 @@ def _optimal_control(
     moving = live_numbers(problem.reference) if moving is None else moving
     assert problem.horizon is not None
     assert problem.cost is not None
-    ahead, read = previewed_values(problem.plant, problem.signals), {**_read_from_data(optimiser), **moving}
+    ahead, read = previewed_values(problem.plant, problem.signals), {**_read_from_data(optimiser, problem), **moving}
     limits, start = problem.limits, problem.start_state
     return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start, read)
 
 
-def _read_from_data(optimiser: Optimiser) -> dict[str, LiveNumber]:
-    """Live numbers of the optimiser that its code reads from the data of the stages."""
-    return live_numbers(*(getattr(optimiser, name) for name in optimiser.in_data))
+def _read_from_data(optimiser: Optimiser, problem: Problem) -> dict[str, LiveNumber]:
+    """Live numbers of the optimiser that its code reads from the data of the stages, and limits whose size it reads there."""
+    limits = (problem.limits.inputs,) if optimiser.sized else ()
+    return live_numbers(*(getattr(optimiser, name) for name in optimiser.in_data), *limits)
 
 
 def _due_block(cycles: int) -> Block:
@@ -224,7 +225,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     def derived(values: Mapping[str, float]) -> Derived:
         lower, upper = settled(problem.limits, values).input_bounds(plant)
         led, along = _led(problem, optimiser, ocp, values)
-        ahead = replace(along.at(values), input_lower=lower, input_upper=upper)
+        ahead = replace(along, input_lower=lower, input_upper=upper).at(values)
         settled(optimiser, values).check(ahead)
         signals = _derived_numbers(ahead) if ocp.settings else {}
         table_of = data_of if led is problem else _stage_data(led, count)
@@ -268,32 +269,33 @@ def _plan_reads(problem: Problem, ocp: OptimalControl, room: np.ndarray | None) 
 
 
 def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:
-    """Scale and largest eigenvalue of the horizon, which follow from live settings; nothing without any."""
+    """Scale, largest eigenvalue and size of the horizon, which follow from live settings; nothing without any."""
     if not ocp.settings:
         return ()
     starts = {name: tuple(map(float, values)) for name, values in _derived_numbers(ocp).items()}
-    elements = {_SCALE: ocp.input.elements, _STEEPEST: ()}
+    elements = {_SCALE: ocp.input.elements, _STEEPEST: (), _SIZE: ()}
     return tuple(Signal(name, elements[name], (), start) for name, start in starts.items())
 
 
 _LONGER = "the line search shortens its steps; plans are the same where they converge, and need more calls"
-_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER}
+_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER, _SIZE: "plans end at the tolerance of the limits before"}
 
 
 def _derived_numbers(ocp: OptimalControl) -> dict[str, np.ndarray]:
-    """Scale and largest eigenvalue, by signal."""
-    return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest])}
+    """Scale, largest eigenvalue and size of the smallest input, by signal."""
+    return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest]), _SIZE: np.array([ocp.input_size])}
 
 
 def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: Signals) -> list[Expression]:
     """The live settings, and what follows from them, at the end of a stage's data; nothing without any."""
     if not ocp.settings:
         return []
-    live = live_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser)
+    live = live_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser, problem)
     declared = {one.name: getattr(s, one.name) for one in own_signals(problem)}
     numbers = {path: declared.get(PREFIX + path, number.of(ca.MX)) for path, number in live.items()}
     settings = (numbers[path] for path in ocp.settings)
-    return [expression(ca.vertcat(*settings, graph(getattr(s, _SCALE)), graph(getattr(s, _STEEPEST))))]
+    follow = (graph(getattr(s, name)) for name in (_SCALE, _STEEPEST, _SIZE))
+    return [expression(ca.vertcat(*settings, *follow))]
 
 
 def _minus(ends: Sequence[float], shift: Expression) -> Expression:

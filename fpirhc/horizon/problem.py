@@ -16,7 +16,7 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.stage_data import SCALE, STEEPEST, Withheld
+from fpirhc.horizon.stage_data import SCALE, SIZE, STEEPEST, Withheld
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.symbolic.live import LiveNumber, Number
 
@@ -111,6 +111,14 @@ class OptimalControl:
         """Largest eigenvalue of D V'' along the reference, with a margin."""
         return steepest_curvature(self.along, self.scale)
 
+    @property
+    def input_size(self) -> float:
+        """Half the smallest range of an input; one without limits counts with its size along the reference."""
+        half = 0.5 * (self.input_upper - self.input_lower)
+        usable = np.isfinite(half) & (half > 0)
+        sizes = half if usable.all() else np.where(usable, half, sizes_along(self.nodes[1]))
+        return float(sizes.min())
+
     def scale_in(self, data: ca.MX | None) -> ca.MX:
         """D as an optimiser's expressions use it: numbers, or entries of the stages' data where settings are live.
 
@@ -140,7 +148,7 @@ class OptimalControl:
 
     def opened(self) -> OptimalControl:
         """Return the problem from which code is built: what follows from live settings or live limits has no number there."""
-        paths = (*self.settings, *self.live_bounds)
+        paths = tuple(dict.fromkeys((*self.settings, *self.live_bounds)))
         if not paths:
             return self
         nothing = cast(np.ndarray, Withheld(paths))
@@ -165,6 +173,7 @@ class OptimalControl:
         along = expand_along(self.dynamics, self.stage_cost, self.terminal_cost, nodes, self.functions)
         changed = replace(self, nodes=nodes, along=along, curvature=input_curvature(along, self.step))
         table[self.data.slice(SCALE)], table[self.data.slice(STEEPEST)] = changed.scale[:, None], changed.steepest
+        table[self.data.slice(SIZE)] = changed.input_size
         return changed
 
     @property

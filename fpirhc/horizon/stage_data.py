@@ -1,7 +1,8 @@
 """The data of the stages of one horizon: time, reference, feedforward, parameters, and what else its stages read.
 
-Where cost or limits have live numbers, the data of every stage end with the settings, the scale of the inputs D = 1 / (step c), and
-the largest eigenvalue of D V''. Python computes the last two from the settings; the optimiser reads them from the data.
+Where cost or limits have live numbers, the data of every stage end with the settings, the scale of the inputs D = 1 / (step c),
+the largest eigenvalue of D V'' and the size of the smallest input. Python computes the last three from the settings; the optimiser
+reads them from the data.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import DERIVED, PREFIX, not_live
 from fpirhc.task.reference import Reference
 
-SCALE, STEEPEST = "input_scale", "steepest"
+SCALE, STEEPEST, SIZE = "input_scale", "steepest", "input_size"
 
 
 def data_layout(plant: Plant, horizon: Horizon) -> Layout:
@@ -171,12 +172,12 @@ def live_signals(paths: tuple[str, ...], inputs: Signal) -> Layout:
     """Return the signals at the end of a stage's data; none without settings."""
     if not paths:
         return Layout()
-    return Layout((Signal("settings", paths), Signal(SCALE, inputs.elements), scalar(STEEPEST)))
+    return Layout((Signal("settings", paths), Signal(SCALE, inputs.elements), scalar(STEEPEST), scalar(SIZE)))
 
 
-def live_table(table: np.ndarray, settings: np.ndarray, scale: np.ndarray, steepest: float) -> np.ndarray:
-    """Return the data of all stages with the rows of the settings, of the scale and of the largest eigenvalue."""
-    rows = np.concatenate([settings, scale, [steepest]])
+def live_table(table: np.ndarray, settings: np.ndarray, inputs: int) -> np.ndarray:
+    """Return the data of all stages with the rows of the settings, and ones for what follows from them."""
+    rows = np.concatenate([settings, np.ones(inputs + 2)])
     return np.vstack([table, np.repeat(rows[:, None], table.shape[1], axis=1)])
 
 

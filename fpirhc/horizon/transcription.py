@@ -100,9 +100,8 @@ def _transcribed(
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
     values = {path: number.value for path, number in {**live_numbers(cost, limits), **others}.items()}
     if settings:
-        # The scale and the largest eigenvalue follow from the expansion; until `at` they are ones.
-        ones, numbers = np.ones(plant.input.size), np.array([values[path] for path in settings])
-        nodes = (*nodes[:2], live_table(nodes[2], numbers, ones, 1.0))
+        # What follows from the settings follows from the expansion; until `at` it is ones.
+        nodes = (*nodes[:2], live_table(nodes[2], np.array([values[path] for path in settings]), plant.input.size))
     _check_finite_limits(dynamics, binding, nodes)
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     functions: dict[object, ca.Function] = {}

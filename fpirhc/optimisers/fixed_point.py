@@ -17,11 +17,11 @@ from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
-from fpirhc.horizon.problem import OptimalControl, sizes_along
+from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser, first_plan, paid, sane, stage_later
 from fpirhc.optimisers.limited import limited_step, shifted_limited
 from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
-from fpirhc.optimisers.plain import PlainSettings, plain_memory, plain_step, shifted_plain
+from fpirhc.optimisers.plain import CLOSE, PlainSettings, plain_memory, plain_step, shifted_plain
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.live import settled
@@ -29,7 +29,6 @@ from fpirhc.symbolic.live import settled
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
 _FIRST_CALLS = 5  # of `converging`, before a run
-_CLOSE = 1e-4  # of the size of an input: the tolerance unless one is given
 _GROWTH = 1e12  # of a motion of the model over the horizon, beyond which rollouts of plans leave their gradients too few digits
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
@@ -135,15 +134,11 @@ class FixedPoint(Optimiser):
 
     def _plain(self, ocp: OptimalControl, *, converging: bool) -> PlainSettings:
         hessian = self.hessian or GaussNewton()
-        return PlainSettings(self._tolerance(ocp), self.map, hessian, self.damping, self.iterations or 0, converging)
+        tolerance = None if self.sized and ocp.settings else self._tolerance(ocp)
+        return PlainSettings(tolerance, self.map, hessian, self.damping, self.iterations or 0, converging)
 
     def _tolerance(self, ocp: OptimalControl) -> float:
-        if self.tolerance is not None:
-            return self.tolerance
-        half = 0.5 * (ocp.input_upper - ocp.input_lower)
-        usable = np.isfinite(half) & (half > 0)
-        sizes = half if usable.all() else np.where(usable, half, sizes_along(ocp.nodes[1]))
-        return _CLOSE * float(sizes.min())
+        return CLOSE * ocp.input_size if self.tolerance is None else self.tolerance
 
     def _limited(self, ocp: OptimalControl, iterations: int) -> LimitedSettings:
         return LimitedSettings(self._tolerance(ocp), self.feasible, self.map, self.hessian, self.damping, iterations)

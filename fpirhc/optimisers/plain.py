@@ -12,7 +12,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
-from fpirhc.horizon.stage_data import SCALE, STEEPEST
+from fpirhc.horizon.stage_data import SCALE, SIZE, STEEPEST
 from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import (
     LAST,
@@ -36,6 +36,7 @@ from fpirhc.symbolic.native import Native
 
 MOST = 100  # iterations of one converging call
 CAP = 50  # the same of one in a loop
+CLOSE = 1e-4  # of the size of an input: the tolerance unless one is given
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
 _TEXTS = ("kernels", "fixed_point", "entry")
 
@@ -44,12 +45,16 @@ _TEXTS = ("kernels", "fixed_point", "entry")
 class PlainSettings:
     """Settings of one Function."""
 
-    tolerance: Number  # of the stationarity, in the unit of the inputs
+    tolerance: Number | None  # of the stationarity, in the unit of the inputs; None: `CLOSE` times the size in the data
     map: Deformation  # the deformation that makes the next plan
     hessian: HessianModel  # second derivatives of the quadratic model
     damping: Number  # added to the curvature of the inputs, in units of it
     iterations: int  # of one call that does not converge; 0: it ends where the plan is solved, after at most `CAP`
     converging: bool  # whether a call goes on until the tolerance is met
+
+    def tolerance_in(self, ocp: OptimalControl, data: ca.MX) -> ca.MX | float:
+        """Return the tolerance as the expressions use it."""
+        return CLOSE * data[ocp.data.slice(SIZE), 0] if self.tolerance is None else ocp.number_in(self.tolerance, data)
 
     @property
     def most(self) -> int:
@@ -174,8 +179,9 @@ def _number(ocp: OptimalControl, number: Number) -> str:
 
 
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
+    own = settings.tolerance
     return {
-        "TOLERANCE": _number(ocp, settings.tolerance),
+        "TOLERANCE": f"({CLOSE!r} * data[{ocp.data.slice(SIZE).start}])" if own is None else _number(ocp, own),
         "DAMPING": _number(ocp, settings.damping),
         "SHARE": line_search.SHARE,
         "ARMIJO": line_search.ARMIJO,
@@ -263,7 +269,7 @@ def _converged(
     count, plain, ended = counts = [ca.MX.sym(name) for name in ("count", "plain", "ended")]
     tried, plan = search.tried(symbols, arguments)
     looked = search.looked(tried, plan, arguments)
-    tolerance = ocp.number_in(settings.tolerance, arguments.data)
+    tolerance = settings.tolerance_in(ocp, arguments.data)
     residual = stationarity(ocp, looked.inputs, looked.slope, arguments.lower, arguments.upper, arguments.data)
     solved = ca.logic_and(
         looked.value < line_search.UNTRIED, ca.logic_and(residual <= tolerance, looked.sent <= tolerance)
@@ -311,7 +317,7 @@ def _results(
     finite = ca.logic_and(posed, evaluated)
     residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0
-    tolerance = ocp.number_in(settings.tolerance, arguments.data)
+    tolerance = settings.tolerance_in(ocp, arguments.data)
     status = status_of(finite, ca.fmax(residual, anchor.sent), 0, tolerance)
     status = ca.if_else(empty, int(Status.INFEASIBLE), status)
     numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))
