@@ -134,7 +134,7 @@ problem = fp.Problem(
     judged=("room",),
 )
 
-plain = fp.RecedingHorizon(fp.FixedPoint(iterations=30, tolerance=1e-2))  # kW
+plain = fp.RecedingHorizon(fp.FixedPoint())
 filter = fp.DisturbanceKalman(drift={"room": 1.0, "wall": 0.03}, measured={"room": 0.03, "wall": 0.03})
 controllers = {
     "PI": fp.rivals.PID({"room": 3.0}, {"room": 1.0}),

@@ -91,7 +91,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=1.0)  # 1/ms
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # uA/cm^2
+optimiser = fp.FixedPoint()
 plain = fp.RecedingHorizon(optimiser)
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in mV/ms
 filter = fp.DisturbanceKalman(
@@ -105,7 +105,7 @@ controllers = {
     "RHC+FPI, model-referenced": fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=-1.8))),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),  # the plain form, as published
     "RHC offset-free": fp.Estimating(plain, filter, at_once=True),
-    "RHC exact model": fp.ExactModel(fp.RecedingHorizon(fp.FixedPoint(iterations=10, tolerance=1e-2))),
+    "RHC exact model": fp.ExactModel(plain),
 }
 headline = ("RHC", "RHC+FPI, model-referenced")
 why = (
