@@ -17,7 +17,6 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
@@ -315,8 +314,7 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     name = max(ratios, key=ratios.__getitem__)
     return Finding(
         f"The response of {run.controller} is measured without noise: with noise of {in_percent(NOISE)} of its range the rms error "
-        f"is {name} {before[name]:.3g} -> {after[name]:.3g}{with_space(run.unit(f'error.{name}'))}, and the command moves "
-        f"{written_out(moves)} times as much.",
+        f"of {name} is {written_out(ratios[name])} times as large, and the command moves {written_out(moves)} times as much.",
         ratios=ratios,
     )
 
