@@ -25,7 +25,7 @@ from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.symbolic.live import ANEW, PREFIX, copied, live_number, not_live
-from fpirhc.symbolic.paths import changed_at, content_at, entry, names_in, paths_to
+from fpirhc.symbolic.paths import changed_at, content_at, entry, mapped, names_in, paths_to
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -300,6 +300,7 @@ def _farthest(accepts: Callable[[float], bool], value: float, size: float, reach
 def _is_structure(owner: object, path: str) -> bool:
     value = owner
     for name in path.split("."):
+        value = mapped(value, name)
         declared = {f.name: f.metadata.get("structure") for f in fields(value)} if is_dataclass(value) else {}
         if declared and (declared.get(name) or expects_whole_number(type(value), name)):
             return True

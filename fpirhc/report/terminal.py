@@ -288,7 +288,8 @@ def _plan_row(solved: Solved) -> list[str]:
 def show_review(found: Review, *, verbose: bool = False) -> None:
     """Print the answers about the problem and every controller, those that are yes as a count."""
     for name, answers in found.answers.items():
-        shown = [one for one in answers if verbose or one.verdict != "yes"]
+        better = [one for one in answers if one.numbers.get("recommended_times", 1.0) != 1.0]
+        shown = [one for one in answers if verbose or one.verdict != "yes" or one in better]
         say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
         for one in shown:
             evidence = f" ({one.evidence})" if one.evidence else ""

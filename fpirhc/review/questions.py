@@ -363,13 +363,23 @@ def gain_by_run(case: Case) -> Fact:
         good[times] = calm and bench.back.left <= 1
         if times > 1 and not good[times]:
             break
+    if not any(good.values()):  # is its sign wrong?
+        errors[-1.0] = own.share(own.at_gain(-1.0).counted)
+        good[-1.0] = errors[-1.0] <= useful
     fine = [t for t in good if good[t]]
     most = max(fine, default=math.nan)
     best = max(most / 2, 1.0) if good[1.0] else min(fine, key=lambda t: errors[t], default=math.nan)
-    names = {1.0: "error", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
-    numbers = {names[times]: e for times, e in errors.items()} | {"recommended_times": best}
-    some = Verdict.NO if most > 0 else Verdict.UNKNOWN
-    return Fact((Verdict.YES if most >= 2 else Verdict.CAUTION) if good[1.0] else some, numbers)
+    names = {
+        1.0: "error",
+        0.5: "error_at_half",
+        2.0: "error_at_twice",
+        4.0: "error_at_four_times",
+        -1.0: "error_turned",
+    }
+    numbers = {names[times]: e for times, e in errors.items()} | ({"recommended_times": best} if fine else {})
+    some = Verdict.NO if fine else Verdict.UNKNOWN
+    grade = (Verdict.YES if most >= 2 else Verdict.CAUTION) if good[1.0] else some
+    return Fact(grade, numbers, change="Turn the sign of the gain." if -1.0 in fine else "")
 
 
 def _added(

@@ -229,8 +229,9 @@ def _rows(frame: pd.DataFrame) -> Iterator[Any]:
 def _commands(result: VariantStudy) -> Iterator[str]:
     """The command that makes the worst run of every controller once more."""
     seeds = result.table.set_index(["controller", "variant"])["seed"].to_dict()
+    file = next((word for word in shlex.split(result.command) if Path(word).stem == result.problem), result.problem)
     for row in _rows(result.summary):
-        words, of = ["fpirhc", "run", result.problem, row.controller], result.variants
+        words, of = ["fpirhc", "run", file, row.controller], result.variants
         if isinstance(of, Draws):
             words += ["--draw", row.worst_in, "--mismatch", f"{of.percent:.17g}", "--seed", str(of.seed)]
         elif isinstance(of, CasesOf):

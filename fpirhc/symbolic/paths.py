@@ -26,6 +26,13 @@ def names_in(value: object) -> list[str]:
     return []
 
 
+def mapped(value: object, name: str) -> object:
+    """The map inside a wrapper that has no field of this name: 'deformation.gain' is that of the map."""
+    while is_dataclass(value) and name not in names_in(value) and "map" in names_in(value):
+        value = getattr(value, "map")  # noqa: B009
+    return value
+
+
 def entry(value: object, name: str) -> object:
     """Return the content of a field, the value of a key, or the item at a place."""
     if isinstance(value, Mapping):
@@ -38,6 +45,7 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
     value = owner
     done: list[str] = []
     for name in path.split("."):
+        value = mapped(value, name)
         valid = names_in(value)
         if name not in valid:
             where = f"'{'.'.join(done)}' of {what}" if done else what
@@ -79,6 +87,8 @@ def changed_at(value: T, path: str, content: object, copy: Copy = validated) -> 
         copy: function (dataclass, changes by field) -> the changed copy; the default one validates.
     """
     name, _, rest = path.partition(".")
+    if mapped(value, name) is not value:
+        return cast(T, copy(value, {"map": changed_at(entry(value, "map"), path, content, copy)}))
     inner = changed_at(entry(value, name), rest, content, copy) if rest else content
     if isinstance(value, Mapping):
         return cast(T, {**value, name: inner})

@@ -21,7 +21,7 @@ NAMES = {  # of numbers by key, which scripts read
     "inverse": {"condition"},
     "ranges": {"without", "of"},
     "plans": {"not_converged", "error", "error_with_more_iterations"},
-    "gain": {"error", "error_at_half", "error_at_twice", "error_at_four_times", "recommended_times"},
+    "gain": {"error", "error_at_half", "error_at_twice", "error_at_four_times", "error_turned", "recommended_times"},
     "follows": {"error", "at_a_limit", "left_with_more_iterations"},
     "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "mean_step", "left_with_more_iterations"},
     "horizon": {"error", "error_with_twice_the_horizon"},
@@ -123,3 +123,4 @@ def test_the_command_writes_fixed_names_and_says_no_by_its_exit_code(tmp_path: P
     for answer in (a for some in told["answers"].values() for a in some):
         assert set(answer) == {"key", "question", "verdict", "numbers", "of", "change"}
         assert set(answer["numbers"]) <= NAMES[answer["key"]]
+        assert answer["key"] != "gain" or (answer["numbers"]["recommended_times"] < 0) is (code == 1)

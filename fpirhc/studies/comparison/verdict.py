@@ -304,7 +304,8 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
     if fair:
         best = min(fair, key=fair.__getitem__)
-        yield f"The smallest error is that of {best}, {written_out(100 * fair[best])} % of the range."
+        among = " of those with the wrong model" if any(e.exact for e in entries) else ""
+        yield f"The smallest error{among} is that of {best}, {written_out(100 * fair[best])} % of the range."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:
