@@ -6,7 +6,7 @@ converter with steps of 0.32 K. The model is what a step test gives: K = 0.9 and
     rms error, seed 0      T1 [degC]      T2 [degC]
     RHC                         0.71           0.20
     RHC+FPI                     0.14           0.15
-    RHC+FPI, plain form          9.3            6.3
+    RHC+FPI, plain form          9.4            6.2
     RHC offset-free             0.20           0.21
     PI of the course             1.3           0.32
 """
@@ -45,7 +45,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"T1": 1.0, "T2": 1.0}, deviation={"Q1": 1e-4, "Q2": 1e-4}),
 )
 
-optimiser = fp.FixedPoint(iterations=3, tolerance=1e-2)  # %
+optimiser = fp.FixedPoint()
 plain = fp.RecedingHorizon(optimiser)
 filter = fp.DisturbanceKalman(drift={"T1": 1e-5, "T2": 1e-5}, measured={"T1": 0.1, "T2": 0.1})
 controllers = {
