@@ -71,8 +71,7 @@ problem = fp.Problem(
     judged=("h2",),
 )
 
-# ml/s; the real-time form, with a tolerance that does not follow from limits, so that these may be live.
-plain = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))
+plain = fp.RecedingHorizon(fp.FixedPoint())
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=0.1)  # m/s
 filter = fp.DisturbanceKalman(
     drift={"h1": 1e-4, "h2": 1e-4}, measured={"h1": 1e-4, "h2": 1e-4}, noise={"h1": 2e-4, "h2": 2e-4}
