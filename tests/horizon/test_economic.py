@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.horizons import horizon_of
+from helpers.judging import Judge
 from helpers.plants import known
-from judging import Judge
 
 import fpirhc as fp
 from fpirhc.errors import NotSupported

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from foreign import FOREIGN, first_states
 from helpers.horizons import called, horizon_of, rolled
+from helpers.judging import Judge
 from helpers.kinds import slow_but
 from helpers.plants import known
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from judging import Judge
 from scipy.optimize import linprog
 
 import fpirhc as fp

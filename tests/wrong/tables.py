@@ -71,7 +71,6 @@ MAP_MEMBERS = {
     "adapts": "adaptation is told",
     "effective_gain": "first step is effective gain",
     "gain_name": "gain is proportional to its field",
-    "held": "held keeps the memory",
     "inner": "inner can be exchanged",
     "iteration": "filter and pairing are told",
     "largest_step": "step is bounded",
