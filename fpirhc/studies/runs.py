@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import math
+import signal
 import sys
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -288,6 +289,10 @@ def _remote(
     path: str, told: str, variants: Variants, name: str, some: Sequence[int], compiled: bool | None, judged: bool
 ) -> list[Row]:
     """The rows of some variants, in a process that keeps the loops of one study."""
+    with contextlib.suppress(
+        ValueError
+    ):  # a thread; Ctrl-C of a terminal reaches every process, and the first one ends the others
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     study = told, repr(variants), compiled, judged
     if getattr(_OWN, "study", None) != study:
         task = load_problem(path)
