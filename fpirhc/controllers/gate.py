@@ -228,9 +228,8 @@ class Gate:
                 start = ca.DM(self.kept[f"good_{n}"].start_vector())
                 following[f"good_{n}@{k}"] = ca.if_else(every_finite(kept), kept, start)
         if self.samples:
-            before = ca.if_else(
-                fits, own[MISSING.name], judged.missing
-            )  # a good sample that the step cannot use is not missing
+            # a good sample that the step cannot use is not missing
+            before = ca.if_else(fits, own[MISSING.name], judged.missing)
             following[MISSING.name] = ca.if_else(ran, 0, before)
         ended = ca.if_else(usable, status, int(Status.RESTARTED))
         ended = ca.if_else(fits, ca.if_else(fine, ended, int(Status.NON_FINITE)), int(Status.BAD_SAMPLE))

@@ -58,7 +58,7 @@ def shares(first: int, missing: int, known: int) -> np.ndarray:
 
 
 def _forgets(problem: Problem) -> int:
-    """Number of samples on a line after which an estimate no longer shows what was before them."""
+    """Number of samples after which an estimate no longer shows what was before them."""
     plant, estimator, period = problem.plant, problem.sensing.estimator, problem.period
     late = problem.dead_time
     queued = max(late.inputs.values(), default=0.0) / period
@@ -88,9 +88,7 @@ class Replay:
     missing: int  # place of the count of missing cycles
     clock: np.ndarray  # place of the last time; none in a loop
     status: int  # place of the status, in the trace; -1: there is none
-    kept: (
-        np.ndarray
-    )  # places of what stays as it was: the command in force, what acted, the monitor's counts, a simulated plant
+    kept: np.ndarray  # places of what stays as it was: the command in force, what acted, counts, a simulated plant
     stays: np.ndarray  # places of what stays after a long gap: all but the windows of estimators and observers
     good: dict[str, list[np.ndarray]]  # places of the last good samples, by name of their signal, the newest first
     period: float
@@ -102,7 +100,7 @@ class Replay:
         """Return the replay of a step that has the gate inside; `bridged`: None: as is usual for the problem."""
         inner = next(block.inside for block in step.blocks if block.inside is not None)
         memory = Layout(
-            tuple(s for one in step.memory.signals for s in ((inner.memory.signals) if one.name == INNER else (one,)))
+            tuple(s for one in step.memory.signals for s in (inner.memory.signals if one.name == INNER else (one,)))
         )
         windows = {s.name for block in seeing_blocks(problem) for s in block.memory.signals}
         acted = {delay.now.name for delay in inner.delays if delay.source == "command"}

@@ -111,7 +111,10 @@ def test_what_has_no_lab(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(PROBLEM)
     Path("far.py").write_text(PROBLEM + OUTSIDE)
+    lossy = 'problem = replace(problem, sensing=fp.Sensing({"q1": fp.Sensor(dropout=0.1)}))\n'
+    Path("lossy.py").write_text(PROBLEM + lossy)
     refused = {
+        "lossy.py RHC": "without the driver that runs missing cycles afterwards",
         "own.py RHC --live deformation.gian": "no controller of the lab can have 'deformation.gian' live",
         "far.py RHC": "a plant outside Python's equations has none",
     }

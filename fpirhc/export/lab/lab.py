@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError, InvalidValue, package
+from fpirhc.errors import FpirhcError, InvalidValue, NotSupported, package
 from fpirhc.export.lab.loop import LabLoop
 from fpirhc.export.targets.c import template
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
+from fpirhc.simulation.path import loses
 from fpirhc.simulation.pictures import planar
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.pictures.planar import Planar
@@ -103,6 +104,10 @@ def make_lab(
     problem.require_equations(
         "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
     )
+    if loses(problem):
+        raise NotSupported(
+            "a page steps its loop without the driver that runs missing cycles afterwards; leave dropout and range out of sensors"
+        )
     package("ziglang", "compiler", "a lab")
     loops, without = [], dict[str, str]()
     for name, controller in controllers.items():
