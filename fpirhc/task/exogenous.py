@@ -28,6 +28,7 @@ from fpirhc.symbolic.layout import Expression
 
 _FILLED: Latest[ca.Function] = Latest(16)  # every run asks for those of the plant and of the model
 _REAL: Latest[Mapping[str, Exogenous]] = Latest(8)
+_LOOKED: Latest[np.ndarray] = Latest(8)  # every variant of a problem is checked
 
 
 class Exogenous(Checked, ABC):
@@ -208,16 +209,13 @@ def check_held(
     Raises:
         InvalidProblem: names the signal, and the first such cycle.
     """
-    values, names = real_values(plant, signals), [n for n in outside_names(plant) if n in signals]
-    if values is None or _OF_MODELS.get():
+    names = [n for n in outside_names(plant) if n in signals]
+    if not names or _OF_MODELS.get():
         return
-    places = [plant.parameter.elements.index(name) for name in names]
-    count, step, mistakes = round(duration / period) * steps, period / steps, Mistakes("")
+    courses, mistakes = [signals[n].values for n in names], Mistakes("")
+    count, step = round(duration / period) * steps, period / steps
     chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).astype(int))
-    many = int(np.clip(_LOOKS[0] * _MOST_STEPS / len(chosen), *_LOOKS))
-    inside = (np.append(np.arange(many), (many - 1) / 2) + 0.5) / many  # and the middle
-    rows = rows_of(values, ((chosen[:, None] + inside) * step).ravel(), plant.exact)
-    looks = rows[:, places].reshape(len(chosen), len(inside), len(places))
+    looks = _LOOKED.of(tuple(courses), (count, step), lambda: _looked(courses, chosen, step))
     means, range_ = looks[:, :-1].mean(axis=1), np.ptp(looks, axis=(0, 1))
     arrives = np.maximum(np.ptp(means, axis=0), (1e-2 if len(chosen) > 1 else 1.0) * range_)  # a short pulse is high
     off = np.abs(means - looks[:, -1]) / np.maximum(arrives, 1e-9 * np.abs(looks).max(axis=(0, 1)) + 1e-300)
@@ -232,6 +230,15 @@ def check_held(
                 + ("a map with a shorter step" if plant.step else f"Reality(..., integrator={finer})")
             )
     mistakes.raise_if_any()
+
+
+def _looked(courses: Sequence[Course], steps: np.ndarray, step: float) -> np.ndarray:
+    """Values of the courses, shape (steps, looks, courses): all through every step, and last in its middle."""
+    many = int(np.clip(_LOOKS[0] * _MOST_STEPS / len(steps), *_LOOKS))
+    inside = (np.append(np.arange(many), (many - 1) / 2) + 0.5) / many
+    times = ((steps[:, None] + inside) * step).reshape(1, -1)
+    values = np.asarray(_course_function(courses).map(times.size)(times).full())
+    return values.T.reshape(len(steps), len(inside), len(courses))
 
 
 def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistakes) -> None:
