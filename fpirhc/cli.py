@@ -289,9 +289,10 @@ def study(
     task = _task(problem)
     from fpirhc.studies.comparison.compare import select
     from fpirhc.studies.limits import limits as find_limits
-    from fpirhc.studies.study import figure_of, write_csv
+    from fpirhc.studies.study import figure_of
     from fpirhc.studies.study import study as run_study
     from fpirhc.studies.variants import CasesOf, Draws, Grid, Variants
+    from fpirhc.summary import write_csv
 
     select(task, controllers)
     folder = _folder(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
 
 _LEAST_SHARE = 1e-5
@@ -102,6 +104,12 @@ def in_units(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
     """Return the frame; its `attrs["units"]` have the units of columns, by name, of those that have one."""
     frame.attrs["units"] = {name: unit for name, unit in units.items() if unit not in ("", "1")}
     return frame
+
+
+def write_csv(table: pd.DataFrame, path: Path) -> None:
+    """Write a table with the units of its columns in their headings."""
+    units = table.attrs.get("units", {})
+    table.rename(columns={name: f"{name} [{unit}]" for name, unit in units.items()}).to_csv(path, index=False)
 
 
 def printable(text: str) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.symbolic.paths import changed_at, content_at, names_in
@@ -76,6 +76,20 @@ def unit_of_setting(path: str, problem: Problem) -> str:
     signals = (problem.plant.state, problem.plant.input) if word in (START, "limits") else ()
     units = {n: u for one in signals for n, u in zip(one.elements, one.entry_units, strict=True)}
     return units.get(name) or units.get(name.rpartition(".")[0], "")  # 'Q1.1' is an end of Q1
+
+
+def number_of_case(problem: Problem, path: str) -> float | None:
+    """Return the number that a problem has at a path of a case; None where there is none, or no number."""
+    word, _, name = path.partition(".")
+    if word in PARAMETERS:
+        one = (problem.moved if word == "exact" else problem.plant).parameters.get(name)
+        return None if one is None else float(one.exact if word == "exact" else one.approximate)
+    if word == START:
+        return dict(zip(problem.plant.state.elements, map(float, problem.start_state), strict=True)).get(name)
+    try:
+        return current_setting(problem, path)
+    except FpirhcError:
+        return None  # 'group', 'reference', or a field that another case has made
 
 
 def current_setting(owner: Controller | Problem, path: str) -> float:

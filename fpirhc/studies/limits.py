@@ -68,7 +68,7 @@ def _mismatch(problem: Problem, seed: int) -> Quantity:
         values = np.where(scaled, model * np.exp(share * ratios), model + share * (exact - model))
         return _one(problem.with_exact(values), seed, None, problem, problem)
 
-    return Quantity("times", 1.0, 2.0, _existing(at, 1.0, 64.0), at)
+    return Quantity("times the file's", 1.0, 2.0, _existing(at, 1.0, 64.0), at)
 
 
 def _existing(at: Callable[[float], object], low: float, high: float) -> float:
@@ -139,6 +139,13 @@ def _plants(problem: Problem, seed: int) -> Quantity:
     return Quantity("% around the exact parameters", 0.0, 8.0, _existing(at, 1e-3, 99.0), at)
 
 
+_GROWS = {
+    "mismatch": "all parameters so many times as far from the model as in the file, up to 64",
+    "plants": f"the width from which {PLANTS} plants are drawn, of which none may fail, up to 99 %",
+    "latency": f"commands later by whole cycles, up to {_FARTHEST}",
+    "noise": "white noise on everything measured, its deviation beside the range of the reference, up to 410 %",
+    "lost": "samples lost at random, up to 98 %",
+}
 QUANTITIES = {"mismatch": _mismatch, "plants": _plants, "latency": _latency, "noise": _noise, "lost": _lost}
 
 
@@ -157,19 +164,24 @@ class Limits(Study):
 
     @property
     def view(self) -> View:
-        heads = ("controller", "quantity", "holds", "fails", "why")
+        heads = ("controller", "what grows", "holds at", "fails at", "why")
         shown = Table(f"{self.problem}: where controllers fail", [Column(c) for c in heads])
         rows: Iterator[Any] = self.table.itertuples()
         for row in rows:
-            holds = "none" if math.isnan(row.holds) else number(row.holds)
-            fails = "as it stands" if math.isnan(row.holds) and row.unit else number(row.fails)
-            what = f"{row.quantity} [{row.unit}]" if row.unit else row.quantity
+            share = row.unit.startswith("of ")  # of the range, of the samples
+            holds, fails = (number(100 * value if share else value) for value in (row.holds, row.fails))
+            holds = "none" if math.isnan(row.holds) else holds
+            fails = (
+                "as it stands" if math.isnan(row.holds) and row.unit else "none tried" if row.fails > 1e300 else fails
+            )
+            what = f"{row.quantity} [{'% ' if share else ''}{row.unit}]" if row.unit else row.quantity
             shown.add([row.controller, what, holds, fails, row.why])
         tried = self.table.loc[self.table.unit != ""]
         said = [_most(str(name), some) for name, some in tried.groupby("quantity", sort=False)]
+        grows = "; ".join(f"{name}, {_GROWS[name]}" for name in dict.fromkeys(self.table.quantity))
         about = (
-            f"A run fails if it ends early, leaves a hard limit by {in_percent(_OUTSIDE)} of its range, or has a relative "
-            f"rms error above {in_percent(self.fails)}."
+            f"What grows until a run fails, found to 5 %: {grows}. A run fails if it ends early, leaves a hard limit by "
+            f"{in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the reference's range."
         )
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
         return self.viewed([(text, None) for text in said if text], about, (shown,), facts)

@@ -172,9 +172,9 @@ def run_variants(
 ) -> pd.DataFrame:
     """Run every controller in every variant and return a row for each, in order; its `attrs["units"]` are those of the columns.
 
-    Columns: controller, variant, group, seed, a column for every path that a grid changes, outcome ('finished', 'diverged' with an
-    error as large as the motion, 'ended early', 'refused'), error (relative to the references' ranges), lasted (share of the
-    cycles), a column for every number of a metric, and why a run failed.
+    Columns: controller, variant, group, seed, a column for every number that the variants change, by its path, 'exact.m1', outcome
+    ('finished', 'diverged' with an error as large as the motion, 'ended early', 'refused'), error (relative to the references'
+    ranges), lasted (share of the cycles), a column for every number of a metric, and why a run failed.
 
     Args:
         controllers: names; None: all.
@@ -289,9 +289,8 @@ def _remote(
     path: str, told: str, variants: Variants, name: str, some: Sequence[int], compiled: bool | None, judged: bool
 ) -> list[Row]:
     """The rows of some variants, in a process that keeps the loops of one study."""
-    with contextlib.suppress(
-        ValueError
-    ):  # a thread; Ctrl-C of a terminal reaches every process, and the first one ends the others
+    with contextlib.suppress(ValueError):  # a thread
+        # Ctrl-C of a terminal reaches every process, and the first one ends the others.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     study = told, repr(variants), compiled, judged
     if getattr(_OWN, "study", None) != study:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,11 @@ from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import CasesOf, Draws, Variants
 from fpirhc.studies.view import Progress, Study, View, circumstances
-from fpirhc.summary import Column, Table, in_percent
+from fpirhc.summary import Column, Table, in_percent, written_out
 
 _TAIL = 0.025  # on either side of an interval
+_MOVES = "total_variation."  # by input
+_ABREAST, _EVEN = 2, 1e-6  # panels of a picture; by how much equal steps of an axis differ
 _CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than"}
 
 
@@ -34,7 +36,8 @@ class VariantStudy(Study):
     Args:
         table: a row per controller and variant, see `run_variants`.
         summary: a row per controller: worst, worst_in, failures, median, difference to the first one (the median of the paired
-            ones), its 95 % interval from low to high, and in how many variants it is better.
+            ones), its 95 % interval from low to high, in how many variants it is better, and the median total variation per unit
+            of time of every input in runs that finished, 'total_variation.INPUT'.
         groups: the same of every group of cases.
         figure: the number that is judged.
         variants: of the study.
@@ -54,10 +57,7 @@ class VariantStudy(Study):
     @property
     def view(self) -> View:
         title = f"{self.problem}: {self.count} variants"
-        tables = [
-            self._shown(title, self.summary),
-            *(self._shown(f"group {g}", some) for g, some in self.groups.items()),
-        ]
+        tables = [self._shown(name, some) for name, some in {title: self.summary, **self.groups}.items()]
         failed = self.table.loc[self.table.outcome != "finished"].groupby("controller", sort=False).first()
         lists = {
             "Why runs failed": [f"{r.controller}, {r.variant}: {r.outcome} {r.why}".rstrip() for r in _rows(failed)],
@@ -71,19 +71,23 @@ class VariantStudy(Study):
             "groups": {g: some.reset_index().to_dict("records") for g, some in self.groups.items()},
             "versions": self.versions,
         }
-        return self.viewed([*_sentences(self)], f"{self.variants}.", tables, facts, lists=lists)
+        shares = "" if self.figure.metric else " Errors are rms, in % of the range of the reference."
+        return self.viewed([*_sentences(self)], f"{self.variants}.{shares}", tables, facts, lists=lists)
 
     def _shown(self, title: str, summary: pd.DataFrame) -> Table:
-        noun = self.figure.column
-        heads = ["controller", f"worst {noun}", "in", "failures", f"median {noun}", "difference", "95 %", "better in"]
-        shown = Table(title, [*map(Column, heads[:-1]), Column(heads[-1], None)])  # the verdict has it
+        noun, first, units = self.figure.column, summary.index[0], self.table.attrs["units"]
+        moves = [name for name in map(str, summary) if name.startswith(_MOVES) and name != noun]
+        heads = ["controller", f"worst {noun}", f"worst {self.variants.place}", "failures", f"median {noun}"]
+        heads += [f"against {first}", "95 %", *(f"moves {n.removeprefix(_MOVES)} [{units.get(n, '1')}]" for n in moves)]
+        shown = Table(title, [*map(Column, heads), Column("better in", None)])  # the verdict has it
         text, apart = self.figure.text, self.figure.difference
         for row in _rows(summary):
             between = "" if math.isnan(row.low) else f"{apart(row.low)} to {apart(row.high)}"
             difference = "" if math.isnan(row.difference) else apart(row.difference)
-            better = f"{row.better} of {row.variants}" if row.controller != summary.index[0] else ""
-            numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between, better]
-            shown.add([row.controller, *numbers])
+            better = f"{row.better} of {row.variants}" if row.controller != first else ""
+            numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between]
+            moved = [written_out(float(summary[name][row.controller])) for name in moves]
+            shown.add([row.controller, *numbers, *moved, better])
         return shown
 
 
@@ -116,16 +120,8 @@ def study(
     begin, chosen = time.perf_counter(), select(task, controllers)
     check_gains(task, chosen)
     aim = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
-    table = run_variants(
-        task,
-        variants,
-        controllers=list(chosen),
-        processes=processes,
-        compiled=compiled,
-        judged=aim.judged,
-        keep=folder and folder / "runs.jsonl",
-        progress=progress,
-    )
+    how: dict[str, Any] = {"processes": processes, "compiled": compiled, "judged": aim.judged, "progress": progress}
+    table = run_variants(task, variants, controllers=list(chosen), keep=folder and folder / "runs.jsonl", **how)
     named = table.loc[table.group != ""]
     groups = {str(g): summarised(some, aim) for g, some in named.groupby("group", sort=False)}
     facts = circumstances(task, chosen, command, begin)
@@ -141,6 +137,8 @@ def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
     wide = values.pivot(index="variant", columns="controller", values="value")
     wide = wide.loc[[*dict.fromkeys(table.variant)], [*dict.fromkeys(table.controller)]]
     failures = (table.outcome != "finished").groupby(table.controller).sum()
+    moves = [column for column in map(str, table) if column.startswith(_MOVES)]
+    moved = table.loc[table.outcome == "finished"].groupby("controller")[moves].median()
     first, rows = wide.iloc[:, 0].to_numpy(), {}
     for name in map(str, wide):
         own, baseline = wide[name].to_numpy(), name == wide.columns[0]
@@ -157,6 +155,7 @@ def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
             "high": max(aim.sign * low, aim.sign * high),
             "better": int((own < first).sum()),
             "variants": len(own),
+            **{column: float(moved[column].get(name, math.nan)) for column in moves},
         }
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("controller")
 
@@ -201,10 +200,7 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
         clear = Outcome.BETTER if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
         said = _CLEAR.get(clear, "is not clearly different from")
-        yield (
-            f"{row.controller} {said} {summary.index[0]} by {aim.column}: {than} in {row.better} of {row.variants}.",
-            clear,
-        )
+        yield f"{row.controller} {said} {summary.index[0]} by {aim.column}: {share}.", clear
     axes = getattr(result.variants, "axes", {})
     for name, some in result.table.groupby("controller", sort=False) if axes else ():
         good = some.loc[some.outcome == "finished"]
@@ -214,12 +210,10 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
             yield f"{name}: the {most} {aim.column} is {number}, at {place}.", None
     for row in _rows(summary):
         low, high = share_interval(row.failures, row.variants)
-        drawn = f": {in_percent(low)} to {in_percent(high)} of what is drawn so, with 95 % confidence"
+        drawn = f"; of all plants drawn so {in_percent(low)} to {in_percent(high)} fail, with 95 % confidence"
         if result.variants.random or row.failures:
-            yield (
-                f"{row.controller} fails in {row.failures} of {row.variants}{drawn if result.variants.random else ''}.",
-                None,
-            )
+            sampled = drawn if result.variants.random else ""
+            yield f"{row.controller} fails in {row.failures} of {row.variants}{sampled}.", None
 
 
 def _rows(frame: pd.DataFrame) -> Iterator[Any]:
@@ -243,37 +237,50 @@ def _commands(result: VariantStudy) -> Iterator[str]:
 
 def figure_of(result: VariantStudy) -> Any:
     """Return the picture of a study: lines or maps over the settings of a grid, else the sorted values of every controller."""
-    from fpirhc.simulation.drawing import PALETTE, draw_legend, new_figure
+    from fpirhc.simulation.drawing import PALETTE, draw_legend, literal, new_figure
 
     axes, table = getattr(result.variants, "axes", {}), result.table
     column, units = result.figure.column, table.attrs["units"]
     with_unit = {name: f"{name} [{units[name]}]" if name in units else name for name in (column, *axes)}
+    with_unit |= {"error": "rms error / range of the reference"}
     shown = table.assign(shown=table[column].where(table.outcome == "finished"))
     names = list(dict.fromkeys(table.controller))
     if len(axes) == 2:
-        figure = new_figure(4.6 * len(names), 3.9, f"{result.problem}: {column}")
-        (x, y), panels = axes, figure.subplots(1, len(names), squeeze=False)[0]
-        for panel, name in zip(panels, names, strict=True):
+        rows, abreast = -(-len(names) // _ABREAST), min(len(names), _ABREAST)
+        figure = new_figure(4.6 * abreast, 3.9 * rows, f"{result.problem}: {column}")
+        (x, y), [*panels] = axes, figure.subplots(rows, abreast, squeeze=False).flat
+        least, largest = shown.shown.min(), shown.shown.max()
+        for spare in panels[len(names) :]:
+            spare.remove()
+        for panel, name in zip(panels, names, strict=False):
             cells = shown[shown.controller == name].pivot(index=y, columns=x, values="shown")
-            mesh = panel.pcolormesh(
-                cells.columns, cells.index, cells, shading="nearest", vmin=shown.shown.min(), vmax=shown.shown.max()
-            )
-            panel.set(title=name, xlabel=with_unit[x], ylabel=with_unit[y])
-        figure.colorbar(mesh, ax=list(panels), label=with_unit[column])
+            mesh = panel.pcolormesh(cells.columns, cells.index, cells, shading="nearest", vmin=least, vmax=largest)
+            panel.set(title=literal(name), xlabel=literal(with_unit[x]), ylabel=literal(with_unit[y]))
+            _scale(panel.set_xscale, axes[x])
+            _scale(panel.set_yscale, axes[y])
+        figure.colorbar(mesh, ax=panels[: len(names)], label=with_unit[column])
         return figure
-    figure = new_figure(9, 4.5, f"{result.problem}: {column}")
+    figure = new_figure(7, 4, f"{result.problem}: {column}")
     axis = figure.subplots()
     for name, colour in zip(names, PALETTE * len(names), strict=False):
         own = shown[shown.controller == name]
         across = own[next(iter(axes))] if axes else np.linspace(0, 100, len(own))
-        axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colour, label=name)
+        axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colour, label=literal(name))
     axis.set_yscale("log" if shown.shown.min() > 0 else "linear")
-    axis.set(xlabel=with_unit[next(iter(axes))] if axes else "share of the variants [%]", ylabel=with_unit[column])
+    axis.set(xlabel="share of the variants [%]", ylabel=with_unit[column])
+    for name, values in axes.items():
+        axis.set_xlabel(literal(with_unit[name]))
+        _scale(axis.set_xscale, values)
     draw_legend(axis)
     return figure
 
 
-def write_csv(table: pd.DataFrame, path: Path) -> None:
-    """Write a table with the units of its columns in their headings."""
-    units = table.attrs.get("units", {})
-    table.rename(columns={name: f"{name} [{unit}]" for name, unit in units.items()}).to_csv(path, index=False)
+def _scale(set_scale: Callable[..., None], values: Sequence[float]) -> None:
+    """Make an axis of a grid logarithmic where its values have equal ratios, and neither equal steps nor different signs."""
+    sizes, more = np.abs(values), {} if min(values) > 0 else {"linthresh": min(map(abs, values)) or 1.0}
+    if (
+        len(values) > 2
+        and values[0] * values[-1] > 0
+        and np.ptp(np.diff(np.log(sizes))) < _EVEN < np.ptp(np.diff(sizes))
+    ):
+        set_scale("symlog" if more else "log", **more)

@@ -6,7 +6,7 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Any, Self
@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.plant import drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task, with_numbers_of_all
-from fpirhc.problem_files.settings import of_problem, with_numbers
+from fpirhc.problem_files.settings import number_of_case, of_problem, with_numbers
 from fpirhc.task.problem import Problem
 
 _WHOLE_CYCLE = 1e-9  # cycles by which a dead time of whole ones may be off
@@ -54,6 +54,7 @@ class Variants(ABC):
         return {"variants": repr(self)}
 
     random = False  # whether they are a sample, from which the share of failures follows
+    place = "at"  # what a table calls one
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class CasesOf(Variants):
 
     patterns: tuple[str, ...] = ("all",)
     seed: int = 0
+    place = "case"
 
     def __str__(self) -> str:
         return f"cases {', '.join(self.patterns)}, seed {self.seed}"
@@ -76,14 +78,17 @@ class CasesOf(Variants):
             raise InvalidValue(
                 f"problem '{task.name}' has no cases; add to its file cases = fpirhc.Cases({{'heavy': {{'exact.mass': 2.0}}}})"
             )
-        made, variants = dict[object, Problem](), []
-        for name in cases.matching(self.patterns):
-            key, own = cases.key(name), cases.seed(name)
+        made, variants, chosen = dict[object, Problem](), [], cases.matching(self.patterns)
+        paths = dict.fromkeys(path for name in chosen for path in cases.changes[name])
+        for name in chosen:
+            key, seed = cases.key(name), cases.seed(name)
             if key not in made:
                 made[key] = cases.build(name, task.problem)
-            seed = _streams(self.seed, cases.names.index(name)).generate_state(1)[0] if own is None else own
+            if seed is None:
+                seed = int(_streams(self.seed, cases.names.index(name)).generate_state(1)[0])
             problem = cases.exactly(name, made[key])
-            variants.append(Variant(name, problem, key, seed=int(seed), group=cases.group(name), built=made[key]))
+            numbers = {path: value for path in paths if (value := number_of_case(problem, path)) is not None}
+            variants.append(Variant(name, problem, key, {}, seed, cases.group(name), numbers, made[key]))
         return _told_apart(variants)
 
 
@@ -99,6 +104,7 @@ class Draws(Variants):
     percent: float = 0.0
     seed: int = 0
     random = True
+    place = "plant"
 
     def __str__(self) -> str:
         within = f"within {self.percent:g} % of the problem's"
@@ -115,34 +121,32 @@ class Draws(Variants):
         """Return the variants of a problem."""
         if self.count < 1:
             raise InvalidValue(f"draws {self.count}: expected at least 1")
-        widths = [high > low for low, high in exact_ranges(problem.moved, self.percent).values()]
+        wide = {n for n, (low, high) in exact_ranges(problem.moved, self.percent).items() if high > low}
         late = bool(self.percent) and _is_late(problem)
         noisy = bool(problem.disturbances) or not problem.sensing.ideal or problem.foreign is not None
-        if self.count > 1 and not (any(widths) or late or noisy):
+        if self.count > 1 and not (wide or late or noisy):
             mend = "state parameters of the plant, or a dead time" if self.percent else "give --mismatch P"
             raise InvalidValue(
                 f"all {self.count} plants would be the same: the problem has no disturbances, no noise, and nothing that is drawn; "
                 f"{mend}"
             )
-        times = {side: _with_dead_times(problem, side * self.percent) if late else problem for side in (-1, 1)} | {
-            0: problem
-        }
-        return _Lazy(self.count, lru_cache(4096)(partial(self._one, problem, times)))
+        times = {s: _with_dead_times(problem, s * self.percent) if late and s else problem for s in (-1, 0, 1)}
+        return _Lazy(self.count, lru_cache(4096)(partial(self._one, problem, times, wide)))
 
-    def _one(self, problem: Problem, times: Mapping[int, Problem], number: int) -> Variant:
+    def _one(self, problem: Problem, times: Mapping[int, Problem], wide: Container[str], number: int) -> Variant:
         parameters, noise, late = _streams(self.seed, number).spawn(3)
         shares = np.random.default_rng(parameters).random(len(problem.moved.parameters))
-        own = problem.moved.parameters.values()
-        exact = [drawn(p, self.percent, float(s)) for p, s in zip(own, shares, strict=True)]
+        stated = zip(problem.moved.parameters.items(), shares, strict=True)
+        exact = {name: drawn(one, self.percent, float(share)) for (name, one), share in stated}
         built = times[int(np.random.default_rng(late).integers(-1, 2))]
-        return Variant(
-            str(number),
-            built.with_exact(np.array(exact, dtype=float)) if self.percent else built,  # a body outside may have none
-            id(built),
-            seed=int(noise.generate_state(1)[0]),
-            built=built,
-            believed=problem,
-        )
+        numbers = {f"exact.{name}": float(value) for name, value in exact.items() if name in wide}
+        if len({*times.values()}) > 1:
+            now = {"dead_time.measurement": built.dead_time.measurement}
+            numbers |= now | {f"dead_time.inputs.{name}": value for name, value in built.dead_time.inputs.items()}
+        # A body outside may have no parameters.
+        own = built.with_exact(np.array([*exact.values()], dtype=float)) if self.percent else built
+        seed = int(noise.generate_state(1)[0])
+        return Variant(str(number), own, id(built), {}, seed, "", numbers, built, believed=problem)
 
 
 @dataclass(frozen=True)
@@ -175,17 +179,10 @@ class Grid(Variants):
             numbers = dict(zip(self.axes, values, strict=True))
             ours = {own: numbers[path] for path, own in paths.items() if own}
             fixed = {path: value for path, value in ours.items() if not path.startswith("exact.")}
-            variants.append(
-                Variant(
-                    ", ".join(f"{path} = {value:.10g}" for path, value in numbers.items()),
-                    problem_with(ours),
-                    tuple(sorted(fixed.items())),
-                    {path: value for path, value in numbers.items() if paths[path] is None},
-                    self.seed,
-                    numbers=numbers,
-                    built=problem_with(fixed),
-                )
-            )
+            name = ", ".join(f"{path} = {value:.10g}" for path, value in numbers.items())
+            settings = {path: value for path, value in numbers.items() if paths[path] is None}
+            build, own = tuple(sorted(fixed.items())), problem_with(ours)
+            variants.append(Variant(name, own, build, settings, self.seed, "", numbers, problem_with(fixed)))
         return _told_apart(variants)
 
     @classmethod

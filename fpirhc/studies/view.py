@@ -49,17 +49,7 @@ class View:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Study(ABC):
-    """The result of a study.
-
-    Args:
-        problem: name of the problem.
-        title: its title.
-        description: its description.
-        settings: settings of the problem and the controllers.
-        versions: versions of fpirhc and of what its numbers depend on.
-        command: the command line.
-        elapsed: wall time, s.
-    """
+    """The result of a study: its problem, settings of the problem and the controllers, versions, command line, wall time in s."""
 
     problem: str
     title: str

@@ -118,7 +118,10 @@ def test_the_row_of_a_drawn_plant_is_the_run_of_a_fresh_loop(late, times, task):
         row = table.set_index(["controller", "variant"]).loc["CTC", one.name]
         assert row["rms_error.y"] == fp.measure(one.problem, run).rms_error["y"]
         assert row.seed == one.seed
+        assert row[["exact.b", "exact.k"]].tolist() == one.problem.plant.exact.tolist()
+        assert row.get("dead_time.inputs.u", 0.0) == now.inputs.get("u", 0.0)
     assert found == times
+    assert ("dead_time.measurement" in table) == (times != {0})
 
 
 def test_a_case_changes_what_it_states_and_nothing_else(task):
@@ -158,6 +161,9 @@ def test_cases_are_their_problems(task):
     assert heavy.variant.tolist() == ["stiff", "known"]
     assert heavy.seed[1] == table.seed["known"] != table.seed["usual"]
     assert table.seed["far"] == 7
+    assert table["exact.k"].tolist() == [5.0, 5.0, 8.0, 5.0, 5.0]
+    assert table["start.y'"].tolist() == [0.0, 0.0, 0.0, 0.0, -0.5]
+    assert table["known.b"].tolist() == [1.0, 1.0, 1.0, 2.0, 1.0]
     assert table.group.tolist() == ["", "light", "heavy", "heavy", ""]
 
 
@@ -261,6 +267,9 @@ def test_a_summary_is_that_of_the_rows(task):
     assert found.summary.difference["CTC+FPI"] == pytest.approx(apart.median())
     assert found.summary["median"].to_dict() == pytest.approx(own.median().to_dict())
     assert found.summary.better["CTC+FPI"] == (apart < 0).sum()
+    moves = found.table.groupby("controller")["total_variation.u"].median()
+    assert found.summary["total_variation.u"].to_dict() == moves.to_dict()
+    assert f"{moves['CTC']:.3g}" in found.view.tables[0].rows[0].cells
     # Of 12 differences the third and the tenth bound the median with 96 % (the binomial distribution of signs).
     assert found.summary.loc["CTC+FPI", ["low", "high"]].tolist() == pytest.approx(sorted(apart)[2:10:7], rel=1e-12)
     [(text, outcome)] = [(t, o) for t, o in found.view.sentences if t.startswith("CTC+FPI ")][:1]
@@ -273,7 +282,7 @@ def test_a_summary_is_that_of_the_rows(task):
 def test_failures_are_counted_and_worse_than_any_error(task):
     """A limit that few plants break; of named cases, which are no sample, no share of others is said."""
     calm = fp.study(task, fp.Draws(12, 20.0, 5), controllers=["CTC"], compiled=False)
-    assert any(t.startswith("CTC fails in 0 of 12: 0 % to ") for t in sentences(calm))
+    assert any(t.startswith("CTC fails in 0 of 12; of all plants drawn so 0 % to ") for t in sentences(calm))
     assert any(f"{100 * (1 - 0.05 ** (1 / 12)):.3g} %" in t for t in sentences(calm))  # the rule of three, 3 / 12
     narrow = replace(task, problem=replace(task.problem, limits=fp.Limits(inputs={"u": (-0.5, 0.5)})))
     found = fp.study(narrow, fp.CasesOf(), controllers=["CTC"], compiled=False)
@@ -326,16 +335,22 @@ def test_the_cost_can_be_judged():
 
 
 @pytest.mark.parametrize(
-    ("words", "count"),
+    ("words", "count", "scales"),
     [
-        ("--draws 3 --mismatch 20%", 9),
-        ("--cases heavy far", 9),
-        ("--over deformation.gain=-1:-0.2:3 exact.b=1:2:2", 18),
-        ("--limits mismatch lost", 6),
+        ("--draws 3 --mismatch 20%", 9, []),
+        ("--cases heavy far", 9, []),
+        ("--over deformation.gain=-1:-0.2:3 exact.b=1:2:2", 18, []),
+        ("--over exact.b=1:2:3:log", 9, ["log"]),
+        ("--over deformation.gain=-1:-0.2:3:log exact.b=1:2:3", 27, ["symlog"] * 3),
+        ("--limits mismatch lost", 6, []),
     ],
 )
-def test_the_command_writes_a_page_and_a_table(words, count, task, capsys):
+def test_the_command_writes_a_page_and_a_table(words, count, scales, task, capsys, monkeypatch):
+    """What is swept in equal ratios is drawn so, of either sign."""
+    found: list[str] = []
+    monkeypatch.setattr("matplotlib.axes.Axes.set_xscale", lambda _, scale, **__: found.append(scale))
     assert main(["study", "line.py", *words.split(), "--no-compile", "--json", "--out", "out"]) == 0
     assert json.loads(capsys.readouterr().out)["versions"]["fpirhc"]
     assert "<html" in Path("out/report.html").read_text()
     assert len(pd.read_csv("out/study.csv")) == count
+    assert found == scales
