@@ -7,6 +7,7 @@ so that a user sees them together.
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -149,14 +150,17 @@ class CompileError(FpirhcError, RuntimeError):
 def nearest(name: object, valid: Iterable[str]) -> str:
     """Return ' Did you mean ...? Valid: ...', the end of a message about an unknown `name`, which may be no text.
 
-    The nearest name is also found by what other tools call it, and a derivative by the spellings angle_dot and angle_ddot.
+    The nearest name is also found by what other tools call it: angle' by angle_dot, angle_rate, angle_velocity, dangle, velocity.
     Of a long list the nearest names are shown.
     """
     names = [str(one) or "''" for one in valid]
     if not names:
         return " No names are valid here."
     near = _near(name, names) if isinstance(name, str) else []
-    hint = f" Did you mean '{near[0]}'?" if near else ""
+    quote = '"' if near and "'" in near[0] else "'"
+    hint = f" Did you mean {quote}{near[0]}{quote}?" if near else ""
+    if quote != '"' and "_" in str(name) and (of := _base(str(name), "'")) in names:
+        hint = f" A derivative is v.{of} in equations of motion, and {of}' elsewhere."
     if len(names) <= _MANY:
         return f"{hint} Valid: {listed(names)}."
     shown = get_close_matches(str(name), names, n=_SHOWN, cutoff=0)
@@ -183,14 +187,26 @@ def listed(names: Sequence[str]) -> str:
 
 def _near(name: str, names: Sequence[str]) -> list[str]:
     """Valid names that may be meant, the likeliest first."""
-    derivative = name.removesuffix("_ddot") + "''" if name.endswith("_ddot") else name.removesuffix("_dot") + "'"
-    elsewhere = [one for one in (derivative, *OF_OTHER_TOOLS.get(name, ())) if one in names]
+    elsewhere = [one for one in OF_OTHER_TOOLS.get(name, ()) if one in names]
+    for primes in _DERIVATIVES:
+        if (of := _base(name, primes)) is not None:
+            elsewhere += [one for one in names if one == (of or one.rstrip("'")) + primes]
     same = [one for one in names if one.casefold() == name.casefold()]
     inside = [one for one in names if len(name) > _LETTER and name.casefold() in one.casefold()]
     return [*elsewhere, *same, *get_close_matches(name, names, n=1, cutoff=0.5), *inside]
 
 
+def _base(name: str, primes: str) -> str | None:
+    """What a name is a derivative of, by the spellings of others; '' where it does not say."""
+    found = re.fullmatch(_DERIVATIVES[primes], name, re.IGNORECASE)
+    return found and "".join(filter(None, found.groups()))
+
+
 _MANY, _SHOWN = 40, 8  # names beyond which a list is cut, and to how many
+_DERIVATIVES = {  # how others write them
+    "''": r"(.+?)_?ddot|(.+)_acc\w*|(?:dd_?|d2_?|acc\w*_)(.+)|acc\w*",
+    "'": r"(.+?)_?dot|(.+)_(?:rate|vel\w*|speed)|(?:d_?|vel\w*_|speed_|rate_|v_)(.+)|vel\w*|speed|rate",
+}
 _LETTER = 1  # character, which is a part of too many names to mean one
 
 OF_OTHER_TOOLS = {

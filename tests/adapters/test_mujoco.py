@@ -156,7 +156,7 @@ def test_a_file_is_read_too(tmp_path):
         ({"joints": {"elbow": "elbo"}}, "joint 'elbo' is unknown. Did you mean 'elbow'? Valid: shoulder, elbow."),
         ({"joints": {"elbo": "elbow"}}, "joints: name of the model 'elbo' is unknown. Did you mean 'elbow'?"),
         ({"actuators": {"M1": "M3"}}, "actuator 'M3' is unknown. Did you mean 'M2'?"),
-        ({"start": {"elbow''": 1.0}}, "start: quantity 'elbow''' is unknown. Did you mean 'elbow''?"),
+        ({"start": {"elbow''": 1.0}}, "start: quantity 'elbow''' is unknown. Did you mean \"elbow'\"?"),
         (
             {"period": 1.7e-3},
             "a cycle of 0.0017 s is no whole number of its steps of 0.0005 s; choose a period of 0.0015 s",

@@ -109,7 +109,7 @@ limits by vectors
     mine.py, line 29 ... no field 'lbu'. Did you mean 'inputs'? ... no field 'ubu'. Did you mean 'inputs'?
 limits of unknown names
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"tau": (-15.0, 15.0)}, states={"angle_dot": (-3, 3)})
-    input 'tau' is unknown. Valid: torque. ... state 'angle_dot' is unknown. Did you mean 'angle''?
+    input 'tau' is unknown. Valid: torque. ... state 'angle_dot' is unknown. Did you mean "angle'"?
 cost by matrices
   fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) ->
       fp.Quadratic(Q=np.diag([1e3, 1.0]), R=np.eye(1))
@@ -121,7 +121,7 @@ cost on unknown names
   fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) ->
       fp.Quadratic(states={"theta": 1.0}, effort={"force": 1e-2}, terminal={"angle_dot": 1.0})
     states: 'theta' is unknown ... effort: 'force' is unknown. Did you mean 'torque'? ... terminal: 'angle_dot' is unknown. Did
-    you mean 'angle''?
+    you mean "angle'"?
 cost of an unknown member
   fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) -> fp.CustomCost(lambda v: {"e": v.x.angle**2})
     line 31): a View has no 'x' ... Valid: state, reference, input

@@ -13,7 +13,7 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.errors import InvalidName, InvalidProblem, NotSupported
 
 shortened = cache(
     lambda: replace(tasks.two_mass, problem=replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
@@ -101,6 +101,14 @@ def test_the_nearest_name_is_offered():
         tasks.two_mass.problem.plant.parameters["mm"]
     with pytest.raises(KeyError):
         tasks.two_mass.controllers["nothing like it"]
+
+
+@pytest.mark.parametrize("name", ["q1_rate", "q1_dot", "q1dot", "dq1", "q1_velocity", "speed_q1"])
+def test_a_derivative_is_known_by_the_spellings_of_others(name):
+    with pytest.raises(InvalidProblem, match=f"state '{name}' is unknown. Did you mean \"q1'\""):
+        replace(tasks.two_mass.problem, start={**tasks.two_mass.problem.start, name: 0.0})
+    with pytest.raises(InvalidName, match="A derivative is v.q1 in equations" if "q1_" in name else "Valid: q1, q2"):
+        tasks.two_mass.problem.plant.coordinates[name]
 
 
 def test_what_a_frozen_value_holds_stays():
