@@ -17,8 +17,8 @@ from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.conformance.loops import REPLAYED, Replay, Trial, coarse_steps, spelled_by_states, two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
+from fpirhc.controllers.composed import compose_controller
 from fpirhc.controllers.contract import resolved, tracking_law, with_optimiser
-from fpirhc.controllers.sensing_chain import compose_controller
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Identity, automatic, with_inner
 from fpirhc.describe import describe

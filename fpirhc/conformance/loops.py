@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.sensing_chain import compose_controller
+from fpirhc.controllers.composed import compose_controller
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.motion import Output

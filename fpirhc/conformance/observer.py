@@ -14,7 +14,7 @@ from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.observed_state import believed_integrator, moving
+from fpirhc.controllers.path import observed_model
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, unobservable, values_of
@@ -112,12 +112,12 @@ def right_model_believes_what_is(trial: _Trial, generator: np.random.Generator) 
 
 
 def lives_in_the_time_of_the_samples(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """Behind a measurement that is late by 2.25 cycles it is the state of that time, interpolated as samples are."""
-    late = replace(trial.problem, dead_time=DeadTime(measurement=2.25 * trial.problem.period))
+    """Behind a measurement that is late by two cycles it is the state of that time."""
+    late = replace(trial.problem, dead_time=DeadTime(measurement=2 * trial.problem.period))
     run = trial.exact_run(late)
     true, believed = run["plant_state"], run["state"]
     hold(np.array_equal(believed[:3], true[[0, 0, 0]]), "before the first late sample it is not the start")
-    error = np.abs(believed[3:] - 0.75 * true[1:-2] - 0.25 * true[:-3]).max()
+    error = np.abs(believed[3:] - true[1:-2]).max()
     hold(within(error, _SAME * np.abs(true).max()), f"behind a late measurement it is off by {error:.3g}")
 
 
@@ -232,9 +232,7 @@ class Cycle:
     @cached_property
     def model(self) -> Model:
         """What the observer is built from."""
-        problem = self.problem
-        move = moving(problem.plant, believed_integrator(problem), problem.period, fraction=False)
-        return Model(problem.plant, move, problem.start_state, problem.sensing.measures(problem.plant))
+        return observed_model(self.problem)
 
     def __call__(self, sample: Sample, memory: Array | None = None) -> tuple[Array, Array]:
         """Believed state and next memory, with the model's approximate parameters; from the start where no memory is given."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
-from fpirhc.controllers.mirror import mirror_blocks
+from fpirhc.controllers.path import believed_path, model_blocks
 from fpirhc.controllers.reference_states import largest_response, motion_of, own_signals, own_values
 from fpirhc.deformation.base import Deformation, LastRequest
 from fpirhc.plant.chain import nominal_responses
@@ -104,7 +104,9 @@ def closing_blocks(
     deform = deform_block(plant, deformation, problem.warm_up_cycles, largest_response(problem))
     last = plant.response_signal(_REQUEST)
     before, remembered = (
-        ([], [Delay(last, "deformed")]) if last.name in deform.reads else mirror_blocks(problem, deformation)
+        ([], [Delay(last, "deformed")])
+        if last.name in deform.reads
+        else model_blocks(believed_path(problem, deformation))
     )
     return [*before, deform, invert_block(plant), *closing], [*delays, *remembered]
 

@@ -18,7 +18,6 @@ from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, l
 from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation, Iteration, against_wrappers, own_gain, with_its_gain
 from fpirhc.errors import NotContractive
-from fpirhc.plant.maps import against_parts
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import every
@@ -244,5 +243,5 @@ def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
         if len(values) not in (1, len(plant.inputs)):
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
-    parts = any(c % 1 for c in (*every(mirror.cycles), mirror.measurement))
-    yield from against_parts(plant, type(deformation).__name__, lags=any(every(mirror.lag)), parts=parts)
+    if plant.step is not None and mirror.lags:
+        yield f"{type(deformation).__name__}: a map has no lag; write an actuator as a state of the map"

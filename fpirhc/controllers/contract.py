@@ -28,6 +28,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.live import nominal
+from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous
 from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 from fpirhc.tracking.base import Tracking
@@ -297,7 +298,7 @@ def believing(problem: Problem, controller: Controller) -> Controller:
 
 
 def late_deformation(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:
-    """Return the deformation with open dead times and lags of at least `least`.
+    """Return the deformation with open dead times, to the nearest whole cycle, and lags of at least `least`.
 
     Inputs that are not one per coordinate have the longest.
     """
@@ -309,7 +310,7 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
     lags, inputs = problem.moves.lag, tuple(problem.plant.inputs)
     times = problem.dead_time.inputs
     known = {
-        "cycles": [times.get(name, 0.0) / problem.period for name in inputs],
+        "cycles": [whole(times.get(name, 0.0) / problem.period) for name in inputs],
         "lag": [lags.get(name, 0.0) for name in inputs],
     }
     left_open = [

@@ -12,7 +12,7 @@ import math
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.live import between, smaller, sqrt
-from fpirhc.task.dead_time import MOST, Cycles, every
+from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
 _LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
@@ -46,6 +46,16 @@ def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
             f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
             "every controlled coordinate"
         )
+
+
+def check_whole(owner: str, cycles: Cycles, name: str) -> None:
+    """Raise InvalidValue for parts of a cycle, which no model is late by."""
+    for value in every(cycles):
+        low = math.floor(value)
+        if abs(value - round(value)) > WHOLE:
+            raise InvalidValue(
+                f"{owner}({name}={cycles!r}): a model is late by whole control cycles; give {low} or {low + 1} for {value:g}"
+            )
 
 
 def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:

@@ -12,7 +12,7 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, memory_of_map
-from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_uncertainty, check_whole, chosen_pole
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -26,16 +26,16 @@ class ModelReferenced(Wrapper):
 
     Args:
         map: any deformation that iterates; wrappers that change the gain or the error go inside: ModelReferenced(Filtered(map)).
-        cycles: believed dead time d of the inputs, in control cycles beyond the one that every loop has; a tuple gives every
-            input its own, and then input k belongs to controlled coordinate k. None: that of the problem.
-        measurement: believed dead time of the measurement, in cycles.
+        cycles: believed dead time d of the inputs, in whole control cycles beyond the one that every loop has; a tuple gives every
+            input its own, and then input k belongs to controlled coordinate k. None: that of the problem, to the nearest cycle.
+        measurement: believed dead time of the measurement, in whole cycles.
         lag: believed time constant of the actuators, tau u_act' = u - u_act, s; a tuple gives one per input. Too long a lag is
             nearly harmless, too short a lag is not, and no lag is worst. None: what an external plant states, else 0.
         uncertainty: by how many cycles the sum of the dead times may be wrong; None: the default of `Increment`.
         pole: of the leak, in [0, 1); None: from the uncertainty, as in `Increment`.
 
     Raises:
-        InvalidValue: a dead time, lag, uncertainty or pole out of range.
+        InvalidValue: a dead time, lag, uncertainty or pole out of range, or parts of a cycle.
     """
 
     chooses_pair: ClassVar[bool] = True
@@ -47,8 +47,9 @@ class ModelReferenced(Wrapper):
     pole: BelowOne | None = None
 
     def __post_init__(self) -> None:
-        check_cycles("ModelReferenced", self._cycles)
-        check_cycles("ModelReferenced", self.measurement, "measurement")
+        for name, value in (("cycles", self._cycles), ("measurement", self.measurement)):
+            check_cycles("ModelReferenced", value, name)
+            check_whole("ModelReferenced", value, name)
         check_cycles("ModelReferenced", self._delays)
         if self.uncertainty is not None and self.cycles is not None:  # else it is checked with the problem's dead times
             check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
@@ -130,4 +131,4 @@ def settled(deformation: Deformation, request: Expression, response: Expression)
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
     """Values for the laws, around any map."""
-    return (ModelReferenced(inner), ModelReferenced(inner, cycles=2.5))
+    return (ModelReferenced(inner), ModelReferenced(inner, cycles=2))

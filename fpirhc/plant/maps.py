@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -94,15 +94,6 @@ def by_single_steps(plant: _Motion) -> _Motion:
 def steps_in(plant: Motion, time: float) -> int:
     """Return how many steps of its own a map makes in a time; one for a plant that moves in between."""
     return 1 if plant.step is None else round(time / plant.step)
-
-
-def against_parts(plant: Motion, owner: str, *, lags: bool, parts: bool) -> Iterator[str]:
-    """Yield a sentence against an actuator's lag, or a dead time of parts of a cycle, that is believed of a map."""
-    if plant.step is not None and (lags or parts):
-        yield (
-            f"{owner}: a map has no lag, and no dead time of parts of a cycle; write an actuator as a state of the map, and dead "
-            "times in whole cycles"
-        )
 
 
 def unlike(plant: Motion, model: Motion) -> str:

@@ -196,7 +196,7 @@ class Model:
     """What an observer is built from.
 
     Args:
-        move: Function (state, input, parameters, forcing, share) -> state after that share of a cycle.
+        move: Function (state, input, parameters, forcing, whether it moves) -> state a cycle later, or the same one.
         start: first state, shape (nx,).
     """
 
@@ -213,9 +213,7 @@ class Evidence:
     measured: Mapping[str, Expression]  # what the sensors show, by name of the quantity
     command: Expression  # it acted until the sample was taken
     parameters: Expression  # of the model
-    # share of a cycle by which the sample is later than the last one: 1, or 0 for a sample that still shows the start.
-    # Where samples are late by a fraction of a cycle, the first one that moves shows a mean with the start, and so a share.
-    moves: Expression
+    moves: Expression  # 1 where the sample is a cycle later than the last one, 0 where it still shows the start
     counts: Expression  # 1 where the sample was taken in this run, and is not the start again that fills a dead time
 
 

@@ -107,7 +107,7 @@ class StepDifference(PositionDifference):
 
     The one of relative order n is exact, with no average: the difference up to this cycle is the response to the request of n
     cycles ago. So it is n - 1 cycles later than the ideal pair, and pairs are complete from cycle n on. The lower differences are
-    those of s cycles ago; `fpirhc.controllers.sensing_chain` brings them to this cycle by the model.
+    those of s cycles ago; `fpirhc.controllers.seeing` brings them to this cycle by the model.
     """
 
     of_steps = True

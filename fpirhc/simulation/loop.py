@@ -13,11 +13,12 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
 from fpirhc.controllers.check import checked
+from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.contract import Undeformed, given_response
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.sensing_chain import compose_with_sensing, seeing_blocks, sensor_ranges
+from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import (
     acting_blocks,
@@ -102,7 +103,7 @@ def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> 
 
 def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """What the estimator remembers at the start of this problem; a graph has it inside the controller's one signal."""
-    own = [s for block in seeing_blocks(problem) for s in block.memory.signals]
+    own = [s for block in seeing_blocks(problem)[0] for s in block.memory.signals]
     if not own or own[0].name in loop.memory:
         return {s.name: s.start_vector() for s in own}
     whole = loop.memory[INNER]

@@ -15,10 +15,11 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, fed, under_names
+from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.sensing_chain import compose_with_sensing, given_states, raw_signal, sensor_ranges
+from fpirhc.controllers.seeing import given_states, raw_signal, sensor_ranges
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import NotSupported

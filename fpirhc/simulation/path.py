@@ -19,7 +19,7 @@ from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
-from fpirhc.controllers.sensing_chain import first_estimates, first_shown, sensor_ranges
+from fpirhc.controllers.seeing import first_estimates, first_shown, sensor_ranges
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal

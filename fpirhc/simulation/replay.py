@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 
 from fpirhc.controllers.gate import FAILED, HELD, INNER, MISSING, MOST_MISSING, REPLAYS
-from fpirhc.controllers.sensing_chain import seeing_blocks
+from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
@@ -102,7 +102,7 @@ class Replay:
         memory = Layout(
             tuple(s for one in step.memory.signals for s in (inner.memory.signals if one.name == INNER else (one,)))
         )
-        windows = {s.name for block in seeing_blocks(problem) for s in block.memory.signals}
+        windows = {s.name for block in seeing_blocks(problem)[0] for s in block.memory.signals}
         acted = {delay.now.name for delay in inner.delays if delay.source == "command"}
         own = set(inner.memory.names)
         observed = {_OBSERVED} & own  # by a learner, which would take what happened in the gap for a disturbance

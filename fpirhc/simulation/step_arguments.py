@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.sensing_chain import given_states, raw_signal
+from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.checked import ByName
 from fpirhc.fields.kinds import described, named_entries, real_number

@@ -80,7 +80,7 @@ class DeadTime(Checked):
 
     def over(self, period: float) -> DeadTime:
         """Return it without dead times that are below the rounding of a cycle, as .3 - .1 - .2 is."""
-        least = _WHOLE * period
+        least = WHOLE * period
         inputs = {n: late for n, late in self.inputs.items() if not 0 < late < least}
         measurement = 0.0 if 0 < self.measurement < least else self.measurement
         if len(inputs) == len(self.inputs) and measurement is self.measurement:
@@ -112,7 +112,7 @@ class DeadTime(Checked):
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
         for name, least in self.outside.items():
-            if self.inputs.get(name, 0.0) < least - _WHOLE * period:
+            if self.inputs.get(name, 0.0) < least - WHOLE * period:
                 mistakes.add(
                     f"'{name}' is {self.inputs.get(name, 0.0):g} {unit}, less than the {least:g} {unit} that the external "
                     "plant states; state less there, ExternalPlant(dead_time=...)"
@@ -157,7 +157,7 @@ def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Queue
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
 Cycles = float | tuple[float, ...]  # one dead time for all channels, or one for each
-_WHOLE = 1e-9  # of a cycle: what differs from a whole number by less is that number
+WHOLE = 1e-9  # of a cycle: what differs from a whole number by less is that number
 
 
 @dataclass(frozen=True)
@@ -241,8 +241,8 @@ class Queue:
 
     def _read(self, past: Expression, cycles: Expression) -> Expression:
         """What was pushed a number of cycles ago that is known at run time, interpolated."""
-        whole = ca.floor(cycles + _WHOLE)
-        part = ca.if_else(whole < ca.ceil(cycles - _WHOLE), ca.fmax(cycles - whole, 0), 0)
+        whole = ca.floor(cycles + WHOLE)
+        part = ca.if_else(whole < ca.ceil(cycles - WHOLE), ca.fmax(cycles - whole, 0), 0)
         return entry_at(past, whole) * (1 - part) + entry_at(past, whole + 1) * part
 
     def _height(self, j: int) -> float:
@@ -252,14 +252,19 @@ class Queue:
     def _shares(self, cycles: float) -> dict[int, float]:
         """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
         shares: dict[int, float] = {}
-        whole = math.floor(cycles + _WHOLE)
-        part = max(cycles - whole, 0.0) if whole < math.ceil(cycles - _WHOLE) else 0.0
+        whole = math.floor(cycles + WHOLE)
+        part = max(cycles - whole, 0.0) if whole < math.ceil(cycles - WHOLE) else 0.0
         for j in range(-self.width, self.width + 1):
             height = self._height(j)
             for place, share in ((whole + j, height * (1 - part)), (whole + j + 1, height * part)):
                 if share > 0:
                     shares[place] = shares.get(place, 0.0) + share
         return shares
+
+
+def whole(cycles: float) -> int:
+    """Return the nearest whole number of cycles; half a cycle is rounded down."""
+    return math.floor(cycles + 0.5 - WHOLE)
 
 
 def every(cycles: Cycles) -> tuple[float, ...]:

@@ -26,11 +26,12 @@ ESTIMATORS = (
     fp.SavitzkyGolay(window=5, degree=2),
     fp.SavitzkyGolay(window=9, degree=3),
 )
+QUANTA = {"q1": fp.Sensor(quantum=1e-5), "q2": fp.Sensor(quantum=3e-5)}
 WAITS = (
     fp.DeadTime(),
     fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}),
-    fp.DeadTime(inputs={"Q1": 3.25e-3, "Q2": 8e-3}, measurement=1.5e-3),
-    fp.DeadTime(inputs={"Q1": 2e-3, "Q2": 2e-3}, measurement=0.4e-3, before={"Q1": -20.0, "Q2": -30.0}),
+    fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 8e-3}, measurement=2e-3),
+    fp.DeadTime(inputs={"Q1": 2e-3, "Q2": 2e-3}, measurement=1e-3, before={"Q1": -20.0, "Q2": -30.0}),
 )
 
 
@@ -46,7 +47,17 @@ def short(problem: fp.Problem, cycles: int = 150) -> fp.Problem:
     return replace(problem, duration=cycles * problem.period, measure_from=0.0)
 
 
-@pytest.mark.parametrize("wait", WAITS[1:], ids=("inputs", "fractions", "before"))
+@pytest.mark.parametrize(("estimator", "wait"), [*zip(ESTIMATORS, (*WAITS, WAITS[2]), strict=True)])
+def test_null_behind_sensors_and_dead_time(estimator, wait):
+    """An exact model is left alone to rounding: late, rounded and smoothed alike, the two responses are the same number."""
+    quanta = QUANTA if isinstance(estimator, fp.PositionDifference) else {}
+    late = replace(tasks.two_mass.problem, dead_time=wait, sensing=fp.Sensing(quanta, estimator))
+    problem = short(with_exact_model(late))
+    referenced = fp.ModelReferenced(SIGMOID, **told(problem))
+    assert change(problem, fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, referenced)) <= 1e-9
+
+
+@pytest.mark.parametrize("wait", WAITS[1:], ids=("inputs", "both", "before"))
 def test_null_with_a_measured_response_and_dead_time(wait):
     """The same with ideal sensors, and under a prediction: the mirror sees the measured state, not the predicted one."""
     problem = short(with_exact_model(replace(tasks.two_mass.problem, dead_time=wait)))

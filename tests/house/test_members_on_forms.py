@@ -129,7 +129,6 @@ REFUSED: dict[tuple[str, str], str] = {
     **{("LyapunovMRAC", form): f"proves that errors vanish by {STEPS_SAID}" for form in IN_STEPS},
     ("ResolvedAccelerationRate", "at once"): f"prescribes {AT_ONCE_SAID}",
     **{("ResolvedAccelerationRate", form): f"prescribes {STEPS_SAID}" for form in IN_STEPS},
-    **{("ModelReferenced 3", form): "a map has no lag, and no dead time of parts of a cycle" for form in IN_STEPS},
     ("ExactModel", "reality"): "no coordinate y, which the model has: it cannot be the exact model of this controller",
     ("ExactModel", "outside"): "an ExternalPlant has no equations that could be the exact model; leave ExactModel out",
 }

@@ -21,7 +21,6 @@ LEARNED = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
 LEARNERS = {"RLS": fp.RecursiveLeastSquares(LEARNED, {"y": 0.1}, 5.0)}
 LATE = {
     "input": fp.DeadTime(inputs={"u": 0.05}),
-    "fraction": fp.DeadTime(inputs={"u": 0.033}),
     "measurement": fp.DeadTime(measurement=0.05),
     "both": fp.DeadTime(inputs={"u": 0.03}, measurement=0.02),
 }

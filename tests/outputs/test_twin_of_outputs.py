@@ -17,7 +17,7 @@ QUANTUM = {"y": fp.Sensor(quantum=1e-5)}
 ESTIMATORS = (fp.VelocityDifference(), fp.PositionDifference(), fp.SavitzkyGolay(window=5, degree=3))
 WAITS = {
     "none": fp.DeadTime(),
-    "inputs": fp.DeadTime(inputs={"u": 2.25e-3}),
+    "inputs": fp.DeadTime(inputs={"u": 3e-3}),
     "both": fp.DeadTime(inputs={"u": 2e-3}, measurement=2e-3),
 }
 

@@ -81,12 +81,12 @@ def covariance(stepper: fp.Stepper, result: fp.Run, size: int) -> np.ndarray:
 # The model alone
 
 
-def test_samples_that_are_late_by_a_fraction_are_those_of_a_linear_model():
-    """Commands 1.25 and samples 2.4 cycles late: every believed state is interpolated as the measured one is, to rounding."""
-    dead_time = fp.DeadTime(inputs={"u": 1.25 / 6}, measurement=2.4 / 6, before={"u": 9.0})
+def test_behind_dead_time_states_are_those_of_the_samples():
+    """Commands one and samples two cycles late: every believed state is the one of that time, to rounding."""
+    dead_time = fp.DeadTime(inputs={"u": 1 / 6}, measurement=2 / 6, before={"u": 9.0})
     result = run(infusion(KALMAN, dead_time=dead_time, duration=15.0), fp.ExactModel(CTC))
     true = result["plant_state"]
-    expected = 0.6 * true[1:-2] + 0.4 * true[:-3]
+    expected = true[1:-2]
     np.testing.assert_allclose(result["state"][3:], expected, atol=1e-11)
     assert np.array_equal(result["state"][:3], np.tile(true[0], (3, 1)))
     assert np.ptp(expected, axis=0).min() > 0.1
@@ -313,7 +313,7 @@ def sedated(observer: StateObserver | None, believed: float = 4.0, **changes: An
 @pytest.mark.parametrize("late", [0.0, 2 / 12], ids=["at once", "two cycles late"])
 def test_a_right_model_of_an_output_believes_what_is(late: float) -> None:
     """With exact parameters the states are the plant's, as late as the measurement is; the outputs are estimated."""
-    problem = sedated(DEPTH, dead_time=fp.DeadTime(inputs={"u": 1.5 / 12}, measurement=late), duration=6.0)
+    problem = sedated(DEPTH, dead_time=fp.DeadTime(inputs={"u": 2 / 12}, measurement=late), duration=6.0)
     result, cycles = run(problem, PLAIN), round(late * 12)
     believed, true = result["state"], result["plant_state"]
     assert np.ptp(true, axis=0).min() > 0.5

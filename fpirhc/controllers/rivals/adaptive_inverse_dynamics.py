@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
-from fpirhc.controllers.model_inputs import MEASURED_TIME, ResponsePairs
+from fpirhc.controllers.path import MEASURED_TIME, Pairs
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
@@ -115,7 +115,7 @@ class AdaptiveInverseDynamics(Controller):
 
     def _target(self, problem: Problem) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
-        plant, pairs = problem.plant, ResponsePairs(problem, problem.dead_time)
+        plant, pairs = problem.plant, Pairs(problem, problem.dead_time)
         if not _late(problem) or given_signals(problem):
             target = like(plant.output, _EARLIER if self._remembers(problem) else "_target")
             return lambda s: getattr(s, target.name), (target,)
@@ -143,7 +143,7 @@ _EARLIER = "_target_earlier"
 
 def _earlier_targets(problem: Problem) -> Block:
     """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
-    plant, period, pairs = problem.plant, problem.period, ResponsePairs(problem, problem.dead_time)
+    plant, period, pairs = problem.plant, problem.period, Pairs(problem, problem.dead_time)
     late = problem.dead_time
     whole = late.measurement + max(late.inputs.values(), default=0.0)
     queue = Queue(2 * whole / period + problem.sensing.delay(plant, period))

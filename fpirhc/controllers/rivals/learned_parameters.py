@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.controllers.base import clip, like
 from fpirhc.controllers.contract import refuse
-from fpirhc.controllers.model_inputs import ResponsePairs
+from fpirhc.controllers.path import Pairs
 from fpirhc.errors import InvalidValue
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.plant import Plant
@@ -91,7 +91,7 @@ class Learning:
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
         learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
-        pairs = ResponsePairs(problem, problem.dead_time)
+        pairs = Pairs(problem, problem.dead_time)
         late = (pairs.state,) if pairs.waiting else ()
         begins = problem.warm_up_cycles if self.rule.reads_response else 1
         reads = (

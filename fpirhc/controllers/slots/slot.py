@@ -15,7 +15,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import refuse
-from fpirhc.controllers.mirror import believed_path
 from fpirhc.deformation.base import Deformation, Identity, against_wrappers
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, nearest
 from fpirhc.fields.checked import Checked
@@ -133,8 +132,6 @@ def _against(problem: Problem, deformation: Deformation, differences: int) -> It
             f"ModelReferenced in a slot compares with the model's response of one cycle, and {estimator} gives a mean over "
             "several; use the map inside"
         )
-    if believed_path(problem, deformation).fraction:
-        yield "ModelReferenced in a slot: a measurement is late by whole cycles; round measurement=..."
     if deformation.iteration.pairing is not None and not deformation.mirror.share:
         pairs = deformation
         while pairs.inner is not None and pairs.inner.iteration.pairing is not None:

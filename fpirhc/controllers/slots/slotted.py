@@ -24,8 +24,7 @@ from fpirhc.controllers.base import (
 )
 from fpirhc.controllers.check import limit_behind
 from fpirhc.controllers.contract import late_deformation
-from fpirhc.controllers.mirror import Answers, believed_path, instant_mirror
-from fpirhc.controllers.model_inputs import measured_output
+from fpirhc.controllers.path import Answers, answer_block, believed_path, measured_output
 from fpirhc.controllers.reference_states import own_signals, own_values, stages_of
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import (
@@ -285,7 +284,7 @@ def _mirror(problem: Problem, one: Channel, name: str) -> Block:
     chain, calm = one.chain, ca.DM.zeros(len(problem.plant.names))
     path = believed_path(problem, one.slot.deformation, f"mirror_{one.number}")
     answers = Answers(lambda x, u, p: chain.response(x, u, p, calm), {chain.coordinate: chain.order}, one.signal(name))
-    return instant_mirror(path, answers)
+    return answer_block(path, answers)
 
 
 def _response(problem: Problem, channels: Sequence[Channel]) -> ca.Function:

@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like, reference_block
+from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import Deformation, RequestChange, automatic
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 from fpirhc.fields.checked import Checked

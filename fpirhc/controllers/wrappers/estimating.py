@@ -14,9 +14,9 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, command_before, like
+from fpirhc.controllers.composed import compose_controller, dependencies_of_command, embedded
 from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
-from fpirhc.controllers.model_inputs import ResponsePairs
-from fpirhc.controllers.sensing_chain import compose_controller, dependencies_of_command, embedded
+from fpirhc.controllers.path import Pairs
 from fpirhc.errors import NotSupported
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
@@ -38,7 +38,7 @@ _MODELLED: Latest[Problem] = Latest(8)
 class Estimating(ControllerWrapper):
     """The wrapped controller with the parameters of its model corrected every cycle.
 
-    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.model_inputs`.
+    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.path`.
 
     Args:
         controller: any controller that uses its model.
@@ -110,7 +110,7 @@ class Estimating(ControllerWrapper):
             )
         outputs = self.estimator.reads_outputs(modelled.plant)
         age = response_age(problem.plant) if self.estimator.reads_response(modelled.plant) else 0
-        pairs = ResponsePairs(problem, self.dead_time or problem.dead_time, outputs, age)
+        pairs = Pairs(problem, self.dead_time or problem.dead_time, outputs, age)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(command_before(problem), name="_acted")
         blocks = [
@@ -121,7 +121,7 @@ class Estimating(ControllerWrapper):
 
 
 def _estimate_block(
-    pairs: ResponsePairs, modelled: Problem, estimator: ParameterEstimator, believed: Signal, acted: Signal
+    pairs: Pairs, modelled: Problem, estimator: ParameterEstimator, believed: Signal, acted: Signal
 ) -> Block:
     """Block (state, realised, parameters, command of the last cycle) -> (corrected parameters, the learned ones among them)."""
     plant, model = pairs.problem.plant, modelled.plant

@@ -12,10 +12,10 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper, require_controlled_response
-from fpirhc.controllers.model_inputs import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
+from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.sensing_chain import compose_controller, embedded
 from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked

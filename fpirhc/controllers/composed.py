@@ -1,0 +1,176 @@
+"""A controller as ONE step: from what is measured, or from raw measurements with sensing before it, to the command.
+
+    raw measurements -> [estimator -> controller] -> command
+
+A machine gives the step what its sensors show; a skipped cycle leaves the estimator's memory as it was, like every other one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.check import checked
+from fpirhc.controllers.contract import given_response
+from fpirhc.controllers.observable import check_believed
+from fpirhc.controllers.path import (
+    ACTED,
+    MEASURED,
+    MEASURED_OUTPUT,
+    MEASURED_TIME,
+    NOW,
+    Told,
+    measured_output,
+    measured_state,
+)
+from fpirhc.controllers.reference_states import given_signals, with_reference
+from fpirhc.controllers.seeing import given_states, raw_signal, seeing_blocks
+from fpirhc.errors import InvalidProblem
+from fpirhc.fields.kinds import described
+from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import time_signal
+from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.driver import plans_are_compiled
+from fpirhc.symbolic.evaluate import Latest
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.task.problem import Problem
+
+_LATEST: Latest[Composite] = Latest(4)
+
+
+def compose_with_sensing(problem: Problem, controller: Controller) -> Composite:
+    """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
+
+    Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
+    """
+    return _LATEST.of((problem, controller), (plans_are_compiled(),), lambda: _composed(problem, controller))
+
+
+def _composed(problem: Problem, controller: Controller) -> Composite:
+    raw = raw_signal(problem)
+    if raw is None:
+        return compose_controller(problem, controller)
+    ready = checked(problem, controller)
+    blocks, delays = _blocks_of(problem, ready)
+    check_believed(problem, ready)
+    seeing, seen = seeing_blocks(problem)
+    time, *others = controller_reads(problem, ready).signals
+    reads = Layout((time, *given_states(problem), raw, *others[1 + len(measured_signals(problem.plant)) :]))
+    return _informed(problem, ready, reads, [*seeing, *_with_measured(problem.plant, blocks)], [*delays, *seen])
+
+
+def controller_reads(problem: Problem, controller: Controller) -> Layout:
+    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
+    plant, response = problem.plant, given_response(problem, controller)
+    realised = response.signal if response else plant.response_signal("realised")
+    parameters = controller.plant_model(problem).plant.parameter
+    return Layout((time_signal(plant), *measured_signals(plant), realised, parameters, *given_signals(problem)))
+
+
+def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
+    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
+
+    Args:
+        problem: that the controller is composed for.
+        controller: checked here against the problem.
+        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, its
+            time, and the signals of the last cycle, where a block needs them.
+    """
+    ready = checked(problem, controller)
+    blocks, delays = _blocks_of(problem, ready)
+    reads = controller_reads(problem, ready)
+    if ahead:
+        reads = reads + Layout(_measured_reads(problem.plant, blocks))
+        return _informed(problem, ready, reads, blocks, delays, ahead=True)
+    return _informed(problem, ready, reads, _with_measured(problem.plant, blocks), delays)
+
+
+def dependencies_of_command(step: Composite) -> frozenset[str]:
+    """Return the names of what the command of a composed controller depends on, in its cycle or by the memory in a later one."""
+    function = step.function
+    results = [function.index_out(name) for name in ("command", "memory_next")]
+    reads = enumerate(function.name_in())
+    return frozenset(name for k, name in reads if any(function.jac_sparsity(one, k).nnz() for one in results))
+
+
+def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
+    given: object = controller.blocks(problem)
+    pair = given if isinstance(given, tuple) and len(given) == 2 else None
+    kinds = (Block, Delay)
+    if pair is None or not all(
+        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
+        for part, kind in zip(pair, kinds, strict=True)
+    ):
+        raise InvalidProblem(
+            f"{type(controller).__name__}.blocks(problem) must return two lists (blocks, delays), got {described(given)}"
+        )
+    return with_reference(problem, pair[0]), list(pair[1])
+
+
+def _informed(
+    problem: Problem,
+    ready: Controller,
+    reads: Layout,
+    blocks: Sequence[Block],
+    delays: Sequence[Delay],
+    *,
+    ahead: bool = False,
+) -> Composite:
+    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
+
+    `ahead`: whether the time is the one at which the command will act.
+    """
+    model = ready.plant_model(problem)
+    told = Told(model.plant, model.signals, problem.period)
+    compares = any(ACTED in block.reads for block in blocks)
+    first = told.block(remembers=compares and not ahead)
+    if first is None:
+        return compose("controller", reads, blocks, delays, outputs=("command",))
+    needed = reads + Layout(told.reads if compares else ())
+    inner = compose("informed", needed, blocks, delays, outputs=("command",))
+    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
+    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
+
+
+def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
+    """Return a composed step as one block.
+
+    `feeds`: name of a signal that the step reads -> the signal that it is given instead.
+    """
+    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
+        next_memory, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
+        remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
+        return {**composite.trace.split(trace), **remembered}
+
+    inside = composite.trace, step, composite.memory, composite.opaque
+    return Block(name, Layout(reads), *inside, derived=composite.derived_if_any)
+
+
+def _measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
+    """The signals of the measured state and outputs and of their time, as far as some blocks read them."""
+    every = measured_state(plant), measured_output(plant), replace(time_signal(plant), name=MEASURED_TIME)
+    read = {name for block in blocks for name in block.reads.names}
+    return tuple({s.name: s for s in every if s.name in read}.values())
+
+
+def _with_measured(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
+    """The blocks behind one that writes the measured state or outputs, and their time, where a block reads them."""
+    writes = _measured_reads(plant, blocks)
+    if not writes:
+        return list(blocks)
+    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
+    named = {w.name: sources[w.name].name for w in writes}
+    reads = {sources[name].name: sources[name] for name in named}
+    copy = Block(
+        "measured",
+        Layout(tuple(reads.values())),
+        Layout(writes),
+        lambda s: {to: getattr(s, name) for to, name in named.items()},
+    )
+    return [copy, *blocks]

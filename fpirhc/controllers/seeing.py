@@ -1,0 +1,141 @@
+"""What a controller sees: from the raw measurements to state, outputs and response; and what sensors show at the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.path import believe_block, stated_path
+from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.maps import response_age
+from fpirhc.plant.plant import Plant
+from fpirhc.sensing.base import response_names
+from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.evaluate import Latest
+from fpirhc.symbolic.expression import Signals, Value
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.dead_time import Queue
+from fpirhc.task.limits import Interval
+from fpirhc.task.problem import Problem
+
+_SHOWN: Latest[np.ndarray] = Latest(8)
+
+
+def given_states(problem: Problem) -> tuple[Signal, ...]:
+    """Return the signal of the state where it is given beside raw measurements: these are of outputs, and nothing is believed."""
+    estimated = problem.sensing.estimates and problem.sensing.observer is None
+    return measured_signals(problem.plant)[:-1] if estimated else ()
+
+
+def raw_signal(problem: Problem) -> Signal | None:
+    """Return the signal of the raw measurements that a step begins with; None where state and response are both measured."""
+    if not problem.sensing.estimates:
+        return None
+    late = problem.dead_time.measurement_wait(problem.period)
+    return problem.sensing.raw(problem.plant, first_shown(problem), late)
+
+
+def sensor_ranges(problem: Problem) -> dict[str, Interval]:
+    """Return the stated ranges of the sensors by column of the sample: "state.q1", "realised.q1", "output.y", "measured.q1"."""
+    plant, raw = problem.plant, raw_signal(problem)
+    signals = measured_signals(plant) if raw is None else (*given_states(problem), raw)
+    columns = [
+        (column, name) for signal in signals for column, name in zip(signal.columns, signal.elements, strict=True)
+    ]
+    if raw is None:
+        columns += zip(plant.response_signal("realised").columns, response_names(plant), strict=True)
+    sensors = problem.sensing.sensors
+    stated = {column: sensors[name].range for column, name in columns if name in sensors}
+    return {column: ends for column, ends in stated.items() if ends is not None}
+
+
+def seeing_blocks(problem: Problem) -> tuple[list[Block], list[Delay]]:
+    """Return the blocks from the raw measurements to 'state', [output] and 'realised', and what they remember.
+
+    There are none where state and response are both measured. Of a plant with outputs these are estimated, and 'state' where it is
+    believed.
+    """
+    raw, plant, sensing = raw_signal(problem), problem.plant, problem.sensing
+    if raw is None:
+        return [], []
+    start, names = first_estimates(problem)[0], sensing.estimator.measures(plant)
+    if sensing.observer is not None:
+        commanded = Delay(stated_path(problem).last, plant.input.name)
+        return with_steps_ahead(plant, believe_block(problem, raw, start)), [commanded]
+    needed, places = Signal("_needed", names), [raw.elements.index(n) for n in names]
+    select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {"_needed": getattr(s, raw.name)[places]})
+    chosen, seen = ([], raw) if sensing.measured is None else ([select], needed)
+    return [*chosen, *with_steps_ahead(plant, sensing.estimator.block(plant, problem.period, start, seen))], []
+
+
+def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return state, or outputs, and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
+    followed = problem.plant.output.elements
+    first = _first(problem, followed)
+    return np.array([first[e] for e in followed]), _first_values(problem, response_names(problem.plant))
+
+
+def first_shown(problem: Problem) -> dict[str, float]:
+    """Return what sensors without noise show at the start, by name of everything that a sensor may show."""
+    plant, (motion, response) = problem.plant, first_estimates(problem)
+    names = (*plant.output.elements, *response_names(plant))
+    shown = dict(zip(names, map(float, np.concatenate([motion, response])), strict=True))
+    return _first(problem, plant.state.elements) | shown
+
+
+def _first(problem: Problem, quantities: Sequence[str]) -> dict[str, float]:
+    """First values of the plant that moves, by name in the model; the model's states where it does not have them."""
+    shown = problem.truth.shown(quantities)
+    states = dict(zip(problem.plant.state.elements, map(float, problem.start_state), strict=True))
+    return states | dict(zip(shown, map(float, _first_values(problem, shown)), strict=True))
+
+
+def _first_values(problem: Problem, quantities: Sequence[str]) -> np.ndarray:
+    """Measured quantities at the start, of the plant that moves."""
+    at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
+    known = problem.truth.function(quantities, seen=True)
+    return _SHOWN.of((problem,), (tuple(quantities),), lambda: np.asarray(known(*at).full()).ravel())
+
+
+def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
+    """Return the estimator, and on a map the block that brings its differences of an order above one to this cycle.
+
+    A law of order r needs y_k, delta y_k ... delta^(r-1) y_k. The forward difference delta^j y_k contains y_{k+1} ... y_{k+j},
+    which follow from the state without the command of this cycle, and are measured j cycles later. The model has both at the
+    measured states,
+
+        delta^j y_k = y^_j(x_k) + (delta^j y_{k-j} - y^_j(x_{k-j})),      j = 1 ... r - 1.
+
+    With an exact model it is exact. A prediction without the last measured difference would keep the model's error for ever.
+    """
+    if not response_age(plant) * (max(plant.chains.values()) - 1):
+        return [estimate]
+    measured, (x, u, p) = replace(plant.output, name="_differences"), plant.symbols()
+    expected = ca.Function(
+        "fpirhc_expected", [x, p], [plant.equations.output(x, 0 * u, p, ca.SX.zeros(len(plant.names)))]
+    )
+    powers = [e.count("'") for e in plant.output.elements]
+    waits = [(f"ahead_{k}", Queue(power)) for k, power in enumerate(powers)]
+    pasts = zip(waits, plant.output.elements, strict=True)
+    memory = [m for (name, wait), e in pasts for m in wait.memory(name, (e,), (0.0,))]
+
+    def renamed(s: Signals) -> dict[str, Value]:
+        return {measured.name if name == plant.output.name else name: v for name, v in estimate.step(s).items()}
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now, arrived = ca.vertsplit(expected(s.state, s.parameters)), ca.vertsplit(getattr(s, measured.name))
+        outputs: list[Expression] = []
+        later = {"ahead_cycles_next": ca.fmin(s.ahead_cycles + 1, max(powers))}
+        for (name, wait), power, own, value in zip(waits, powers, now, arrived, strict=True):
+            before, queue = wait.arrived(s, name, own)
+            brought = own + ca.if_else(s.ahead_cycles > power - 0.5, value - before, 0)
+            outputs, later = [*outputs, brought if power else value], later | queue
+        return {plant.output.name: ca.vertcat(*outputs), **later}
+
+    writes = Layout(tuple(measured if w.name == plant.output.name else w for w in estimate.writes.signals))
+    reads, own = Layout((measured, plant.state, plant.parameter)), Layout((*memory, scalar("ahead_cycles")))
+    ahead = Block("steps_ahead", reads, Layout((plant.output,)), step, own)
+    return [replace(estimate, step=renamed, writes=writes), ahead]
