@@ -14,9 +14,22 @@ from typer.core import TyperCommand
 
 _ABOUT = """Adaptive receding-horizon control by fixed-point iteration.
 
-Exit codes: 0 finished; 1 a review or a probe answered no; 2 bad input; 3 a file cannot be written; 4 a run ended early, or a
-plan did not converge; 5 a metric changed; 6 no usable baseline; 7 a faulty installation; 70 an error inside fpirhc;
-130 interrupted; 141 the reader of the output closed it."""
+\b
+To begin:
+  fpirhc new my_plant          writes my_plant.py: put in your equations
+  fpirhc review my_plant.py    asks whether adaptation can work there
+  fpirhc compare my_plant.py   runs its controllers and writes a report
+  fpirhc compare two_mass      does so for a shipped problem; fpirhc list has all
+
+\b
+Exit codes:
+  0  finished                      1  review answered no, or probe proposes nothing
+  2  bad input                     3  a file or folder cannot be written
+  4  a run ended early, or a plan did not converge
+  5  a metric changed (check)      6  a baseline is missing or unusable (check)
+  7  a faulty installation (doctor)
+  70 an error inside fpirhc        130 interrupted from the keyboard
+  141 the reader of the output closed it"""
 app = typer.Typer(add_completion=True, pretty_exceptions_enable=False, help=_ABOUT, rich_markup_mode=None)
 MADE: list[Path] = []  # folders that this command has made, the innermost first
 
@@ -61,32 +74,35 @@ def _percent(text: str) -> float:  # also of a default, which is a number
     return value
 
 
+def _given(metavar: str, text: str, **more: Any) -> Any:
+    return typer.Option(metavar=metavar, help=text, **more)
+
+
 Problem = Annotated[str, typer.Argument(metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")]
 Controller = Annotated[str, typer.Argument(metavar="CONTROLLER", help="name of a controller of the problem")]
 Controllers = Annotated[
-    list[str] | None, typer.Option("--controllers", "-c", metavar="NAME ...", help="only these controllers")
+    list[str] | None, typer.Option("--controllers", "-c", metavar="NAME ...", help="only these controllers of the file")
 ]
-Out = Annotated[Path | None, typer.Option(metavar="FOLDER", help="for the results [default: results/PROBLEM]")]
-Seed = Annotated[int, typer.Option(min=0, help="of noise and draws")]
+Out = Annotated[Path | None, _given("FOLDER", "folder of the results [default: results/PROBLEM]")]
+Seed = Annotated[int, _given("N", "seed of noise and of what is drawn", min=0)]
 Percent = typer.Option(
-    metavar="PERCENT", parser=_percent, help="exact parameters and dead times within so much of the problem's"
+    metavar="PERCENT", parser=_percent, help="draw exact parameters and dead times within so much of the file's"
 )
 Mismatch = Annotated[float, Percent]
 Set = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="PATH=NUMBER ...", help="other numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"),
+    typer.Option("--set", metavar="PATH=NUMBER ...", help="replace numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"),
 ]  # fmt: skip
 Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="print all that is known, not the main things alone")]
-NoCompile = Annotated[bool, typer.Option("--no-compile", help="run loops in CasADi's virtual machine")]
-Processes = Annotated[int, typer.Option(min=1, help="number of processes")]
-Count = typer.Option(min=1, metavar="N", help="plants drawn at random")
-Cases = Annotated[
-    list[str] | None, typer.Option(metavar="NAME ...", help="cases of the problem file: names, groups, or all")
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="print every column and every remark")]
+NoCompile = Annotated[
+    bool,
+    typer.Option("--no-compile", help="do not wait for a C compiler: loops run in CasADi's virtual machine, slower"),
 ]
-Baselines = Annotated[
-    Path | None, typer.Option(metavar="FOLDER", help="of the baselines [default: baselines beside the problem]")
-]
+Processes = Annotated[int, _given("N", "number of processes", min=1)]
+Count = _given("N", "number of plants that are drawn at random", min=1)
+Cases = Annotated[list[str] | None, _given("NAME ...", "named cases of the file: names, groups, or all")]
+Baselines = Annotated[Path | None, _given("FOLDER", "folder of the baselines [default: baselines, beside the problem]")]
 
 
 def _task(problem: str, settings: Sequence[str] | None = None, controllers: Sequence[str] | None = None) -> Any:
@@ -147,11 +163,11 @@ def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -
 )
 def compare(
     problem: Problem, controllers: Controllers = None, set_: Set = None,
-    optimisers: Annotated[list[str] | None, typer.Option(metavar="NAME ...", help="plan with each of these, or all")] = None,
-    plans: Annotated[bool, typer.Option("--plans", help="solve and certify the first plans, and run nothing")] = False,
+    optimisers: Annotated[list[str] | None, _given("NAME ...", "run planning controllers with each of these, or all")] = None,
+    plans: Annotated[bool, typer.Option("--plans", help="solve and certify the first plans alone; no run")] = False,
     seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
 ) -> None:  # fmt: skip
-    """Run several controllers on one problem and write a report."""
+    """Run controllers side by side and write a report. It names the winner, by how much, and at what price."""
     task = _task(problem, set_, controllers)
     from fpirhc.studies.comparison.compare import compare as run
     from fpirhc.studies.comparison.compare import select
@@ -193,7 +209,7 @@ def review(
     problem: Problem, controllers: Controllers = None, mismatch: Mismatch = 0.0, seed: Seed = 0, json: Json = False,
     verbose: Verbose = False,
 ) -> None:  # fmt: skip
-    """Answer before a run: well posed, gains, limits, margins, convergence. Exit code 1 where an answer is no."""
+    """Ask every loop, by short runs, whether it can work. Each no comes with what to do, and ends the command with exit code 1."""
     task = _task(problem)
     from dataclasses import asdict
 
@@ -214,16 +230,16 @@ def review(
 @_command(
     "run two_mass RHC+FPI",
     "run two_mass RHC+FPI --set deformation.gain=-1.2 limits.inputs.Q1=-50,20",
-    "run two_mass RHC+FPI --draw 7 --mismatch 20%    the plant number 7 of study --draws --mismatch 20%",
+    "run two_mass RHC+FPI --draw 7 --mismatch 20%    plant number 7 of study --draws N --mismatch 20%",
     "run anaesthesia CTC+FPI --case 'patient 03'",
 )
 def run(
     problem: Problem, controller: Controller, set_: Set = None,
-    case: Annotated[str | None, typer.Option(metavar="NAME", help="a case of the problem file")] = None,
-    draw: Annotated[int | None, typer.Option(min=0, metavar="K", help="the drawn plant of this number")] = None,
+    case: Annotated[str | None, _given("NAME", "in this case of the file")] = None,
+    draw: Annotated[int | None, _given("K", "with plant number K of study --draws", min=0)] = None,
     mismatch: Mismatch = 0.0, seed: Seed = 0, out: Out = None, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
-    """Run one controller and save every signal, as it stands, in a case of the file, or for a drawn plant."""
+    """Run one controller and save every signal. NAME.npz holds them (fpirhc.load_run reads it), NAME.png draws them."""
     task = _task(problem, set_, [controller])
     from dataclasses import replace
 
@@ -265,18 +281,19 @@ def run(
 )
 def study(
     problem: Problem, cases: Cases = None, draws: Annotated[int | None, Count] = None,
-    over: Annotated[list[str] | None, typer.Option(metavar="PATH=LOW:HIGH:COUNT[:log] ...", help="settings, one or two")] = None,
-    limits: Annotated[list[str] | None, typer.Option(metavar="WORD ...", help="mismatch, plants, latency, noise, lost")] = None,
+    over: Annotated[list[str] | None, _given("PATH=LOW:HIGH:COUNT[:log] ...", "sweep one or two settings")] = None,
+    limits: Annotated[list[str] | None, _given("WORD ...", "what grows: mismatch, plants, latency, noise, lost")] = None,
     mismatch: Mismatch = 0.0, controllers: Controllers = None,
-    headline: Annotated[str | None, typer.Option(metavar="METRIC", help="what is judged [default: the error]")] = None,
-    processes: Annotated[int | None, typer.Option(min=1, help="number of processes [default: one per core]")] = None,
-    cluster: Annotated[str | None, typer.Option(metavar="ADDRESS", help="of a Dask scheduler, tcp://HOST:PORT")] = None,
+    headline: Annotated[str | None, _given("METRIC", "number by which runs are compared [default: the error]")] = None,
+    processes: Annotated[int | None, _given("N", "number of processes [default: one per core]", min=1)] = None,
+    cluster: Annotated[str | None, _given("ADDRESS", "run on the Dask cluster with this scheduler, tcp://HOST:PORT")] = None,
     seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
 ) -> None:  # fmt: skip
-    """Run every controller in many variants: cases, drawn plants, settings, or up to where it fails.
+    """Run controllers in many variants of a problem. Variants are named cases, drawn plants, or swept settings; or one quantity
+    grows until each controller fails (--limits).
 
-    The first controller is the one that the others are compared with. study.csv has every run; the same command goes on after
-    an interruption.
+    The first controller is the one that the others are compared with. study.csv has every run and its parameters; the same
+    command goes on after an interruption.
     """
     if sum(map(bool, (cases, draws, over, limits))) != 1:
         raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
@@ -327,14 +344,14 @@ def study(
     "probe my_arm.py --recording run.csv         from a record of a run",
 )
 def probe(
-    problem: Problem, controller: Annotated[str | None, typer.Option(metavar="NAME", help="that keeps the plant safe")] = None,
-    cycles: Annotated[int | None, typer.Option(metavar="N", help="of the excitation [default: 300]")] = None,
-    amplitude: Annotated[float | None, typer.Option(help="of the excitation, in the unit of the response")] = None,
-    recording: Annotated[Path | None, typer.Option(metavar="CSV", help="of a run: time, inputs, what is measured")] = None,
-    chatter: Annotated[float | None, typer.Option(help="largest rms step of a command per cycle")] = None,
-    trials: Annotated[bool, typer.Option(help="try candidates on the plant")] = True, seed: Seed = 0, json: Json = False,
+    problem: Problem, controller: Annotated[str | None, _given("NAME", "that runs the plant [default: first that can]")] = None,
+    cycles: Annotated[int | None, _given("N", "length of the excitation [default: 300]")] = None,
+    amplitude: Annotated[float | None, _given("NUMBER", "size of the excitation, in the unit of the response")] = None,
+    recording: Annotated[Path | None, _given("CSV", "estimate from a recorded run: time, inputs, measurements")] = None,
+    chatter: Annotated[float | None, _given("NUMBER", "largest rms step of a command per cycle that is allowed")] = None,
+    trials: Annotated[bool, typer.Option(help="try candidates on the plant itself")] = True, seed: Seed = 0, json: Json = False,
 ) -> None:  # fmt: skip
-    """Excite a plant that nobody knows, and find the adaptation that suits it. Exit code 1 where none is proposed."""
+    """Measure an unknown plant and propose an adaptation. Exit code 1 where none is proposed."""
     task = _task(problem)
     from fpirhc.errors import NotSupported
     from fpirhc.probing.probe import probe as ask
@@ -362,12 +379,12 @@ def probe(
 )
 def tune(
     problem: Problem, controllers: Controllers = None,
-    trials: Annotated[int, typer.Option(min=1, max=1_000_000, help="of every controller")] = 50,
+    trials: Annotated[int, _given("N", "number of trials of every controller", min=1, max=1_000_000)] = 50,
     draws: Annotated[int | None, Count] = None, mismatch: Mismatch = 0.0, cases: Cases = None,
-    metric: Annotated[str | None, typer.Option(metavar="METRIC", help="that becomes better [default: the error]")] = None,
+    metric: Annotated[str | None, _given("METRIC", "number that is to become better [default: the error]")] = None,
     seed: Seed = 0, out: Out = None, json: Json = False,
 ) -> None:  # fmt: skip
-    """Find better settings, with the same budget and cost for every controller. The problem file lists them: tuning = {...}."""
+    """Search better settings, at equal cost for every controller. The problem file says what is searched: tuning = {...}."""
     task = _task(problem)
     from fpirhc.report.terminal import progress_bars, show_harm
     from fpirhc.studies.tune import tune as search
@@ -399,10 +416,10 @@ def tune(
 )
 def check(
     problems: Annotated[list[str] | None, typer.Argument(metavar="PROBLEM ...", help="[default: all of this folder]")] = None,
-    ignore_below: Annotated[float, typer.Option(metavar="PERCENT", parser=_percent, help="changes below it hold")] = 0.0,
+    ignore_below: Annotated[float, _given("PERCENT", "smaller changes than this count as none", parser=_percent)] = 0.0,
     baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
-    """Compare fresh results with the committed baselines. Exit code 5: a metric changed; 6: no usable baseline."""
+    """Compare fresh results with their baselines. Exit code 5: a metric changed; 6: a baseline is missing or unusable."""
     from fpirhc.baselines.baseline import check as judge
     from fpirhc.baselines.baseline import problems_here
     from fpirhc.report.terminal import progress_bars, say
@@ -421,11 +438,11 @@ def check(
     'accept my_arm.py --reason "new" --seeds 20      bands from more seeds, where there is noise',
 )
 def accept(
-    problem: Problem, reason: Annotated[str, typer.Option(metavar="TEXT", help="why the new numbers are right")],
-    seed: Seed = 0, seeds: Annotated[int, typer.Option(min=2, help="of which the bands are made")] = 8,
+    problem: Problem, reason: Annotated[str, _given("TEXT", "why the new numbers are right")],
+    seed: Seed = 0, seeds: Annotated[int, _given("N", "number of noise seeds from which the bands follow", min=2)] = 8,
     baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
-    """Measure a problem anew and write its baseline, which check compares with."""
+    """Measure a problem anew and write its baseline. fpirhc check compares later results with it."""
     task = _task(problem)
     from fpirhc.baselines.baseline import accept as write
     from fpirhc.report.terminal import progress_bars
@@ -438,8 +455,10 @@ def accept(
 
 @_command("new my_arm", "new my_arm --dir problems")
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="of the problem, a name of Python")],
-    folder: Annotated[Path, typer.Option("--dir", metavar="FOLDER", help="for the files [default: here]")] = Path(),
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="name of the problem; letters, digits and _, as in Python")
+    ],
+    folder: Annotated[Path, typer.Option("--dir", metavar="FOLDER", help="folder of the files")] = Path(),
 ) -> None:
     """Write a problem file and its test to start from."""
     from fpirhc.scaffold import create_problem
@@ -459,7 +478,9 @@ def list_() -> None:
 
 @_command("doctor")
 def doctor(json: Json = False) -> None:
-    """Examine the installation: versions, solvers, compiler, cache."""
+    """Say what is installed, what is missing, and how to get it. Exit code 7 where something that is needed is broken; a part that
+    is missing and has a substitute (warn), or that few need (none), ends with 0.
+    """
     from fpirhc.doctor import examine, written
 
     findings = [*examine()]
@@ -475,12 +496,12 @@ def doctor(json: Json = False) -> None:
 )
 def export(
     problem: Problem, controller: Controller,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="new or empty [default: results/PROBLEM/TARGET]")] = None,
-    to: Annotated[str, typer.Option(metavar="TARGET", help="c, arduino, fmu2, library, wasm, or lab")] = "c",
-    live: Annotated[list[str] | None, typer.Option(metavar="PATH ...", help="settings that stay open")] = None,
-    name: Annotated[str | None, typer.Option(help="prefix of everything in C [default: of problem and controller]")] = None,
+    out: Annotated[Path | None, _given("FOLDER", "new or empty folder [default: results/PROBLEM/TARGET]")] = None,
+    to: Annotated[str, _given("TARGET", "what is written: c, arduino, fmu2, library, wasm, or lab")] = "c",
+    live: Annotated[list[str] | None, _given("PATH ...", "settings that can be changed on the device")] = None,
+    name: Annotated[str | None, _given("NAME", "prefix of all names in C [default: problem and controller]")] = None,
 ) -> None:  # fmt: skip
-    """Write a controller for a device, another simulator, or a page with sliders: without Python, bit by bit the same."""
+    """Write a controller for use without Python. C99 for a device, a unit of FMI 2, WebAssembly, or a page with sliders."""
     task = _task(problem)
     from fpirhc.errors import InvalidName, nearest
     from fpirhc.export.target import device_of, targets, write

@@ -1,4 +1,4 @@
-"""The examination of an installation: versions, solvers, compiler, cache."""
+"""The examination of an installation: what is there, what is missing, what that is for, and the command that installs it."""
 
 from __future__ import annotations
 
@@ -7,36 +7,59 @@ import os
 import platform
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
+from importlib.util import find_spec
 
 import casadi as ca
 
 from fpirhc.symbolic.native import cache_folder, find_compiler, native
 
-Finding = tuple[str, str, str, str]  # name; ok, warn or fail; evidence; what to do
+Finding = tuple[str, str, str, str]  # name; ok, none (not needed by most), warn or fail; evidence; what to do
 _PACKAGES = ("fpirhc", "casadi", "numpy", "scipy", "osqp", "control")
+_SOLVERS = {
+    "ipopt": "the optimiser Ipopt",
+    "fatrop": "the optimiser Fatrop",
+    "sqpmethod": "the optimiser SequentialQuadratic",
+}
+_GCC = "sudo apt install gcc (Debian, Ubuntu), xcode-select --install (macOS), or name a compiler by FPIRHC_CC"
+_EXTRAS = {
+    "tune": ("fpirhc tune", ("optuna",)),
+    "cluster": ("fpirhc study --cluster", ("distributed",)),
+    "fmu": ("fpirhc export --to fmu2, and plants that are units of FMI", ("fmpy",)),
+    "compiler": ("fpirhc export --to wasm and --to lab", ("ziglang",)),
+    "outside": ("plants in simulators of others", ("mujoco", "rotorpy", "tclab", "vehiclemodels")),
+}
 
 
 def _solvers() -> tuple[str, str, str]:
-    missing = [name for name in ("ipopt", "fatrop", "sqpmethod") if not ca.has_nlpsol(name)]
-    return "warn" if missing else "ok", f"missing: {', '.join(missing) or 'none'}", "install casadi from its wheel"
+    missing = [f"{name} is missing, needed for {what}" for name, what in _SOLVERS.items() if not ca.has_nlpsol(name)]
+    mend = "pip install --force-reinstall --only-binary :all: casadi"
+    return ("warn", "; ".join(missing), mend) if missing else ("ok", ", ".join(_SOLVERS), "")
 
 
 def _compiler() -> tuple[str, str, str]:
     x = ca.SX.sym("x")
     built = native(ca.Function("step", [x], [3 * x + 1]))  # a name of libc: it must have a prefix
     if not built.compiled:
-        return (
-            "warn",
-            built.reason,
-            "install gcc or clang, or name a compiler by FPIRHC_CC; without one loops are slower",
-        )
+        need = "needed for loops as compiled C, which are several times as quick, and for --to library"
+        return "warn", f"{built.reason}; {need}", _GCC
     value = float(built.function(2))
-    return "ok" if value == 7 else "fail", f"{find_compiler()}: 3 * 2 + 1 = {value:g}", "name another one by FPIRHC_CC"
+    return "ok" if value == 7 else "fail", f"{find_compiler()}: 3 * 2 + 1 = {value:g}", _GCC
 
 
 def _cache() -> tuple[str, str, str]:
     size = sum(file.stat().st_size for file in cache_folder().iterdir() if file.is_file())
-    return "ok" if size < 2e9 else "warn", f"{cache_folder()}: {size / 1e6:.1f} MB", "remove old libraries from it"
+    text = f"{size / 1e6:.1f} MB of compiled loops in {cache_folder()}"
+    return "ok" if size < 2e9 else "warn", text, f"rm -r {cache_folder()}; loops are compiled anew when they run"
+
+
+def _extras() -> Iterator[Finding]:
+    for extra, (need, packages) in _EXTRAS.items():
+        missing = [name for name in packages if find_spec(name) is None]
+        install = f"pip install 'fpirhc[{extra}]'"
+        if missing:
+            yield f"extra {extra}", "none", f"{', '.join(missing)} not installed, needed for {need}", install
+        else:
+            yield f"extra {extra}", "ok", f"for {need}", install
 
 
 def examine() -> Iterator[Finding]:
@@ -50,6 +73,7 @@ def examine() -> Iterator[Finding]:
             yield name, *check()
         except Exception as error:  # noqa: BLE001 -- a broken installation may raise anything, and the other checks count
             yield name, "fail", f"{type(error).__name__}: {error}", "install fpirhc again in a fresh environment"
+    yield from _extras()
 
 
 def written(findings: list[Finding], as_json: bool) -> str:

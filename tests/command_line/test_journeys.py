@@ -365,8 +365,11 @@ def test_doctor_finds_this_installation_and_a_faulty_one(capsys, tmp_path, monke
     assert str(tmp_path / "cache") in checks["cache"]["evidence"]
     assert "fail" not in {one["outcome"] for one in checks.values()}
     monkeypatch.setenv("FPIRHC_CC", "none")
+    monkeypatch.setattr("fpirhc.doctor.find_spec", lambda name: None if name == "optuna" else name)
     assert main(["doctor"]) == 0
-    assert re.search(r"warn  compiler: .*FPIRHC_CC=none.*to do: install gcc", capsys.readouterr().out)
+    said = capsys.readouterr().out
+    assert re.search(r"warn  compiler: .*FPIRHC_CC=none.*needed for .*to do: sudo apt install gcc", said)
+    assert "none  extra tune: optuna not installed, needed for fpirhc tune; to do: pip install 'fpirhc[tune]'" in said
     monkeypatch.setattr("casadi.has_nlpsol", lambda name: 1 / 0)
     assert main(["doctor"]) == 7
     assert re.search(r"fail  solvers: ZeroDivisionError", capsys.readouterr().out)
