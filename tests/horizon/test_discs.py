@@ -69,9 +69,7 @@ def test_bounded_linear_quadratic_plans_give_the_loop_of_ipopt(discretisation):
 def test_steps_with_which_the_model_runs_away_are_refused_with_a_remedy(substeps):
     """RK4 multiplies the motors, which decay within a stage, by 291, by 13.7^2 or by 2.2^3 per stage."""
     p = discs(fp.RungeKutta4(substeps))
-    with pytest.raises(
-        NotSupported, match=r"multiplies a motion by .* in a stage and by .* use Horizon\(discretisation=Collocation"
-    ):
+    with pytest.raises(NotSupported, match=r"multiplies a motion by .* in a stage .* use Horizon\(discretisation=Col"):
         fp.simulate(p, fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2)), seed=0)
 
 

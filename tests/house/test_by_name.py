@@ -93,9 +93,7 @@ def tells(mapping: Mapping[str, Any], name: Any) -> bool:
 
 def test_the_nearest_name_is_offered():
     name = headline()[1]
-    with pytest.raises(
-        InvalidName, match=rf"^Task\.controllers has no '{re.escape(name[:-1])}'\. Did you mean '{re.escape(name)}'"
-    ):
+    with pytest.raises(InvalidName, match=rf"^Task\.controllers has no '.*'\. Did you mean '{re.escape(name)}'"):
         tasks.two_mass.controllers[name[:-1]]
     with pytest.raises(InvalidName, match=r"^Plant\.parameters has no"):
         tasks.two_mass.problem.plant.parameters["mm"]

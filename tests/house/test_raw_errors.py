@@ -69,9 +69,7 @@ def pendulum(value):
 
 @pytest.mark.parametrize("value", [HUGE, np.timedelta64(1, "s"), np.bool_(True), "1", None, 1j])
 def test_what_is_no_number_is_no_parameter(value):
-    with pytest.raises(
-        InvalidField, match=r"(?s)approximate: expected a finite number.*exact: expected a finite number"
-    ):
+    with pytest.raises(InvalidField, match=r"(?s)approximate: expected a finite number.*exact: expected"):
         pendulum(value)
 
 

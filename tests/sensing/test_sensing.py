@@ -309,9 +309,7 @@ def test_dead_time_counts_but_is_not_judged_alone():
     wild = fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(gain=-1.0))
     run(late, wild)
     window = replace(late, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=5, degree=2)))
-    with pytest.raises(
-        NotContractive, match=r"11.5 cycles late \(dead time 10, Sav.* 1.5\).*Paired\(map, cycles=11.5\)"
-    ):
+    with pytest.raises(NotContractive, match=r"11.5 cycles late \(dead time 10, Sav.* 1.5\).*Paired\(map, cycles=11"):
         run(window, wild)
     run(window, fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Paired(fp.Affine(gain=-1.0), cycles=11.5)))
 
