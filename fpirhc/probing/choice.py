@@ -1,245 +1,215 @@
-"""Which adaptation suits a plant as estimated: candidates run on it, and come back from a push at the ends of the likelihood.
+"""The plant as estimated, and which adaptation suits it: gains that its review admits, then trials on the plant itself.
 
-Gains are shares g of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or the inverse of Lambda where responses are coupled.
-A mirror that is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too.
+The estimated plant is the model behind gains, dead times, lags and the recorded drift, as the reality of the problem. A mirror that
+is right takes lateness for right and leaves it, so mirrors without dead time and lag are candidates too.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import any_gain, checked
-from fpirhc.controllers.contract import without_deformation
+from fpirhc.controllers.check import any_gain
+from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.leaky import default_pole
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.deformation.wrappers.filtered import Filtered
-from fpirhc.errors import FpirhcError
-from fpirhc.probing.estimated import estimated_problem, gain_name
-from fpirhc.probing.identification import End, Estimates
-from fpirhc.review.experiments import PLACES, Bench
+from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.plant.chain import require_rates
+from fpirhc.plant.parameter import outside
+from fpirhc.plant.plant import Plant
+from fpirhc.probing.identification import Estimates
+from fpirhc.review.experiments import Bench
+from fpirhc.review.questions import Case, Verdict, gain_by_run
+from fpirhc.sensing.base import response_names
+from fpirhc.sensing.sensing import Sensor
+from fpirhc.simulation.model_as_plant import ModelAsPlant, behind_actuators, shortened
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.trials import ErrorPair, errors_of, weighed
+from fpirhc.simulation.simulate import simulator
+from fpirhc.simulation.trials import errors_of, weighed
 from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.disturbance import Noise
+from fpirhc.task.exogenous import Samples, Unknown
 from fpirhc.task.problem import Problem
+from fpirhc.task.reality import Reality
 
-DARING = ("prompt", "lagging")
-"""Candidates that come back at the estimate alone, or begin with the least share: trials have to show them."""
-SHARES = (0.05, 0.1, 0.16, 0.25, 0.4, 0.65, 1.0)
+_ASKED = 0.5, 0.1  # shares of the deadbeat gain that a review is asked about; it tries a half to four times as much
 _POLES = (0.0, 0.5, 0.8)  # of the filter
-_FIRST = 0.2  # share with which loops are built
 _LARGEST_PRODUCT = 1.99
 _STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the controller alone, or of the input's range
-_WORTH = 0.95  # error that is worth an adaptation
-_FINE = 1.05  # ratio of two shares, between which no other is tried
-_LEFT, _CALM = 0.5, 2.0  # of a push at an end; steps there over the largest that are allowed
-Case = tuple[End, float]
-"""An end of the likelihood, and the factor of its gains."""
+_WORTH, _WORSE = 0.95, 1.03  # error that is worth an adaptation; largest one of any coordinate
+_LONGEST = 2000  # cycles of a trial
+_STEP, _CLEARLY = 1.6, 0.97  # ratio of the gains of two trials; of their errors, from which the larger one counts
+MARGIN, _LARGER = 1.4, 1.5  # times its gain that what is kept has to bear, and the ratio of the errors then
+_SEEDS = 3  # of these runs
+_BEGUN = 0.2  # share of a run from which errors count
+_CYCLES = 300  # of a run, where the problem has as many and the record is shorter
 
 
-@dataclass(frozen=True)
-class Form:
-    """What candidates share that differ in their gain alone."""
-
-    referenced: bool  # whether it is model-referenced; else the plain one
-    cycles: tuple[float, ...]  # believed dead time of every input
-    lags: tuple[float, ...]  # believed lag of every input
-    wrong: float = 0.0  # cycles by which the dead time may be wrong
-    pole: float = 0.0  # of the filter; 0: none
-    weighted: bool = False  # whether the gain is a matrix, a share of the inverse of Lambda
-
-    def deformation(self, estimates: Estimates, share: float) -> Deformation:
-        """Return the deformation with A_c = -2 share / (largest eigenvalue); gains are rounded to three digits."""
-        largest = estimates.largest_weighted if self.weighted else estimates.largest
-        chosen: Deformation = Affine(
-            gain=_rounded(-2 * share / largest), weights=estimates.weights if self.weighted else None
-        )
-        if self.pole:
-            chosen = Filtered(chosen, pole=self.pole)
-        cycles, lag = _one(self.cycles), _one(tuple(_rounded(tau) for tau in self.lags))
-        late = max(self.cycles) > 0
-        if not self.referenced:
-            return Paired(chosen, cycles=cycles) if late else chosen
-        leak = default_pole(min(max(1 / largest, 1.0), _LARGEST_PRODUCT), self.wrong) if late else None
-        return ModelReferenced(chosen, cycles=cycles, lag=lag, pole=None if leak is None else _rounded(float(leak)))
+def forms(estimates: Estimates, share: float, pole: float) -> dict[str, Deformation]:
+    """Return the forms by name, with a share of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or its inverse."""
+    low, value, high = estimates.dead
+    likely = np.where(high > low, np.ceil((low + high) / 2), value)
+    late, cycles, lag = bool(likely.any()), _one(likely), _one(estimates.lag[1])
+    wrong = float(max((high - likely).max(), (likely - low).max(), 1.0))
+    leak = default_pole(min(max(1 / estimates.largest, 1.0), _LARGEST_PRODUCT), wrong) if late else None
+    one = _map(share / estimates.largest, pole)
+    found: dict[str, Deformation] = {
+        "referenced": ModelReferenced(one, cycles=cycles, lag=lag, pole=None if leak is None else _rounded(leak)),
+        "prompt": ModelReferenced(one, cycles=0.0, lag=0.0),
+        "lagging": ModelReferenced(one, cycles=0.0, lag=lag),
+        "plain": Paired(one, cycles=cycles) if late else one,
+    }
+    if estimates.weights is not None:
+        weighted = _map(share / estimates.largest_weighted, pole, estimates.weights)
+        found["matrix"] = ModelReferenced(weighted, cycles=0.0, lag=0.0)
+    return {name: one for k, (name, one) in enumerate(found.items()) if one not in list(found.values())[:k]}
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """A form and a share on the estimated plant."""
+def _map(gain: float, pole: float, weights: tuple[tuple[float, ...], ...] | None = None) -> Deformation:
+    one = Affine(gain=_rounded(-2 * gain), weights=weights)
+    return Filtered(one, pole=pole) if pole else one
 
-    form: Form
-    share: float
-    deformation: Deformation
-    error: float = math.inf  # rms tracking error over that of the controller alone, in the mean over the coordinates
-    steps: float = math.inf  # rms step of the command over the largest that is allowed
+
+def _times(one: Deformation, factor: float) -> Deformation:
+    return one.with_effective_gain(_rounded(factor * one.effective_gain()))
 
 
 class Choice:
     """The choice for one problem and controller."""
 
     def __init__(
-        self, problem: Problem, controller: Controller, estimates: Estimates, chatter: Mapping[str, float] | None
+        self, problem: Problem, bare: Controller, estimates: Estimates, chatter: Mapping[str, float] | None
     ) -> None:
-        """Build the estimated plant and run the controller alone on it."""
-        self.bare, self.estimates = without_deformation(controller), estimates
-        self._given, self._names, self._chatter = problem, weighed(problem, controller), chatter
-        self._benches: dict[object, Bench] = {}
-        self._known: dict[object, bool] = {}
+        """Build the plants that the record allows, a cycle later, and run the controller alone on the estimate."""
+        self._given, self._bare, self._estimates = problem, bare, estimates
+        self._names, self._chatter = weighed(problem, bare), chatter or {}
         noise = [one.noise for one in estimates.channels]
         middle = estimates.dead[1], estimates.lag[1]
         self.problem = estimated_problem(problem, estimates.gains, *middle, estimates.drift, noise)
-        self._alone = self._bench(None).nominal
-        self._room = self.allowed(self._alone)
+        self._alone = _run(self.problem, bare)
+        ends = {(one.cycles, one.lags): one for one in estimates.ends}.values()
+        plants = [estimated_problem(problem, e.gains, [c + 1 for c in e.cycles], e.lags) for e in ends]
+        self._plants = [(plant, dict[object, Bench](), ModelAsPlant(plant, seed=0)) for plant in plants]
 
-    def shortlist(self) -> dict[str, Candidate]:
-        """Return the candidates by name, cautious first; none where nothing safe makes the error clearly less.
+    def shortlist(self) -> dict[str, Deformation]:
+        """Return what makes the error on the plant as estimated clearly less, by name of its form, the best first."""
+        with compiled_plans(), any_gain():
+            found = {name: one for name in forms(self._estimates, 1.0, 0.0) if (one := self._best(name))}
+        return {name: found[name][1] for name in sorted(found, key=lambda name: found[name][0])}
 
-        All come back with a command that is a cycle later and gains of 0.6 and 1.4 times those at every end of the likelihood: a
-        longer lag with a larger gain says much the same of a record as a shorter one with a smaller. The cautious one also bears
-        twice the gain on a plant that is slower by half, because a lag is only a picture of what is slow.
-        """
-        ends, most = self.estimates.ends, np.maximum(self.estimates.lag[2], 0.25 * self._given.period)
-        later, dead = ends[0].later(), tuple(self.estimates.dead[2].tolist())
-        slow = replace(ends[0], cycles=dead, lags=tuple((1.5 * most).tolist()))
-        middle: list[Case] = [(ends[0], 1.4), (ends[0], 0.6), (later, 1.0)]
-        near: list[Case] = [(later, 1.0), *((one, factor) for factor in (1.4, 0.6) for one in ends)]
-        far: list[Case] = [(slow, 2.0), (slow.later(), 1.4)]
-        forms = self.forms()
-        with compiled_plans():
-            calm = {name: self._calm(form) for name, form in forms.items()}
-            every = sorted((one for some in calm.values() for one in some), key=lambda one: one.error)
-            chosen = {"cautious": self._first(every, far + near)}
-            chosen |= {name: self._first(some, near) for name, some in calm.items()}
-            for name in DARING:
-                if name in forms and chosen[name] is None:
-                    least = self._candidate(forms[name], SHARES[0])
-                    chosen[name] = self._first(calm[name], middle) or self._first([least], [])
-        different: dict[str, Candidate] = {}
-        for name, one in chosen.items():
-            if one is not None and all(one.deformation != other.deformation for other in different.values()):
-                different[name] = one
-        return different
-
-    def beside(self, one: Candidate, tried: Iterable[Candidate]) -> dict[float, Candidate]:
-        """Return by share the next smaller and the next larger share of the same form, which trials have to show.
-
-        They are those of the list. Where the next larger one is tried already, it is their geometric mean, down to a ratio of 1.05:
-        an error falls with the share until the loop is lost, so the best one is near that limit.
-        """
-        known = {other.share for other in tried if other.form == one.form}
-        every = {*SHARES, *known}
-        smaller = max((share for share in every if share < one.share), default=one.share)
-        larger = min((share for share in every if share > one.share), default=one.share)
-        if larger in known and larger / one.share > _FINE:
-            larger = float(f"{math.sqrt(larger * one.share):.2g}")
-        found = [self._candidate(one.form, share) for share in {smaller, larger} - {one.share, *known}]
-        return {other.share: other for other in found if self._accepted(other)}
-
-    def _candidate(self, form: Form, share: float) -> Candidate:
-        return Candidate(form, share, form.deformation(self.estimates, share))
-
-    def _calm(self, form: Form) -> list[Candidate]:
-        """Shares and filters of a form that are worth it and calm on the estimated plant, best first."""
+    def _best(self, name: str) -> tuple[float, Deformation] | None:
+        """Error and deformation of a form, with the best of the filters whose commands are calm; None where none is worth it."""
         found = []
         for pole in _POLES:
-            filtered = replace(form, pole=pole)
-            for share in SHARES:
-                with any_gain():  # a run judges it
-                    run = self._bench(filtered).at_gain(share / _FIRST).nominal
-                if run.stop is not None:
-                    break  # larger ones are lost too
-                error = mean_ratio(errors_of(self.problem, (self._alone, run), self._names))
-                steps = float((steps_of(run) / self._room).max())
-                found.append(replace(self._candidate(filtered, share), error=error, steps=steps))
-        return sorted((one for one in found if one.steps <= 1 and one.error < _WORTH), key=lambda one: one.error)
+            asked = (forms(self._estimates, share, pole)[name] for share in _ASKED)
+            one = next((_times(one, times) for one in asked if (times := self._admitted(one))), None)
+            if one is not None:
+                run = _run(self.problem, self._bare.with_deformation(one))
+                found.append((self.compared(self.problem, self._alone, run), one))
+        return min(((trial.error, one) for trial, one in found if trial.passes), key=lambda pair: pair[0], default=None)
 
-    def _first(self, some: Iterable[Candidate], cases: Iterable[Case]) -> Candidate | None:
-        """The first one that comes back in every case."""
-        return next((one for one in some if self._accepted(one) and all(self._returns(one, *c) for c in cases)), None)
+    def _admitted(self, one: Deformation) -> float:
+        """Half of the largest gain that comes back on every plant, as a multiple; 0 where there is none."""
+        admitted = math.inf
+        for plant, known, models in self._plants:
+            try:
+                bench = Bench.of(plant, self._bare.with_deformation(one))
+                case = Case(bench, np.zeros((0, 0)), False, known, models)
+                if case.plain.back.left > 1:  # the controller alone does not come back either
+                    continue
+                fact = gain_by_run(case)
+            except FpirhcError:  # it cannot be composed
+                return 0.0
+            best = max(fact.numbers.get("recommended_times", 0.0), 0.0)
+            admitted = min(admitted, best if fact.verdict == Verdict.YES else best / 2)
+        return admitted if math.isfinite(admitted) else 0.0
 
-    def _accepted(self, one: Candidate) -> bool:
-        """Whether the loop of the problem takes its gain, which it judges by the model."""
-        try:
-            checked(self._given, self.bare.with_deformation(one.deformation))
-        except FpirhcError:
-            return False
-        return True
-
-    def _returns(self, one: Candidate | None, end: End, factor: float) -> bool:
-        """Whether the loop comes back from a push, calmly; true where the controller alone does not."""
-        key = one and (one.form, one.share), end.cycles, end.lags, factor
-        if key not in self._known:
-            back = self._pushed(one, end, factor)
-            self._known[key] = back or (one is not None and not self._returns(None, end, factor))
-        return self._known[key]
-
-    def _pushed(self, one: Candidate | None, end: End, factor: float) -> bool:
-        try:
-            with any_gain():
-                bench = self._bench(one.form if one else None, (end.cycles, end.lags))
-                plant = bench.problem.real_plant
-                names, exact = list(plant.parameters), plant.exact.copy()
-                for (i, j), gain in np.ndenumerate(factor * end.gains):
-                    exact[names.index(gain_name(i, j))] = gain
-                bench = bench if one is None else bench.at_gain(one.share / _FIRST)
-                base = bench.run(exact=exact)
-                if base.stop is not None or (steps_of(base) > _CALM * self._room).any():
-                    return False
-                return bench.pushed(PLACES[0], base=base, exact=exact)[0].left <= _LEFT
-        except FpirhcError:  # it cannot be composed
-            return False
-
-    def _bench(self, form: Form | None, place: tuple[tuple[float, ...], tuple[float, ...]] | None = None) -> Bench:
-        """The loop with the first share of a form, at dead times and lags; None: those of the estimate, with drift and noise."""
-        if (form, place) not in self._benches:
-            if form is not None:
-                adapted = self.bare.with_deformation(form.deformation(self.estimates, _FIRST))
-                bench = Bench.of(self._bench(None, place).problem, adapted)
-            elif place is not None:
-                bench = Bench(estimated_problem(self._given, self.estimates.gains, *place), self.bare)
-            else:
-                bench = Bench(self.problem, self.bare)
-            self._benches[form, place] = bench
-        return self._benches[form, place]
-
-    def forms(self) -> dict[str, Form]:
-        """Return the forms by name, each once."""
-        low, value, high = self.estimates.dead
-        likely = np.where(high > low, np.ceil((low + high) / 2), value)
-        wrong = float(max((high - likely).max(), (likely - low).max(), 1.0)) if likely.any() else 0.0
-        cycles, never = tuple(likely.tolist()), (0.0,) * len(value)
-        lag = tuple(self.estimates.lag[1].tolist())
-        forms = {
-            "referenced": Form(True, cycles, lag, wrong),
-            "prompt": Form(True, never, never),
-            "lagging": Form(True, never, lag),
-            "plain": Form(False, cycles, never),
-        }
-        if self.estimates.weights is not None:
-            forms["matrix"] = replace(forms["prompt"], weighted=True)
-        return {name: one for k, (name, one) in enumerate(forms.items()) if one not in list(forms.values())[:k]}
-
-    def allowed(self, alone: Run) -> np.ndarray:
-        """Return the largest rms step of every input, beside a run of the controller alone."""
-        plant, chatter = self._given.plant, self._chatter
+    def compared(self, problem: Problem, alone: Run, run: Run, *, loud: bool = False) -> Trial:
+        """Return what a run shows beside that of the controller alone; `loud`: whether steps of any size are calm."""
+        pair, (own, before) = errors_of(problem, (alone, run), self._names), map(steps_of, (run, alone))
+        plant = self._given.plant
         lower, upper = self._given.limits.input_bounds(plant)
         width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
-        usual = np.maximum(_STEPS * steps_of(alone), _OF_RANGE * width)
-        limits = chatter or {}
-        return np.array([limits.get(n, max(own, 1e-300)) for n, own in zip(plant.inputs, usual, strict=True)])
+        usual = np.maximum(_STEPS * before, _OF_RANGE * width)
+        room = [self._chatter.get(name, max(one, 1e-300)) for name, one in zip(plant.inputs, usual, strict=True)]
+        ratios = [pair.ratio(name) for name in pair.without]
+        return Trial(math.sqrt(np.mean(np.square(ratios))), max(ratios), sound=loud or bool((own <= room).all()))
+
+    def tried(self, shortlist: dict[str, Deformation], notes: list[str], seed: int) -> dict[str, Trial]:
+        """Return trials on the plant: of the shortlist, and of other gains of the best one, which are added to it.
+
+        The best one has to bear 1.4 times its gain, with other seeds too; else it and larger gains of its form do not count.
+        """
+        task, alone, results = shortened(self._given, _LONGEST), dict[int, Run](), dict[str, Trial]()
+        places = {name: (name, 0) for name in shortlist}  # form, and by how many steps its gain is larger
+
+        def trial(one: Deformation, seed: int, *, loud: bool = False) -> Trial | str:
+            if seed not in alone:
+                alone[seed] = _run(task, self._bare, seed)
+            try:
+                return self.compared(task, alone[seed], _run(task, self._bare.with_deformation(one), seed), loud=loud)
+            except FpirhcError as error:
+                return str(error)
+
+        waiting, needed = list(shortlist), math.inf
+        while True:
+            outcomes = {name: trial(shortlist[name], seed) for name in waiting}
+            notes += [f"{name} is not tried: {one}" for name, one in outcomes.items() if isinstance(one, str)]
+            results |= {n: one for n, one in outcomes.items() if isinstance(one, Trial) and one.error <= needed}
+            name = best(results)
+            if name is None:
+                return results
+            form, place = places[name]
+            beside = next((k for k in (place + 1, place - 1) if (form, k) not in places.values()), None)
+            if beside is not None:
+                needed = _CLEARLY * results[name].error if beside > place else math.inf
+                waiting = [f"{form}, {_STEP**beside:.3g} times its gain"]
+                places[waiting[0]] = form, beside
+                shortlist[waiting[0]] = _times(shortlist[form], _STEP**beside)
+                continue
+            more = [trial(_times(shortlist[name], MARGIN), other, loud=True) for other in range(seed, seed + _SEEDS)]
+            if all(isinstance(m, Trial) and m.passes and m.error <= _LARGER * results[name].error for m in more):
+                return results
+            notes.append(f"{name} is not kept: on the plant it does not bear {MARGIN:g} times its gain")
+            lost = [n for n in results if places[n][0] == form and places[n][1] >= place]
+            results, waiting = results | {n: replace(results[n], sound=False) for n in lost}, []
 
 
-def mean_ratio(pair: ErrorPair) -> float:
-    """Return the rms over the coordinates of their errors over those of the controller alone."""
-    return float(np.sqrt(np.mean([pair.ratio(name) ** 2 for name in pair.without])))
+def _run(problem: Problem, controller: Controller, seed: int = 0) -> Run:
+    return simulator(problem, controller, compiled=False).run(seed=seed)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A run on the plant."""
+
+    error: float  # rms error over that of the controller alone, in the mean over the coordinates
+    worst: float  # of any coordinate
+    sound: bool = (
+        True  # whether commands keep the budget of chatter, and runs with a larger gain pass as far as there are some
+    )
+
+    @property
+    def passes(self) -> bool:
+        """Whether it makes the error clearly less, and that of no coordinate more, and is sound."""
+        return self.error <= _WORTH and self.worst <= _WORSE and self.sound
+
+
+def best(trials: Mapping[str, Trial]) -> str | None:
+    """Return the name of the best trial that passes; None where none does."""
+    return min((name for name, one in trials.items() if one.passes), key=lambda name: trials[name].error, default=None)
 
 
 def steps_of(run: Run) -> np.ndarray:
@@ -249,8 +219,86 @@ def steps_of(run: Run) -> np.ndarray:
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.3g}")
+    return float(f"{float(value):.3g}")
 
 
-def _one(values: tuple[float, ...]) -> float | tuple[float, ...]:
-    return values[0] if len(set(values)) == 1 else values
+def _one(values: np.ndarray) -> float | tuple[float, ...]:
+    rounded = tuple(map(_rounded, values))
+    return rounded[0] if len(set(rounded)) == 1 else rounded
+
+
+def estimated_problem(
+    problem: Problem,
+    gains: np.ndarray,
+    cycles: Sequence[float],
+    lags: Sequence[float],
+    drift: np.ndarray | None = None,
+    noise: Sequence[float] = (),
+) -> Problem:
+    """Return the problem with the estimated plant as its reality.
+
+    Args:
+        gains: Lambda, shape (n, n).
+        drift: w by cycle, shape (cycles, n), which ends with its last value; None: there is none.
+        noise: rms of the measured response, by controlled coordinate; empty: there is none.
+    """
+    plant, signals = _plant(problem.plant, gains, drifts=drift is not None)
+    own, period = problem.of_model, problem.period
+    shortest = min((tau for tau in lags if tau > 0), default=math.inf)
+    finer = own.integrator.finer(math.ceil(period / shortest)) if shortest < period else None
+    duration, begin, courses = own.duration, own.measure_from, {}
+    if drift is not None:
+        duration, times = period * max(len(drift), min(own.cycles, _CYCLES)), period * np.arange(len(drift))
+        begin = min(begin, _BEGUN * duration)
+        courses = {s: Unknown(Samples(times, w)) for s, w in zip(signals, drift.T, strict=True)}
+    start: Mapping[str, float] = own.start
+    if own.plant.equations.known_on_reference:  # what is judged is what comes after the transient
+        start = dict(zip(own.plant.state.elements, map(float, reference_states(own, 2)[:, 0]), strict=True))
+    sensing = own.sensing
+    if noise and sensing.estimator.shows_response and sensing.observer is None:  # the response itself is measured
+        sizes = zip(response_names(own.plant), noise, strict=True)
+        noisy = {name: Sensor(noise=Noise(size)) for name, size in sizes if size}
+        sensing = replace(sensing, sensors={**sensing.sensors, **noisy})
+    actuated = behind_actuators(plant, lags)
+    added = [name for name in actuated.coordinates if name not in plant.coordinates]
+    at_rest = [float(u) for u, lag in zip(own.inputs_before, lags, strict=True) if lag > 0]
+    return replace(
+        own,
+        plant=problem.plant,
+        start=start,
+        reality=Reality(actuated, integrator=finer, start=dict(zip(added, at_rest, strict=True))),
+        dead_time=DeadTime(inputs={name: c * period for name, c in zip(own.plant.inputs, cycles, strict=True)}),
+        signals={**own.signals, **courses},
+        disturbances={},
+        sensing=sensing,
+        duration=duration,
+        measure_from=begin,
+    )
+
+
+def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tuple[str, ...]]:
+    """The plant without its lags, and the names of its drifts."""
+    without = "the estimated plant of a {} has no equations yet"
+    require_rates(model, without.format("map"))
+    direct = set(model.controlled_names) == set(model.coordinates)  # else what else the inputs move has to follow
+    if model.equations.inverse_opaque and not direct:
+        raise NotSupported(without.format("plant of outputs of a model that is not affine in its inputs,"))
+    signals = tuple(f"drift_{name}" for name in model.controlled_names) if drifts else ()
+    known = {n: one if one.outside else replace(one, exact=one.approximate) for n, one in model.parameters.items()}
+    courses = {name: outside(0.0, "1") for name in signals}
+
+    def response(*arguments: Named) -> Mapping[str, Expression]:
+        *derivatives, u, p = arguments
+        x = ca.vertcat(*(derivatives[e.count("'")][e.rstrip("'")] for e in model.state.elements))
+        inputs, parameters = (ca.vertcat(*(one[n] for n in names)) for one, names in ((u, model.inputs), (p, known)))
+        answers = model.equations.controlled_response(x, inputs, parameters)
+        wanted = ca.DM(gains) @ answers + (ca.vertcat(*(p[name] for name in signals)) if signals else 0)
+        if direct:
+            return {name: wanted[i] for i, name in enumerate(model.controlled_names)}
+        inputs = model.equations.inverse(x, wanted, parameters)
+        own = Named(tuple(known), parameters, "parameter")
+        return dict(model.response(*derivatives, Named(tuple(model.inputs), inputs, "input"), own))
+
+    vars(response)["__signature__"] = inspect.signature(model.response)
+    plant = replace(model, parameters={**known, **courses}, response=response, inverse=None)
+    return plant, signals

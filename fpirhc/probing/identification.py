@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -44,12 +44,10 @@ class Channel:
     dead_time: Interval  # d, cycles
     lag: Interval  # tau, in the problem's unit of time
     noise: float  # rms of what is no response of the plant
-    drift: np.ndarray = field(repr=False)  # what is, and the model does not have: w by cycle
+    drift: np.ndarray  # what is, and the model does not have: w by cycle
     drifting: float = 0.0  # rms change of w per square root of the unit of time
     edge: str = ""  # what the record is too short to bound: "dead time", "lag", or nothing
-    ends: tuple[Fit, ...] = field(
-        default=(), repr=False
-    )  # the best, and the likeliest at the ends of dead time and lag
+    ends: tuple[Fit, ...] = ()  # the best, and the likeliest at the ends of dead time and lag
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,23 +64,9 @@ class Fit:
     innovation: float
 
 
-def identify(
-    measured: np.ndarray, modelled: np.ndarray, period: float, usable: np.ndarray | None = None
-) -> tuple[Channel, ...]:
-    """Return what every response is made of.
-
-    Args:
-        measured: f, shape (cycles, n).
-        modelled: m of the same cycles, shape (cycles, n).
-        usable: which cycles count; None: all.
-
-    Raises:
-        InvalidValue: fewer than 40 cycles.
-    """
-    cycles = len(measured)
-    require_cycles(cycles)
-    good = np.ones(cycles, dtype=bool) if usable is None else usable
-    return tuple(_channel(measured[:, i], modelled, period, good) for i in range(measured.shape[1]))
+def identify(measured: np.ndarray, modelled: np.ndarray, period: float, usable: np.ndarray) -> tuple[Channel, ...]:
+    """Return what every response f, shape (cycles, n), is made of, from m of the same cycles, and which of them count."""
+    return tuple(_channel(f, modelled, period, usable) for f in measured.T)
 
 
 def require_cycles(cycles: int) -> None:
@@ -139,14 +123,9 @@ def delayed(m: np.ndarray, dead: int, lag: float, period: float) -> np.ndarray:
 
 
 def _profile(
-    f: np.ndarray,
-    m: np.ndarray,
-    period: float,
-    good: np.ndarray,
-    deads: Sequence[int],
-    lags: np.ndarray,
-    ratios: np.ndarray,
-) -> list[Fit]:
+    f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray,
+    deads: Sequence[int], lags: np.ndarray, ratios: np.ndarray,
+) -> list[Fit]:  # fmt: skip
     """The best gains at every point of a grid; all points of one noise are whitened together."""
     points = [(d, float(tau)) for d in deads for tau in lags]
     rows = np.array([delayed(m, d, tau, period).T for d, tau in points])  # (points, n, cycles)
@@ -224,10 +203,6 @@ class End:
     lags: tuple[float, ...]
     gains: np.ndarray
 
-    def later(self) -> End:
-        """Return it with commands that come a cycle later still."""
-        return replace(self, cycles=tuple(c + 1 for c in self.cycles))
-
 
 class Estimates:
     """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them.
@@ -257,9 +232,8 @@ class Estimates:
             for fits in zip(*(one.ends for one in channels), strict=True)
         )
         sizes = np.abs(np.linalg.eigvals(self.gains))
-        self.weights: tuple[tuple[float, ...], ...] | None = (
-            None  # the inverse of Lambda; None: all directions have one gain
-        )
+        # The inverse of Lambda; None: all directions have one gain.
+        self.weights: tuple[tuple[float, ...], ...] | None = None
         if len(sizes) > 1 and not self.refused and sizes.max() >= _COUPLED * sizes.min():
             self.weights = tuple(tuple(float(f"{w:.3g}") for w in row) for row in np.linalg.inv(self.gains))
             self.largest_weighted = _largest(draws @ np.array(self.weights))  # of Lambda times the weights

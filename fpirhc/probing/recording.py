@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,14 +17,17 @@ from fpirhc.deformation.base import Identity, Iteration
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.motion import input_columns
+from fpirhc.probing.identification import require_cycles
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
 _HOLDS = (1, 2, 4, 8, 16)  # cycles
 _NOISES, _SHARE = 2.0, 0.1  # amplitude: of the noise, and of the deviation of the desired response
+_EVEN = 0.01  # share of the period by which a time may be off
 _BEGUN = 3  # cycles after which a response is one of the run
 
 
@@ -43,52 +46,55 @@ class Excitation(Identity):
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         del elements
-        return Layout((*(scalar(name) for name in self.shown().values()), scalar("excitation_cycle")))
-
-    def shown(self) -> Mapping[str, str]:
-        return {name: f"{name}_before" for pair in self._names for name in pair}
+        return Layout((scalar("excitation_cycle"),))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
+        del request, response
         table = sequence(self.cycles, len(self.amplitude), self.seed) * np.array(self.amplitude)
         cycle, grid = memory["excitation_cycle"], np.arange(self.cycles, dtype=float)
         added = ca.interpolant("excitation", "linear", [grid.tolist()], table.ravel().tolist())
-        remembered = {"excitation_cycle": cycle + 1}
-        for k, (model, measured) in enumerate(self._names):
-            remembered |= {f"{model}_before": request[k], f"{measured}_before": response[k]}
-        return desired + added(ca.fmin(cycle, self.cycles - 1)), remembered
+        return desired + added(ca.fmin(cycle, self.cycles - 1)), {"excitation_cycle": cycle + 1}
 
     def effective_gain(self) -> float:
         return 1e-9  # next to nothing
 
-    @property
-    def _names(self) -> list[tuple[str, str]]:
-        return [(f"excitation_model_{k}", f"excitation_response_{k}") for k in range(len(self.amplitude))]
-
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What was recorded."""
+    """What was recorded, from the second cycle on."""
 
-    measured: np.ndarray  # responses, shape (cycles, n)
+    measured: np.ndarray  # responses, shape (cycles - 1, n)
     modelled: np.ndarray  # the model's responses to the commands that acted
-    usable: np.ndarray  # which cycles count: those with an answer
-    amplitude: tuple[float, ...] = ()  # of the excitation
+    usable: np.ndarray  # which cycles count: those with numbers
     stop: str = ""  # why the run ended early; empty where it did not
-    clipped: float = 0.0  # share of the cycles with a command at a limit
+
+
+def _record(
+    problem: Problem, where: str, times: np.ndarray, states: np.ndarray, commands: np.ndarray, measured: np.ndarray
+) -> Record:
+    """The responses beside those of the model, at the states of the same time and with the commands before it."""
+    plant = problem.plant
+    require_cycles(len(times))
+    still = np.ptp(commands, axis=0) <= 1e-9 * np.abs(commands).max(axis=0)  # NaN moves
+    if still.any():
+        raise InvalidValue(
+            f"{where}: the input '{list(plant.inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain; "
+            "record a run in which it steps, or leave it room within its limits"
+        )
+    told, parameters = model_values(plant, problem.signals), plant.approximate
+    known = parameters if told is None else told.map(len(times) - 1)(times[None, 1:], parameters)
+    modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, known)).T
+    usable = np.isfinite(measured[1:]).all(axis=1) & np.isfinite(modelled).all(axis=1)
+    return Record(np.nan_to_num(measured[1:], posinf=0, neginf=0), np.nan_to_num(modelled, posinf=0, neginf=0), usable)
 
 
 def sequence(cycles: int, channels: int, seed: int) -> np.ndarray:
     """Return +-1, shape (cycles, channels), held for 1 to 16 cycles: power at all frequencies of interest; 0 in the end."""
     random, signs = np.random.default_rng(seed), np.zeros((cycles, channels))
     for j in range(channels):
-        k, sign = 0, 1.0
-        while k < cycles:
-            hold = int(random.choice(_HOLDS))
-            sign = float(random.choice([-1.0, 1.0])) if random.random() < 0.5 else -sign
-            signs[k : k + hold, j] = sign
-            k += hold
+        signs[:, j] = np.repeat(random.choice([-1.0, 1.0], cycles), random.choice(_HOLDS, cycles))[:cycles]
     signs[-1] = 0
     return signs
 
@@ -102,44 +108,25 @@ def excited(
         amplitude: in the unit of the response, by controlled coordinate; None: twice the noise of a silent run of
             the same length and a tenth of the deviation of its desired response.
     """
-    names = problem.plant.controlled_names
     short, bare = replace(problem, duration=cycles * problem.period, measure_from=0.0), without_deformation(controller)
-    if amplitude is None:
-        run, silent = _run(short, bare, (0.0,) * len(names), cycles, seed)
-        noise = np.median(np.abs(np.diff((silent.measured - silent.modelled)[_BEGUN:], axis=0)), axis=0) / 0.6745
-        sizes = _NOISES * noise / np.sqrt(2) + _SHARE * np.std(np.asarray(run["desired"])[_BEGUN:], axis=0)
-        chosen = tuple(map(float, sizes))
-    else:
-        chosen = tuple(float(amplitude.get(name, 0.0)) for name in names)
-    return _run(short, bare, chosen, cycles, seed)[1]
 
+    def run_with(amplitude: tuple[float, ...]) -> tuple[Run, Record]:
+        # All lateness is identified, the stated one too.
+        at_once = ModelReferenced(Excitation(amplitude, cycles, seed), cycles=0.0, lag=0.0)
+        with any_gain():  # nothing is iterated, so the sign of the plant's gain does not matter
+            run = simulate(short, bare.with_deformation(at_once), seed=seed, compiled=False)
+        record = _record(problem, "probe", run.time, run["state"], run["command"], run["realised"])
+        if "foreign_held" in run.layout.names:
+            record = replace(record, usable=record.usable & (run["foreign_held"].ravel()[1:] == 0))
+        return run, replace(record, stop=run.stop or "")
 
-def _run(
-    problem: Problem, bare: Controller, amplitude: tuple[float, ...], cycles: int, seed: int
-) -> tuple[Run, Record]:
-    excitation = Excitation(amplitude, cycles, seed)
-    at_once = ModelReferenced(excitation, cycles=0.0, lag=0.0)  # all lateness is identified, the stated one too
-    with any_gain():  # nothing is iterated, so the sign of the plant's gain does not matter
-        run = simulate(problem, bare.with_deformation(at_once), seed=seed, compiled=False)
-    if run.stop is None:
-        require_moving(run["command"], problem.plant.inputs, "probe")
-    modelled, measured = (np.column_stack([run[pair[k]] for pair in excitation._names]) for k in (0, 1))
-    held = np.asarray(run["foreign_held"]).ravel() if "foreign_held" in run.layout.names else np.zeros(len(measured))
-    clipped = float(np.mean(np.asarray(run["clipped"]) > 0)) if len(measured) else 0.0
-    return run, Record(measured, modelled, held == 0, amplitude, run.stop or "", clipped)
-
-
-def require_moving(commands: np.ndarray, inputs: Iterable[str], where: str) -> None:
-    """Raise if an input never changes."""
-    still = np.ptp(commands, axis=0) <= 1e-9 * np.abs(commands).max(axis=0)  # NaN moves
-    if still.any():
-        raise InvalidValue(
-            f"{where}: the input '{list(inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain; "
-            "record a run in which it steps, or leave it room within its limits"
-        )
-
-
-_EVEN = 0.01  # share of the period by which a time may be off
+    names = problem.plant.controlled_names
+    if amplitude is not None:
+        return run_with(tuple(float(amplitude.get(name, 0.0)) for name in names))[1]
+    run, silent = run_with((0.0,) * len(names))
+    noise = np.median(np.abs(np.diff((silent.measured - silent.modelled)[_BEGUN:], axis=0)), axis=0) / 0.6745
+    sizes = _NOISES * noise / np.sqrt(2) + _SHARE * np.std(np.asarray(run["desired"])[_BEGUN:], axis=0)
+    return run_with(tuple(map(float, sizes)))[1]
 
 
 def read_recording(path: Path, problem: Problem) -> Record:
@@ -148,13 +135,6 @@ def read_recording(path: Path, problem: Problem) -> Record:
     Its columns are "time", every input by name (the command that is sent at this time;
     "input NAME" where a coordinate has the same name), the elements of the model's state, and the
     responses ("q1''"); a response without a column is the difference of its lower derivative over a cycle.
-
-    Args:
-        path: of the file.
-        problem: whose model and period it is of.
-
-    Raises:
-        InvalidValue: missing columns, other times than those of the period, entries that are no numbers; all mistakes together.
     """
     table = _table(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
@@ -176,13 +156,8 @@ def read_recording(path: Path, problem: Problem) -> Record:
             f"{times[k]:g} is followed by {times[k + 1]:g}"
         )
     commands, states = (table[list(names)].to_numpy() for names in (input_columns(plant), plant.state.elements))
-    require_moving(commands, plant.inputs, f"recording {path.name}")
     responses = [table[n] if n in table else table[n[:-1]].diff() / period for n in response_names(plant)]
-    measured = np.column_stack(responses)[1:]
-    modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, plant.approximate)).T
-    usable = np.isfinite(measured).all(axis=1) & np.isfinite(modelled).all(axis=1)
-    measured, modelled = (np.where(np.isfinite(one), one, 0.0) for one in (measured, modelled))
-    return Record(measured, modelled, usable)
+    return _record(problem, f"recording {path.name}", times, states, commands, np.column_stack(responses))
 
 
 def _table(path: Path) -> pd.DataFrame:

@@ -140,10 +140,10 @@ def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
 
 
 @pytest.mark.slow
-def test_no_neighbour_of_the_choice_is_better():
-    """On a plant with limits that the estimate lacks the best predicted share is too large; trials walk to the best."""
+def test_no_neighbour_of_the_choice_is_clearly_better():
+    """On a plant with limits that the estimate lacks, trials of 2 000 cycles walk to the best."""
     task = fp.load_problem("van_der_pol")
-    problem, controller = replace(task.problem, duration=5.0), task.controllers["RHC"]
+    problem, controller = replace(task.problem, duration=2000 * task.problem.period), task.controllers["RHC"]
     found = fp.probe(problem, controller, cycles=400)
     assert found.deformation is not None
     gain = found.deformation.effective_gain()
@@ -152,14 +152,14 @@ def test_no_neighbour_of_the_choice_is_better():
         adapted = controller.with_deformation(found.deformation.with_effective_gain(factor * gain))
         run = fp.simulate(problem, adapted, seed=1, compiled=False)
         errors.append(np.mean(list(fp.measure(problem, run).rms_error.values())))
-    assert errors[0] == min(errors)
+    assert errors[0] <= 1.02 * min(errors)
 
 
 @pytest.mark.slow
 def test_what_a_record_does_not_bound_is_adapted_by_trials_alone():
     """Forty cycles are a tenth of what a lag of .3 s takes: nothing is proposed untried."""
     problem = replace(body_problem(1.0, 0, 0.3, 0.05), duration=2.0)
-    untried, found = (fp.probe(problem, RHC, cycles=60, trials=trials) for trials in (False, True))
+    untried, found = (fp.probe(problem, RHC, cycles=60, amplitude=1.0, trials=trials) for trials in (False, True))
     assert untried.why == "the record is too short for the lag: take more cycles"
     assert untried.deformation is None
     assert untried.why in found.notes
