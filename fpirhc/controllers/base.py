@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
-from fpirhc.controllers.path import believed_path, model_blocks
+from fpirhc.controllers.path import believed_path, model_block
 from fpirhc.controllers.reference_states import largest_response, motion_of, own_signals, own_values
 from fpirhc.deformation.base import Deformation, LastRequest
 from fpirhc.plant.chain import nominal_responses
@@ -106,7 +106,7 @@ def closing_blocks(
     before, remembered = (
         ([], [Delay(last, "deformed")])
         if last.name in deform.reads
-        else model_blocks(believed_path(problem, deformation))
+        else ([model_block(believed_path(problem, deformation))], [])
     )
     return [*before, deform, invert_block(plant), *closing], [*delays, *remembered]
 

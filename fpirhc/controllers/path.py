@@ -4,7 +4,7 @@
 
 | behind it | is given | by |
 |---|---|---|
-| the parallel model of `ModelReferenced` | the model's response, as late as the plant's | `model_blocks` |
+| the parallel model of `ModelReferenced` | the model's response, as late as the plant's | `model_block` |
 | an observer | what acted until a sample was taken | `believe_block` |
 | a learner | the state and the command of a response | `Pairs` |
 
@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -27,11 +27,11 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import controlled_places, time_signal
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Evidence, Model, response_names, values_of
-from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, expression, is_finite, total
+from fpirhc.sensing.base import Evidence, Model, values_of
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.live import left_after, left_in_mean, numbers, stays
 from fpirhc.task.dead_time import DeadTime, Queue, every, whole
@@ -183,14 +183,10 @@ class Answers(NamedTuple):
     signal: Signal  # that holds them
 
 
-def model_blocks(path: Path) -> tuple[list[Block], list[Delay]]:
-    """Return the block that writes '_modelled', the response that a model-referenced map reads, and what it remembers."""
-    estimator, plant = path.problem.sensing.estimator, path.problem.plant
-    if estimator.of_steps or estimator.shows_response:
-        return [answer_block(path)], []
-    if plant.outputs:
-        return [_twin(path, _Beside(path))], []
-    return [_twin(path, _Forced(path))], [Delay(plant.response_signal(BEFORE), "_deformation")]
+def model_block(path: Path) -> Block:
+    """Block that writes '_modelled', the response that a model-referenced map reads in place of its last request."""
+    estimator = path.problem.sensing.estimator
+    return answer_block(path) if estimator.of_steps or estimator.shows_response else _twin(path)
 
 
 def answer_block(path: Path, answers: Answers | None = None) -> Block:
@@ -222,117 +218,60 @@ def answer_block(path: Path, answers: Answers | None = None) -> Block:
     return Block(path.name, Layout((measured_state(plant), *path.reads)), Layout((given.signal,)), step, Layout(memory))
 
 
-BEFORE = "_deformation_before"
-# a sample, what is added to the response that is estimated of it, and what is remembered after a move of the estimate
-Sample: TypeAlias = tuple[Expression, Expression | float, Callable[[Expression], dict[str, Expression]]]
-
-
-def _twin(path: Path, model: _Beside | _Forced) -> Block:
+def _twin(path: Path) -> Block:
     """Block (what is measured, last command, parameters) -> the model's response behind sensors and estimator.
 
-    The model shows a sample, the estimator makes a state and a response of it, and whatever separates this state from the measured
-    one moves the model and what the estimator remembers, so that the samples stay on one path.
+    The model moves over a cycle to x^ = F(x, u). Outputs that it computes are not the measured ones, so it has an offset o, a
+    polynomial in y ... y^(r-1) as the plans have, and shows y^(x^) + o to the sensors. The estimator makes outputs and response of
+    that. What separates these outputs from the measured ones moves the offset and what the estimator remembers, so that the samples
+    stay on one path.
+
+    The next cycle begins at the state that is given. A state that outputs show is the model's own, moved as they are: a state that
+    is estimated is late and noisy. The offset takes up what x^ is away from that state.
     """
     problem, plant, estimator = path.problem, path.problem.plant, path.problem.sensing.estimator
-    names = estimator.measures(plant)
-    estimate = estimator.block(plant, problem.period, model.start, Signal("_seen", names))
+    names, calm, given = estimator.measures(plant), np.zeros(len(plant.names)), measured_output(plant)
+    estimate = estimator.block(plant, problem.period, problem.start_output, Signal("_seen", names))
     own = tuple(replace(m, name=f"mirror_{m.name}") for m in estimate.memory.signals)
-    moves = _memory_moves(problem, names)
+    moves, ahead = _memory_moves(problem, names), ca.DM(_drift(plant.output, problem.period))
+    advance, seen = problem.integrator.step(plant, problem.period), _seen(problem)
+    x, u, p = plant.symbols()
+    outputs = ca.Function("fpirhc_mirror_outputs", [x, u, p], [plant.equations.output(x, u, p, calm)])
+    first = outputs(problem.start_state, problem.inputs_before, plant.approximate).full().ravel()
+    state = replace(plant.state, name="mirror_state", start=tuple(map(float, problem.start_state)))
+    offsets = replace(plant.output, name="mirror_offset", start=tuple(map(float, problem.start_output - first)))
+    shown_by = list(enumerate(plant.equations.known_by_outputs))
 
     def step(s: Signals) -> dict[str, Expression]:
-        acted = path.acted(s)
-        sample, adds, after = model.sample(s, acted)
-        shown, response, *memories = estimate.function(sample, *(getattr(s, m.name) for m in own))
-        away = getattr(s, model.reads[0].name) - shown
+        end, mean, parameters, age, later = path.acted(s)
+        at = ca.if_else(age < 0.5, s.mirror_state, advance(s.mirror_state, mean, parameters, calm))
+        offset = ca.if_else(age < 0.5, s.mirror_offset, ahead @ s.mirror_offset)
+        past = [getattr(s, m.name) for m in own]
+        shown, response, *memories = estimate.function(seen(at, end, parameters, offset), *past)
+        measured, away = getattr(s, MEASURED), getattr(s, given.name) - shown
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
-        later = acted.later | after(move)
-        for signal, value, matrix in zip(own, memories, moves, strict=True):
-            later[f"{signal.name}_next"] = value + matrix @ move
-        return {"_modelled": response + adds, **later}
+        told = ca.if_else(is_finite(measured), measured, at)
+        begins = ca.vertcat(*(told[k] if place < 0 else at[k] + move[place] for k, place in shown_by))
+        turn = outputs(at, end, parameters) - outputs(begins, end, parameters)
+        later |= {"mirror_state_next": begins, "mirror_offset_next": offset + move + turn}
+        moved = zip(own, memories, moves, strict=True)
+        return {"_modelled": response, **later, **{f"{m.name}_next": v + matrix @ move for m, v, matrix in moved}}
 
-    reads, memory = Layout((*model.reads, *path.reads)), Layout((*path.memory, *model.memory, *own))
+    reads = {signal.name: signal for signal in (given, measured_state(plant), *path.reads)}
+    memory, writes = (*path.memory, state, offsets, *own), (plant.response_signal("_modelled"),)
     return Block(
-        "mirror", reads, Layout((plant.response_signal("_modelled"),)), step, memory, problem.integrator.opaque
+        "mirror", Layout(tuple(reads.values())), Layout(writes), step, Layout(memory), problem.integrator.opaque
     )
 
 
-class _Forced:
-    """A model that goes on by itself under the commands, forced by the deformations of the past with the other sign.
-
-    So it moves as the plant would if the model were right. The response that the estimator makes of a deformation is added.
-    """
-
-    def __init__(self, path: Path) -> None:
-        problem, plant = path.problem, path.problem.plant
-        self.start, self.reads = problem.start_state, (measured_state(plant), plant.response_signal(BEFORE))
-        self._advance, self._places = problem.integrator.step(plant, problem.period), controlled_places(plant)
-        self._seen = _seen(problem, response_names(plant))
-        names, estimator = plant.controlled_names, problem.sensing.estimator
-        self._weights = [estimator.weights(plant.orders[k], problem.period) for k in self._places]
-        self._waits = path.waits
-        length = max(max(w.size for w in self._weights) - 1, 1) + self._waits.length - 1
-        past = tuple(f"{e}@{k}" for k in range(1, length + 1) for e in names)
-        state = replace(plant.state, name="mirror_state", start=tuple(map(float, self.start)))
-        self.memory = (state, Signal("mirror_deformations", past))
-
-    def sample(self, s: Signals, acted: Acted) -> Sample:
-        """Return the sample of the cycle, what is added to its response, and what is remembered after a move."""
-        column, size = ca.vertcat(getattr(s, BEFORE), s.mirror_deformations), len(self._places)
-        late = [self._waits.delayed(column[size * j :], size) for j in range(max(w.size for w in self._weights))]
-        forcing: list[Expression] = [expression(0.0)] * self._advance.numel_in(3)
-        for place, value in zip(self._places, ca.vertsplit(late[0]), strict=True):
-            forcing[place] = -value
-        moved = self._advance(s.mirror_state, acted.mean, acted.parameters, ca.vertcat(*forcing))
-        at = ca.if_else(acted.age < 0.5, s.mirror_state, moved)
-        adds = [total(v * late[j][k] for j, v in enumerate(w) if v != 0) for k, w in enumerate(self._weights)]
-        later = {"mirror_deformations_next": column[: self.memory[1].size]}
-        seen = self._seen(at, acted.end, acted.parameters, -late[0])
-        return seen, ca.vertcat(*adds), lambda move: {"mirror_state_next": at + move, **later}
-
-
-class _Beside:
-    """A model that moves over a cycle from the state that is given, x_{k-1}, to x^ = F(x_{k-1}, u), and shows its outputs there.
-
-    Outputs that the model computes are not the measured ones, so it has an offset o, a polynomial in y ... y^(r-1) as the plans
-    have: y~_k = y^(x^) + o_k. After each cycle the offset is moved to where the estimate of the twin is the controller's, and it
-    takes up the difference between x^ and the state that is given next.
-    """
-
-    def __init__(self, path: Path) -> None:
-        problem, plant = path.problem, path.problem.plant
-        self.start, self.reads = problem.start_output, (measured_output(plant), measured_state(plant))
-        self._advance, self._calm = problem.integrator.step(plant, problem.period), np.zeros(len(plant.names))
-        self._seen, self._ahead = _seen(problem, plant.output.elements), ca.DM(_drift(plant.output, problem.period))
-        x, u, p = plant.symbols()
-        self._chain = ca.Function("fpirhc_mirror_chain", [x, u, p], [plant.equations.output(x, u, p, self._calm)])
-        own = self._chain(problem.start_state, problem.inputs_before, plant.approximate).full().ravel()
-        state = replace(plant.state, name="mirror_state", start=tuple(map(float, problem.start_state)))
-        self.memory = (state, replace(plant.output, name="mirror_offset", start=tuple(map(float, self.start - own))))
-
-    def sample(self, s: Signals, acted: Acted) -> Sample:
-        """Return the sample of the cycle, nothing that is added to its response, and what is remembered after a move."""
-        waits, end, parameters = acted.age < 0.5, acted.end, acted.parameters
-        moved = self._advance(s.mirror_state, acted.mean, parameters, self._calm)
-        at = ca.if_else(waits, s.mirror_state, moved)
-        offset = ca.if_else(waits, s.mirror_offset, self._ahead @ s.mirror_offset)
-
-        def after(move: Expression) -> dict[str, Expression]:
-            measured = getattr(s, MEASURED)
-            measured = ca.if_else(is_finite(measured), measured, at)
-            turn = self._chain(at, end, parameters) - self._chain(measured, end, parameters)
-            return {"mirror_state_next": measured, "mirror_offset_next": offset + move + turn}
-
-        return self._seen(at, end, parameters, offset), 0.0, after
-
-
-def _seen(problem: Problem, shifted: Sequence[str]) -> ca.Function:
-    """Function (state, input, parameters, shift) -> what the sensors show, in whole quanta; the shift is added to `shifted`."""
+def _seen(problem: Problem) -> ca.Function:
+    """Function (state, input, parameters, offset of the outputs) -> what the sensors show, in whole quanta."""
     plant, names = problem.plant, problem.sensing.estimator.measures(problem.plant)
-    (x, u, p), shift = plant.symbols(), ca.SX.sym("shift", len(shifted))
+    (x, u, p), offset = plant.symbols(), ca.SX.sym("offset", plant.output.size)
     values = values_of(plant, x, u, p)
-    values |= {name: values[name] + one for name, one in zip(shifted, ca.vertsplit(shift), strict=True)}
+    values |= {e: values[e] + one for e, one in zip(plant.output.elements, ca.vertsplit(offset), strict=True)}
     shown = [problem.sensing.rounded(name, values[name]) for name in names]
-    return ca.Function("fpirhc_mirror_seen", [x, u, p, shift], [ca.densify(ca.vertcat(*shown))])
+    return ca.Function("fpirhc_mirror_seen", [x, u, p, offset], [ca.densify(ca.vertcat(*shown))])
 
 
 def _memory_moves(problem: Problem, names: Sequence[str]) -> list[ca.DM]:
@@ -494,5 +433,7 @@ def measured_state(plant: Plant) -> Signal:
 
 
 def measured_output(plant: Plant) -> Signal:
-    """Return the signal of the outputs of the same instant."""
-    return Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units)
+    """Return the signal of the outputs of the same instant; without outputs that of the state."""
+    return (
+        Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units) if plant.outputs else measured_state(plant)
+    )
