@@ -25,7 +25,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar, vector
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.open import nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 

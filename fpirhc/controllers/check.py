@@ -19,7 +19,7 @@ from fpirhc.controllers.contract import Controller, refuse, resolved
 from fpirhc.deformation.base import Deformation, Iteration, against_wrappers, own_gain, with_its_gain
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.open import nominal
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
@@ -210,7 +210,7 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
 
 def check_form(problem: Problem, controller: Controller) -> None:
     """Raise if the controller's deformation has a form that cannot be used."""
-    refuse(_of_form(problem, nominal(controller.deformation)))
+    refuse(_of_form(problem, controller.deformation))
 
 
 def _of_outputs(problem: Problem) -> Iterator[str]:

@@ -149,7 +149,7 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         return {**composite.trace.split(trace), **remembered}
 
     inside = composite.trace, step, composite.memory, composite.opaque
-    return Block(name, Layout(reads), *inside, derived=composite.derived_if_any)
+    return Block(name, Layout(reads), *inside)
 
 
 def _measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:

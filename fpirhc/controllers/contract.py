@@ -27,7 +27,6 @@ from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
-from fpirhc.symbolic.live import nominal
 from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous
 from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
@@ -119,7 +118,7 @@ class Planner:
         return costed if horizon is costed.horizon else replace(costed, horizon=horizon)
 
     def check_weights(self, problem: Problem) -> None:
-        """Raise where the weights of the cost are not valid; `derived` of the plan block checks its other numbers."""
+        """Raise where the weights of the cost are not valid."""
         cost = self.cost or problem.cost
         if cost is not None:
             cost.check(problem.plant)
@@ -251,7 +250,7 @@ class PairedAtOnce(Undeformed, ABC):
     """Contract: a controller that takes a response for that of the last command, also behind dead time."""
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        late = nominal(problem.dead_time)
+        late = problem.dead_time
         age = late.measurement + max(late.inputs.values(), default=0.0)
         text = (
             f"{type(self).__name__} takes a response for that of the last command, and it is that of a command {age:.3g} "

@@ -15,7 +15,6 @@ from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.driver import every_finite, finite, kept_if_finite
 from fpirhc.symbolic.expression import FINITE, Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import Derived, Values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -190,16 +189,8 @@ class Gate:
             values |= dict.fromkeys(status, ended)
             return {**values, "command": kept[HELD], **{f"{m}_next": v for m, v in remembered.items()}}
 
-        derived = self._derived if self.inner.derived_if_any else None
         opaque, inside = self.inner.opaque, self.inner
-        return Block("gate", self.reads, trace, step, self.memory, opaque=opaque, derived=derived, inside=inside)
-
-    def _derived(self, values: Values) -> Derived:
-        """What follows from live settings, with the controller's memory as this block has it."""
-        inner = self.inner.derived(values)
-        if not self.inner.opaque:
-            return inner
-        return replace(inner, memory=lambda: {INNER: self.inner.memory.pack(inner.memory())})
+        return Block("gate", self.reads, trace, step, self.memory, opaque=opaque, inside=inside)
 
     def _before(self) -> ca.Function:
         """Function (sample, kept, time) -> (whether the sample fits, the last good sample).

@@ -9,22 +9,24 @@ from __future__ import annotations
 
 import math
 import re
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Controller, resolved
-from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout, Signal, scalar
-from fpirhc.symbolic.live import ANEW, PREFIX, copied, live_number, not_live
+from fpirhc.symbolic.open import ANEW, PREFIX, copied, not_live, open_number
 from fpirhc.symbolic.paths import changed_at, content_at, entry, mapped, names_in, paths_to
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -36,8 +38,10 @@ _ALWAYS_DATA = (
     "Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes exact.NAME, "
     "approximate.NAME and start.NAME"
 )
-_IN_TABLES = ("sensing", "disturbances")  # of what Python makes tables before a run
-_NUDGES, _SMALLEST = (0.07, 2.0), 1e-3  # shares by which a number is changed to see whether the loop depends on it
+_IN_TABLES = ("sensing.", "disturbances.")  # of what Python makes tables before a run
+_SMALLEST = 1e-3
+_OF_BUILD = (ArithmeticError, AttributeError, FpirhcError, NotImplementedError, RuntimeError, TypeError, ValueError)
+_PACKAGE = str(Path(__file__).parents[1])
 _OF_INPUTS = "limits.inputs."
 # Of the search for bounds, in the number's size.
 _REACHES = (1.0, 1e1, 1e2, 1e4, 1e8, 1e16, 1e32, 1e64, 1e128, 1e256)
@@ -86,74 +90,58 @@ class LiveSettings:
             if path in data:
                 continue
             if self._in_problem(path):
-                problem = changed_at(problem, path, live_number(path, value), copied)
+                problem = changed_at(problem, path, open_number(path, value), copied)
             else:
-                controller = changed_at(controller, path, live_number(path, value), copied)
+                controller = changed_at(controller, path, open_number(path, value), copied)
         return problem, controller
 
     def composed(self, compose: Callable[[Problem, Controller], Composite]) -> Composite:
-        """Return what `compose` makes of problem and controller with live numbers."""
-        problem, controller = self.planted()
+        """Return what `compose` makes of problem and controller with open numbers.
+
+        Raises:
+            NotSupported: a number that the loop does not read, or with which Python computes while the loop is built.
+        """
         try:
-            composite = compose(problem, controller)
-        except (ArithmeticError, AttributeError, FpirhcError, RuntimeError, TypeError, ValueError) as error:
+            composite = compose(*self.planted())
+        except _OF_BUILD as error:
             interruption = unwrapped(error)
-            raise (self._refusal(error) if isinstance(interruption, Exception) else interruption) from None
+            if not isinstance(interruption, Exception):
+                raise interruption from None
+            raise self._refusal(error, compose) from None
         read = {s.name for b in composite.blocks for s in b.inputs.signals}
         for path in self.paths:
             if path in self.moved:
                 _require_moving(path, composite)
-            elif PREFIX + path not in read:
-                self._require_apart(path, composite, compose)
-        _refuse_lost(composite, self.paths)
+            elif PREFIX + path not in read and not (self._in_problem(path) and path.startswith(_IN_TABLES)):
+                loop = f"the loop of {type(self.controller).__name__}"
+                raise not_live([path], f"{loop} does not use it, or uses only what was computed from it before; {ANEW}")
+        for block in composite.blocks:
+            if holds_nan(block.function) or np.isnan(block.memory.start()).any():
+                # CasADi makes NaN of a symbol that is turned into a number.
+                raise not_live(self.paths, f"block '{block.name}' turns one of them into a number; {ANEW}", " together")
         return composite
 
-    def _require_apart(
-        self, path: str, composite: Composite, compose: Callable[[Problem, Controller], Composite]
-    ) -> None:
-        """Raise for a number that no block reads, unless the loop is the same one for others: then checks or tables read it."""
-        elsewhere = self._in_problem(path) and path.partition(".")[0] not in _IN_TABLES
-        if elsewhere or not all(self._same_with(path, share, composite, compose) for share in _NUDGES):
-            loop = f"the loop of {type(self.controller).__name__}"
-            raise not_live(
-                [path],
-                f"{loop} does not use it, or uses only numbers that are computed from it while it is built; {ANEW}",
-            )
-
-    def _same_with(
-        self, path: str, share: float, composite: Composite, compose: Callable[[Problem, Controller], Composite]
-    ) -> bool:
-        value = self._content(path)
-        other, paths = value + share * max(abs(value), _SMALLEST), tuple(p for p in self.paths if p != path)
-        if self._in_problem(path):
-            apart = replace(self, paths=paths, problem=changed_at(self.problem, path, other, copied))
-        else:
-            apart = replace(self, paths=paths, controller=changed_at(self.controller, path, other, copied))
-        try:
-            again = compose(*apart.planted())
-            same = again.function.serialize() == composite.function.serialize()
-        except (ArithmeticError, FpirhcError, ValueError):  # another number may be refused
-            return False
-        return same and np.array_equal(again.memory.start(), composite.memory.start())
-
-    def _refusal(self, error: Exception) -> Exception:
-        """The error that names the settings, for an error of the build."""
+    def _refusal(self, error: Exception, compose: Callable[[Problem, Controller], Composite]) -> Exception:
+        """The error that names the setting and the place, for an error of the build."""
         if isinstance(error, FpirhcError) and any(f"'{path}'" in str(error) for path in self.start):
             return error
-        lost = [path for path in self.start if f"{PREFIX}{path}" in str(error)]
-        if lost:
-            return not_live(lost[:1], f"a part of the loop that is built by itself needs its number; {ANEW}", " here")
-        together = " together" if len(self.start) > 1 else ""
-        if isinstance(error, TypeError):  # the words of numpy or CasADi for a number that it was not given
-            return not_live(self.start, f"a number is needed while the loop is built; {ANEW}", together)
-        return not_live(self.start, f"the loop cannot be built like that ({error})", together)
+        for path in self.paths if len(self.paths) > 1 else ():
+            try:
+                replace(self, paths=(path,), automatic=()).composed(compose)
+            except NotSupported as alone:
+                return alone
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        for one in traceback.extract_tb(error.__traceback__):
+            place = one if one.filename.startswith(_PACKAGE) else place
+        where = f"{Path(place.filename).stem}.{place.name}"
+        return not_live(self.paths, f"{where} needs its number while the loop is built; {ANEW}", " here")
 
     def held(self, blocks: Sequence[Block]) -> list[Delay]:
-        """Return the settings and derived numbers that some blocks read, as constants of a memory."""
+        """Return the settings that some blocks read, as constants of a memory."""
         return [Delay(s, s.name) for s in self.read_by(blocks)]
 
     def read_by(self, blocks: Sequence[Block]) -> list[Signal]:
-        """Return the signals of settings and derived numbers that some blocks read, with their numbers of the build."""
+        """Return the signals of settings that some blocks read, with their numbers of the build."""
         starts = {s.name: s for s in self.signals.signals}
         return [starts.get(s.name, s) for s in open_settings(blocks).signals]
 
@@ -330,15 +318,6 @@ def _require_moving(path: str, composite: Composite) -> None:
     """Raise for a parameter of what moves where nothing moves."""
     if MOVING not in composite.memory:
         raise not_live([path], "nothing moves in a controller alone; change the machine", " here")
-
-
-def _refuse_lost(composite: Composite, paths: Sequence[str]) -> None:
-    """Raise where a Function holds the number NaN: CasADi makes it of a symbol that is turned into a number."""
-    for block in composite.blocks:
-        if holds_nan(block.function):
-            raise not_live(
-                paths, f"block '{block.name}' turns one of them into a number, which is NaN; {ANEW}", " together"
-            )
 
 
 def _differences(before: object, after: object, path: str = "") -> Iterator[str]:

@@ -33,7 +33,7 @@ from fpirhc.sensing.base import Evidence, Model, values_of
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import left_after, left_in_mean, numbers, stays
+from fpirhc.symbolic.open import left_after, left_in_mean, numbers, stays
 from fpirhc.task.dead_time import DeadTime, Queue, every, whole
 from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
 from fpirhc.task.problem import Problem

@@ -18,7 +18,6 @@ from fpirhc.controllers.replanning import (
     at_consistent_start,
     built_first_memory,
     consistent_start,
-    first_memory,
     held_model,
 )
 from fpirhc.deformation.base import Deformation, Identity
@@ -27,7 +26,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import SCALE, SIZE, STEEPEST, live_signals, offset_limits, shifted_reference, stage_data
+from fpirhc.horizon.stage_data import live_signals, offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -39,11 +38,10 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, Derived, LiveNumber, copied, live_numbers, nominal, numbers, settled
+from fpirhc.symbolic.open import PREFIX, expressed, is_open, nominal, numbers, open_numbers, smallest
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem, cycles_per_plan
 
-_SCALE, _STEEPEST, _SIZE = (f"{PREFIX}{DERIVED}plan.{name}" for name in (SCALE, STEEPEST, SIZE))
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
 
@@ -121,10 +119,10 @@ _PLANS: Latest[Block] = Latest(8)  # controllers that differ in their deformatio
 
 
 def _optimal_control(
-    problem: Problem, optimiser: Optimiser, moving: Mapping[str, LiveNumber] | None = None
+    problem: Problem, optimiser: Optimiser, moving: Mapping[str, ca.SX] | None = None
 ) -> OptimalControl:
     """The horizon; live numbers that move its reference are among its settings, as those that the optimiser reads."""
-    moving = live_numbers(problem.reference) if moving is None else moving
+    moving = open_numbers(problem.reference) if moving is None else moving
     assert problem.horizon is not None
     assert problem.cost is not None
     ahead, read = previewed_values(problem.plant, problem.signals), {**_read_from_data(optimiser, problem), **moving}
@@ -132,10 +130,10 @@ def _optimal_control(
     return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start, read)
 
 
-def _read_from_data(optimiser: Optimiser, problem: Problem) -> dict[str, LiveNumber]:
+def _read_from_data(optimiser: Optimiser, problem: Problem) -> dict[str, ca.SX]:
     """Live numbers of the optimiser that its code reads from the data of the stages, and limits whose size it reads there."""
     limits = (problem.limits.inputs,) if optimiser.sized else ()
-    return live_numbers(*(getattr(optimiser, name) for name in optimiser.in_data), *limits)
+    return open_numbers(*(getattr(optimiser, name) for name in optimiser.in_data), *limits)
 
 
 def _due_block(cycles: int) -> Block:
@@ -177,7 +175,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     assert problem.cost is not None
     optimiser, restarts = controller.optimiser, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
-    count = live_signals(ocp.settings, plant.input).size
+    count = live_signals(ocp.settings).size
     data_of = _stage_data(problem, count)
     preview = preview_of(problem)
     running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
@@ -222,30 +220,8 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
             **remembered_next,
         }
 
-    def derived(values: Mapping[str, float]) -> Derived:
-        lower, upper = settled(problem.limits, values).input_bounds(plant)
-        led, along = _led(problem, optimiser, ocp, values)
-        ahead = replace(along, input_lower=lower, input_upper=upper).at(values)
-        settled(optimiser, values).check(ahead)
-        signals = _derived_numbers(ahead) if ocp.settings else {}
-        table_of = data_of if led is problem else _stage_data(led, count)
-        first = lambda: optimiser.memory(ocp).unpack(first_memory(start, optimiser, ahead, table_of))  # noqa: E731
-        return Derived(signals, first, {name: _STALE[name] for name in signals})
-
     own = memory + Layout((discrete("plan_begun"),))
-    live = derived if ocp.settings or ocp.live_bounds else None
-    return Block("plan", _plan_reads(problem, ocp, room), Layout(writes), step, own, opaque=True, derived=live)
-
-
-def _led(
-    problem: Problem, optimiser: Optimiser, ocp: OptimalControl, values: Mapping[str, float]
-) -> tuple[Problem, OptimalControl]:
-    """Problem and horizon along the reference with other numbers: scale and first plan are taken from the first horizon."""
-    moving = live_numbers(problem.reference)
-    if not moving:
-        return problem, ocp
-    led = copied(problem, {"reference": settled(problem.reference, values)})
-    return led, _optimal_control(led, optimiser, moving)
+    return Block("plan", _plan_reads(problem, room), Layout(writes), step, own, opaque=True)
 
 
 def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:
@@ -256,8 +232,8 @@ def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.F
     return stage_data(*arguments, previewed=previewed)
 
 
-def _plan_reads(problem: Problem, ocp: OptimalControl, room: np.ndarray | None) -> Layout:
-    """Time, start of the plan, parameters, last command and its shift or last plan, derived numbers, outputs, own signals."""
+def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
+    """Time, start of the plan, parameters, last command and its shift or last plan, outputs, own signals."""
     plant = problem.plant
     names = ("_command_shift_last", "_command_before") if room is None else (_PLANNED_BEFORE,)
     last = tuple(like(plant.input, name) for name in names)
@@ -265,37 +241,22 @@ def _plan_reads(problem: Problem, ocp: OptimalControl, room: np.ndarray | None) 
     own, outputs = own_signals(problem), measured_signals(plant)[1:]
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
-    return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *_derived_signals(ocp), *own))
-
-
-def _derived_signals(ocp: OptimalControl) -> tuple[Signal, ...]:
-    """Scale, largest eigenvalue and size of the horizon, which follow from live settings; nothing without any."""
-    if not ocp.settings:
-        return ()
-    starts = {name: tuple(map(float, values)) for name, values in _derived_numbers(ocp).items()}
-    elements = {_SCALE: ocp.input.elements, _STEEPEST: (), _SIZE: ()}
-    return tuple(Signal(name, elements[name], (), start) for name, start in starts.items())
-
-
-_LONGER = "the line search shortens its steps; plans are the same where they converge, and need more calls"
-_STALE = {_SCALE: _LONGER, _STEEPEST: _LONGER, _SIZE: "plans end at the tolerance of the limits before"}
-
-
-def _derived_numbers(ocp: OptimalControl) -> dict[str, np.ndarray]:
-    """Scale, largest eigenvalue and size of the smallest input, by signal."""
-    return {_SCALE: ocp.scale, _STEEPEST: np.array([ocp.steepest]), _SIZE: np.array([ocp.input_size])}
+    return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *own))
 
 
 def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: Signals) -> list[Expression]:
-    """The live settings, and what follows from them, at the end of a stage's data; nothing without any."""
+    """The open settings, and the size of the smallest input, at the end of a stage's data; nothing without any."""
     if not ocp.settings:
         return []
-    live = live_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser, problem)
+    live = open_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser, problem)
     declared = {one.name: getattr(s, one.name) for one in own_signals(problem)}
-    numbers = {path: declared.get(PREFIX + path, number.of(ca.MX)) for path, number in live.items()}
-    settings = (numbers[path] for path in ocp.settings)
-    follow = (graph(getattr(s, name)) for name in (_SCALE, _STEEPEST, _SIZE))
-    return [expression(ca.vertcat(*settings, *follow))]
+    rows = [declared.get(PREFIX + path, expressed(live[path], s.parameters)) for path in ocp.settings]
+    halves = [0.5 * (high - low) for low, high in zip(*problem.limits.input_ends(problem.plant), strict=True)]
+    limited = np.isfinite(ocp.input_upper - ocp.input_lower)
+    sizes = [
+        half if one and is_open(half) else own for half, one, own in zip(halves, limited, ocp.input_sizes, strict=True)
+    ]
+    return [expression(ca.vertcat(*rows, expressed(smallest(sizes), s.parameters)))]
 
 
 def _minus(ends: Sequence[float], shift: Expression) -> Expression:

@@ -22,7 +22,7 @@ from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.open import nominal
 from fpirhc.task.problem import Problem, nominal_start
 from fpirhc.tracking.base import Tracking
 

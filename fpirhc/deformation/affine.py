@@ -14,7 +14,6 @@ from fpirhc.describe import as_written
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import NotZero, finite_number
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.live import nominal
 
 
 @dataclass(frozen=True)
@@ -43,7 +42,7 @@ class Affine(Deformation):
     def __post_init__(self) -> None:
         if self.weights is None:
             return
-        rows = nominal(self._rows)
+        rows = self._rows
         square = all(len(row) == len(rows) and all(map(finite_number, row)) for row in rows)
         if not square or not rows or np.linalg.matrix_rank(np.array(rows)) < len(rows):
             raise InvalidValue(
@@ -58,7 +57,7 @@ class Affine(Deformation):
     def iteration(self) -> Iteration:
         if self.weights is None:
             return Iteration()
-        return Iteration(channels=len(self.weights), weights=nominal(self._rows))
+        return Iteration(channels=len(self.weights), weights=self._rows)
 
     @property
     def _rows(self) -> tuple[tuple[float, ...], ...]:

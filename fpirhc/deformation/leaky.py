@@ -11,7 +11,7 @@ import math
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
-from fpirhc.symbolic.live import between, smaller, sqrt
+from fpirhc.symbolic.open import between, smaller, sqrt
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped

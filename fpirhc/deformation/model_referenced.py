@@ -16,7 +16,7 @@ from fpirhc.deformation.leaky import check_cycles, check_uncertainty, check_whol
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import stays
+from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import Cycles, Queue, every, several
 
 

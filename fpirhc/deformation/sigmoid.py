@@ -20,7 +20,7 @@ from fpirhc.deformation.base import Deformation, RequestChange, smooth_norm
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import NotZero, Positive, Range
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.live import atanh, signed, sqrt, tanh
+from fpirhc.symbolic.open import atanh, signed, sqrt, tanh
 
 # Beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits.
 _SHIFTS = Range("a number from -5 to 5, such as 0.3", low=-5.0, high=5.0)

@@ -15,11 +15,11 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.errors import InvalidName
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.symbolic.program import generate
 from fpirhc.task.problem import Problem
 
@@ -81,12 +81,6 @@ class Device:
     @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
         """Intervals of the live settings, by path."""
-        outdated = [name for name, effect in self.stepper.outdated().items() if not effect]
-        if outdated:
-            raise NotSupported(
-                f"these live settings cannot leave Python: '{outdated[0].removeprefix(PREFIX)}' follows from them and must not "
-                "stay as it was; export without live settings, or with gains, limits and rates alone"
-            )
         return dict(self.stepper.bounds())
 
     @cached_property

@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidField
-from fpirhc.symbolic.live import SymbolicNumber
+from fpirhc.symbolic.open import is_open
 
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
@@ -243,7 +243,7 @@ class Number(Expected):
 
     def fits(self, value: object) -> bool:
         if type(value) not in _OFTEN:  # the tests of abstract classes are slow
-            if isinstance(value, SymbolicNumber):
+            if is_open(value):
                 return True
             if isinstance(value, np.ndarray):
                 return False

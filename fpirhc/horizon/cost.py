@@ -14,14 +14,14 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
+from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
-from fpirhc.symbolic.live import live_numbers
+from fpirhc.symbolic.open import require_closed
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,11 +217,7 @@ class Quadratic(Cost):
         if isinstance(self.terminal, Mapping):
             return _squares(self.terminal, view.output, view.reference)
         error = view.state.vector[: plant.state.size] - view.reference.vector
-        if live := live_numbers(self):
-            raise NotSupported(
-                f"LQRTerminal computes its weight from {', '.join(live)}; leave it closed, or weigh the end by name: "
-                "terminal={...}"
-            )
+        require_closed("the terminal weight of LQRTerminal", self)
         weight = ca.SX(ca.DM(np.asarray(self.terminal.weight(self, plant, linearise()))))
         return ca.bilin(weight, error, error)
 

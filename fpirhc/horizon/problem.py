@@ -8,17 +8,15 @@ theta_i are the data of stage i: its time, the reference, the feedforward and th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import cast
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.stage_data import SCALE, SIZE, STEEPEST, Withheld
 from fpirhc.symbolic.layout import Layout, Signal
-from fpirhc.symbolic.live import LiveNumber, Number
+from fpirhc.symbolic.open import PREFIX, Number
 
 GAP = 1e-9  # half width of the bounds of what the end must meet, in sizes of the state
 _LEAST = 1e-3  # of what inputs move a state by: a smaller spread of the reference is no measure of it
@@ -57,7 +55,6 @@ class OptimalControl:
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
         settings: paths of the live settings, whose numbers are among the data.
-        live_bounds: paths of the live limits of inputs, which are arguments of a call.
         inner: of a plant with outputs, for every state its place in the reference, or -1 and a value of its own; else empty.
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
@@ -87,7 +84,6 @@ class OptimalControl:
     node_times: np.ndarray
     shares: np.ndarray
     settings: tuple[str, ...] = ()
-    live_bounds: tuple[str, ...] = ()
     inner: tuple[tuple[int, float], ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
@@ -104,7 +100,7 @@ class OptimalControl:
         """The problem whose D is that of later inputs at rest, for plans with states of their own: a model that runs away enlarges
         what their inputs are rounded by, and D with answers would call them not solved.
         """
-        return self if self.settings else replace(self, curvature=curvature_at_rest(self.along, self.step))
+        return replace(self, curvature=curvature_at_rest(self.along, self.step))
 
     @cached_property
     def steepest(self) -> float:
@@ -112,69 +108,22 @@ class OptimalControl:
         return steepest_curvature(self.along, self.scale)
 
     @property
+    def input_sizes(self) -> np.ndarray:
+        """Half the range of every input, shape (nu,); one without limits counts with its size along the reference."""
+        return sizes_of_inputs(self.input_lower, self.input_upper, self.nodes[1])
+
+    @property
     def input_size(self) -> float:
-        """Half the smallest range of an input; one without limits counts with its size along the reference."""
-        half = 0.5 * (self.input_upper - self.input_lower)
-        usable = np.isfinite(half) & (half > 0)
-        sizes = half if usable.all() else np.where(usable, half, sizes_along(self.nodes[1]))
-        return float(sizes.min())
+        """The smallest of these."""
+        return float(self.input_sizes.min())
 
-    def scale_in(self, data: ca.MX | None) -> ca.MX:
-        """D as an optimiser's expressions use it: numbers, or entries of the stages' data where settings are live.
-
-        Raises:
-            NotSupported: live settings, and the optimiser has no data at this place.
-        """
-        if not self.settings:
-            return cast(ca.MX, ca.DM(self.scale))
-        if data is None:
-            Withheld(self.settings).refuse()
-        return data[self.data.slice(SCALE), 0]
-
-    def place_of(self, number: LiveNumber) -> int:
+    def place_of(self, number: ca.SX) -> int:
         """Return the place of a live setting in the data of every stage."""
-        return self.data.slice("settings").start + self.settings.index(number.paths[0])
+        return self.data.slice("settings").start + self.settings.index(number.name().removeprefix(PREFIX))
 
     def number_in(self, number: Number, data: ca.MX) -> ca.MX | float:
         """Return a number of an optimiser as its expressions use it: itself, or an entry of the stages' data where it is live."""
-        return data[self.place_of(number), 0] if isinstance(number, LiveNumber) else float(number)
-
-    @property
-    def setting_numbers(self) -> dict[str, float]:
-        """Numbers of the live settings by path, as they stand in the data along the reference."""
-        if not self.settings:
-            return {}
-        return dict(zip(self.settings, map(float, self.nodes[2][self.data.slice("settings"), 0]), strict=True))
-
-    def opened(self) -> OptimalControl:
-        """Return the problem from which code is built: what follows from live settings or live limits has no number there."""
-        paths = tuple(dict.fromkeys((*self.settings, *self.live_bounds)))
-        if not paths:
-            return self
-        nothing = cast(np.ndarray, Withheld(paths))
-        changed = replace(self, input_lower=nothing, input_upper=nothing) if self.live_bounds else self
-        if not self.settings:
-            return changed
-        nodes = cast(tuple[np.ndarray, np.ndarray, np.ndarray], nothing)
-        return replace(changed, curvature=nothing, nodes=nodes, along=cast(_ReferenceExpansion, nothing))
-
-    def at(self, values: Mapping[str, float]) -> OptimalControl:
-        """Return the same problem for other numbers of its settings, by path: the expansion along the reference follows them.
-
-        The bounds of inputs stay as they are: a call of an optimiser has its own.
-        """
-        if not self.settings:
-            return self
-        states, inputs, table = self.nodes
-        numbers = np.array([values[path] for path in self.settings])
-        table = table.copy()
-        table[self.data.slice("settings")] = numbers[:, None]
-        nodes = states, inputs, table
-        along = expand_along(self.dynamics, self.stage_cost, self.terminal_cost, nodes, self.functions)
-        changed = replace(self, nodes=nodes, along=along, curvature=input_curvature(along, self.step))
-        table[self.data.slice(SCALE)], table[self.data.slice(STEEPEST)] = changed.scale[:, None], changed.steepest
-        table[self.data.slice(SIZE)] = changed.input_size
-        return changed
+        return data[self.place_of(number), 0] if isinstance(number, ca.SX) else float(number)
 
     @property
     def equations(self) -> np.ndarray:
@@ -306,6 +255,13 @@ def expand_along(
     final = np.asarray(functions["final"](states[:, stages], data[:, stages]).full())
     a, b, q, s, r = (np.array([stage[k] for stage in derivatives]) for k in range(5))
     return _ReferenceExpansion(a, b, q, s, r, final)
+
+
+def sizes_of_inputs(lower: np.ndarray, upper: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Return half the range of every input (nu,), from its bounds; without any its size along the reference (nu, N)."""
+    half = 0.5 * (upper - lower)
+    usable = np.isfinite(half) & (half > 0)
+    return np.asarray(half if usable.all() else np.where(usable, half, sizes_along(along)))
 
 
 def sizes_along(states: np.ndarray, moved: np.ndarray | float = 1.0) -> np.ndarray:

@@ -1,14 +1,11 @@
 """The data of the stages of one horizon: time, reference, feedforward, parameters, and what else its stages read.
 
-Where cost or limits have live numbers, the data of every stage end with the settings, the scale of the inputs D = 1 / (step c),
-the largest eigenvalue of D V'' and the size of the smallest input. Python computes the last three from the settings; the optimiser
-reads them from the data.
+Where cost or limits have open numbers, the data of every stage end with the settings and the size of the smallest input.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NoReturn
+from collections.abc import Iterable, Sequence
 
 import casadi as ca
 import numpy as np
@@ -20,10 +17,10 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import DERIVED, PREFIX, not_live
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.reference import Reference
 
-SCALE, STEEPEST, SIZE = "input_scale", "steepest", "input_size"
+SIZE = "input_size"
 
 
 def data_layout(plant: Plant, horizon: Horizon) -> Layout:
@@ -168,39 +165,13 @@ def settings_in(expressions: Iterable[Expression], known: Expression) -> list[ca
     return [s for s in symbols if s.name().startswith(PREFIX)]
 
 
-def live_signals(paths: tuple[str, ...], inputs: Signal) -> Layout:
+def live_signals(paths: tuple[str, ...]) -> Layout:
     """Return the signals at the end of a stage's data; none without settings."""
     if not paths:
         return Layout()
-    return Layout((Signal("settings", paths), Signal(SCALE, inputs.elements), scalar(STEEPEST), scalar(SIZE)))
+    return Layout((Signal("settings", paths), scalar(SIZE)))
 
 
-def live_table(table: np.ndarray, settings: np.ndarray, inputs: int) -> np.ndarray:
-    """Return the data of all stages with the rows of the settings, and ones for what follows from them."""
-    rows = np.concatenate([settings, np.ones(inputs + 2)])
-    return np.vstack([table, np.repeat(rows[:, None], table.shape[1], axis=1)])
-
-
-class Withheld:
-    """A number that follows from live settings, where code is built: every use is refused, so that no code keeps an old number."""
-
-    __array_ufunc__ = None
-
-    def __init__(self, paths: tuple[str, ...]) -> None:
-        self._paths = paths
-
-    def refuse(self, *_: object) -> NoReturn:
-        """Raise NotSupported with the names of the settings."""
-        own = [path for path in self._paths if not path.startswith(DERIVED)]
-        why = "its code keeps numbers that follow; use FixedPoint() without limits of states, or leave it out of live=[...]"
-        raise not_live(own, why, " with this optimiser")
-
-    __getitem__ = __iter__ = __len__ = __array__ = __float__ = __bool__ = refuse
-    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __neg__ = __pow__ = (
-        refuse
-    )
-
-    def __getattr__(self, name: str) -> NoReturn:
-        if name.startswith("__"):  # copy and pickle ask for what does not exist
-            raise AttributeError(name)
-        self.refuse()
+def live_table(table: np.ndarray, rows: Sequence[float]) -> np.ndarray:
+    """Return the data of all stages with the rows of the settings and of the size."""
+    return np.vstack([table, np.repeat(np.array([rows]).T, table.shape[1], axis=1)])

@@ -28,7 +28,7 @@ from fpirhc.horizon.constraint_states import (
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
-from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along
+from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along, sizes_of_inputs
 from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
@@ -36,7 +36,7 @@ from fpirhc.plant.motion import outside_of, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.live import PREFIX, LiveNumber, live_numbers, nominal
+from fpirhc.symbolic.open import PREFIX, nominal, number_of, open_numbers
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -52,7 +52,7 @@ def transcribe(
     limits: Limits,
     signals: ca.Function | None = None,
     start: np.ndarray | None = None,
-    others: Mapping[str, LiveNumber] = MappingProxyType({}),
+    others: Mapping[str, ca.SX] = MappingProxyType({}),
 ) -> OptimalControl:
     """Return the standard form of one horizon; it is the same one for the same objects, and for plants with other exact parameters.
 
@@ -75,7 +75,7 @@ def _transcribed(
     limits: Limits,
     signals: ca.Function | None,
     start: np.ndarray | None,
-    others: Mapping[str, LiveNumber],
+    others: Mapping[str, ca.SX],
 ) -> OptimalControl:
     nominal(cost).check(plant)
     limits.check(plant)
@@ -86,7 +86,7 @@ def _transcribed(
             name: (limits.states[name][0] + m, limits.states[name][1] - m) for name, m in horizon.margins.items()
         }
         limits = replace(limits, states={**limits.states, **inside_by})
-    same, live = (plant.equations, reference, cost, whole, *others.values()), [n.of(ca.SX) for n in others.values()]
+    same, live = (plant.equations, reference, cost, whole, *others.values()), list(others.values())
 
     def expressed() -> tuple[_Stage, tuple[ca.Function, ...]]:
         stage = _stage_expressions(plant, reference, horizon, cost, limits, live)
@@ -98,10 +98,11 @@ def _transcribed(
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
-    values = {path: number.value for path, number in {**live_numbers(cost, limits), **others}.items()}
+    bounds = nominal(limits).input_bounds(plant)
+    values = {path: number_of(number) for path, number in {**open_numbers(cost, limits), **others}.items()}
     if settings:
-        # What follows from the settings follows from the expansion; until `at` it is ones.
-        nodes = (*nodes[:2], live_table(nodes[2], np.array([values[path] for path in settings]), plant.input.size))
+        size = float(sizes_of_inputs(*bounds, nodes[1]).min())
+        nodes = (*nodes[:2], live_table(nodes[2], [*(values[path] for path in settings), size]))
     _check_finite_limits(dynamics, binding, nodes)
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     functions: dict[object, ca.Function] = {}
@@ -109,12 +110,12 @@ def _transcribed(
     lower, upper = hard_state_bounds(limits, plant, horizon.measured)
     of_entries = _sizes_of_entries(plant, horizon, limits, nodes[0], len(binding))
     state = _stage_state(plant, bool(free), binding)
-    ocp = OptimalControl(
+    return OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant, horizon) + live_signals(settings, plant.input),
+        data=data_layout(plant, horizon) + live_signals(settings),
         dynamics=dynamics,
         stage_cost=stage_cost,
         terminal_cost=terminal_cost,
@@ -123,8 +124,8 @@ def _transcribed(
         start=_start(plant, free, len(binding)),
         state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding] * of_entries]),
         state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding] * of_entries]),
-        input_lower=nominal(limits).input_bounds(plant)[0],
-        input_upper=nominal(limits).input_bounds(plant)[1],
+        input_lower=bounds[0],
+        input_upper=bounds[1],
         curvature=input_curvature(along, horizon.step),
         nodes=nodes,
         along=along,
@@ -132,7 +133,6 @@ def _transcribed(
         met=len(set(horizon.terminal)),
         state_price=state_prices(limits, state, plant, horizon.step),
         settings=settings,
-        live_bounds=tuple(live_numbers(limits.inputs)),
         inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.longest, nodes[0][: plant.state.size, :-1], nodes[1]
@@ -141,14 +141,13 @@ def _transcribed(
         shares=horizon.share / horizon.relative_lengths,
         functions=functions,
     )
-    return ocp.at(values)
 
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
     """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state.
 
-    theta ends with the symbols of live `settings` and of what follows from them (see `live_signals`).
+    theta ends with the symbols of open `settings` and of the size of the smallest input (see `live_signals`).
     """
 
     x: Expression
@@ -212,8 +211,7 @@ def _stage_expressions(
     _check_entries(plant, keeps_input, written)
     settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding), *others], theta)
     if settings:
-        live = live_signals(tuple(s.name() for s in settings), plant.input)
-        theta = ca.vertcat(theta, *settings, ca.SX.sym("live", live.size - len(settings)))
+        theta = ca.vertcat(theta, *settings, ca.SX.sym("size"))
 
     return _Stage(
         x, before, u, applied, theta, x_next, terms, final, soft_end, binding, settings, horizon.step * length

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, cast
 
 import casadi as ca
 import numpy as np
@@ -134,7 +134,7 @@ def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "conv
     """Return the Function `step` or `converging`, built once: horizons that differ in numbers of settings only share it."""
     key = form, plans_are_compiled(), Same(optimiser)
     if key not in ocp.functions:
-        ocp.functions[key] = getattr(optimiser, form)(ocp.opened())
+        ocp.functions[key] = getattr(optimiser, form)(ocp)
     return ocp.functions[key]
 
 
@@ -176,11 +176,9 @@ def _largest(value: ca.MX) -> ca.MX:
     return ca.norm_inf(ca.vec(value))
 
 
-def stationarity(
-    ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX, data: ca.MX | None = None
-) -> ca.MX:
-    """Return the projected residual of a plan (docs/theory.md); live settings need the stages' data."""
-    scale = ca.repmat(ocp.scale_in(data), 1, ocp.stages)
+def stationarity(ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.MX, upper: ca.MX) -> ca.MX:
+    """Return the projected residual of a plan (docs/theory.md)."""
+    scale = cast(ca.MX, ca.repmat(ca.DM(ocp.scale), 1, ocp.stages))
     return _largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
@@ -242,7 +240,7 @@ def judge(ocp: OptimalControl) -> ca.Function:
     if ocp.bounds_states:
         valid = _valid_multipliers(ocp, rollout(ocp)(s0, inputs, data)[0], multipliers)
     value, slope, states, _ = reduced_gradient(ocp)(s0, inputs, data, valid)
-    results = [value, stationarity(ocp, inputs, slope, lower, upper, data), _state_violation(ocp, states)]
+    results = [value, stationarity(ocp, inputs, slope, lower, upper), _state_violation(ocp, states)]
     return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
 
 

@@ -15,9 +15,6 @@ typedef struct {
   casadi_real partials[N * NM], lambda[COSTATES * NS], final[NS * NS];
   casadi_real envelope, reach, tau, gamma, resume;
   casadi_real sent; /* the largest move that a sweep at the best plan wants of an input; beyond every number before one */
-#ifdef SCALE_AT
-  casadi_real metric[NU], first_gamma; /* settings are live: the scale and the first gamma are data of the call */
-#endif
 } Search;
 
 #define GAINS (N * (NU + NS)) /* where they begin in the memory */
@@ -27,12 +24,7 @@ typedef struct {
 
 typedef char search_fits[sizeof(Search) == ROOM * sizeof(casadi_real) ? 1 : -1];
 
-#ifdef SCALE_AT
-#define scale (s->metric)
-#define FIRST_GAMMA (s->first_gamma)
-#else
 static const casadi_real scale[NU] = SCALE;
-#endif
 
 /* The middle of the limits of an input; 0 without one of them. */
 INLINE casadi_real middle(casadi_real low, casadi_real high) {
@@ -288,10 +280,9 @@ INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In 
 }
 
 /* max |U - clip(U - D g)| */
-INLINE casadi_real residual(const Search* s, const Plan* plan, In lower, In upper) {
+INLINE casadi_real residual(const Plan* plan, In lower, In upper) {
   int k;
   casadi_real worst = 0;
-  (void)s; /* needed where settings are live */
   for (k = 0; k < N * NU; ++k) {
     casadi_real moved = between(plan->u[k] - scale[k % NU] * plan->g[k], lower[k % NU], upper[k % NU]);
     casadi_real move = fabs(plan->u[k] - moved);
@@ -341,10 +332,6 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   int i, tried, plain = 0, swept = 0, empty = 0, good, posed = sane(s0, data, lower, upper);
   Out gains = res[2] + GAINS;
   casadi_real left;
-#ifdef SCALE_AT
-  for (i = 0; i < NU; ++i) s->metric[i] = data[SCALE_AT + i];
-  s->first_gamma = SHARE / data[STEEPEST_AT];
-#endif
   begin(s, best, gains, memory, posed, lower, upper);
   for (tried = 0;; ++tried) {
     int bold = s->tau >= SHORTEST, sure = s->sent <= TOLERANCE, ok = try_next(s, best, plan, gains, s0, data, lower, upper);
@@ -360,13 +347,13 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
          plan before has to say so too. */
       plain += !bold;
       if (plain >= PLAIN) break;
-      if ((sure || !CONVERGING) && best->value < UNTRIED && s->sent <= TOLERANCE && residual(s, best, lower, upper) <= TOLERANCE) break;
+      if ((sure || !CONVERGING) && best->value < UNTRIED && s->sent <= TOLERANCE && residual(best, lower, upper) <= TOLERANCE) break;
     }
     if (accepted && direct(s, best, gains, data, lower, upper)) return 1;
     swept |= accepted;
   }
   good = posed && best->value < UNTRIED;
-  left = residual(s, best, lower, upper);
+  left = residual(best, lower, upper);
   for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
   if (res[0]) for (i = 0; i < N * NU; ++i) res[0][i] = best->u[i];
   if (res[1]) {

@@ -24,7 +24,6 @@ from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited
 from fpirhc.optimisers.plain import CLOSE, PlainSettings, plain_memory, plain_step, shifted_plain
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.live import settled
 
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
@@ -123,9 +122,7 @@ class FixedPoint(Optimiser):
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
         if ocp.bounds_states:
             return None
-        # Here the settings are numbers: a rescue runs outside the loop, for the numbers of one call.
-        own = settled(self, ocp.setting_numbers)
-        limited = limited_step(replace(ocp, settings=()), own._limited(ocp, _MOST_LIMITED))
+        limited = limited_step(ocp, self._limited(ocp, _MOST_LIMITED))
         return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ class GradientFixedPoint(Optimiser):
         lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
         inputs = ca.reshape(column, nu, n)
         slope = reduced_gradient(ocp)(s0, inputs, data, ca.MX.zeros(ocp.state.size, n))[1]
-        response = ca.vec(ca.repmat(ocp.scale_in(data), 1, n) * slope)
+        response = ca.vec(ca.repmat(ca.DM(ocp.scale), 1, n) * slope)
         request, error, none = (expression(v) for v in (column, response, ca.MX.zeros(nu * n)))
         next_column, _ = self._map(ocp).step(request, error, none, {})
         clipped = ca.vec(clip(ca.reshape(graph(next_column), nu, n), lower, upper))

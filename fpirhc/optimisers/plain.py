@@ -12,7 +12,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
-from fpirhc.horizon.stage_data import SCALE, SIZE, STEEPEST
+from fpirhc.horizon.stage_data import SIZE
 from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import (
     LAST,
@@ -31,8 +31,8 @@ from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
-from fpirhc.symbolic.live import LiveNumber, Number
 from fpirhc.symbolic.native import Native
+from fpirhc.symbolic.open import Number
 
 MOST = 100  # iterations of one converging call
 CAP = 50  # the same of one in a loop
@@ -151,7 +151,7 @@ def _room(ocp: OptimalControl, costates: int) -> int:
     nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
     plan = 2 * n * nu + (n + 1) * ns + 1
     course = n * (nu + nu * nu + partial_count(ocp)) + costates * ns + ns * ns
-    return 2 * plan + course + 6 + (nu + 1 if ocp.settings else 0)
+    return 2 * plan + course + 6
 
 
 def _sizes(ocp: OptimalControl) -> dict[str, object]:
@@ -166,16 +166,14 @@ def _sizes(ocp: OptimalControl) -> dict[str, object]:
 
 
 def _metric(ocp: OptimalControl) -> dict[str, object]:
-    """Definitions of the scale and of the first gamma: numbers, or places in the data where settings are live."""
-    if ocp.settings:
-        return {"SCALE_AT": ocp.data.slice(SCALE).start, "STEEPEST_AT": ocp.data.slice(STEEPEST).start}
+    """Definitions of the scale and of the first gamma."""
     scale = ", ".join(repr(float(v)) for v in ocp.scale)
     return {"SCALE": f"{{{scale}}}", "FIRST_GAMMA": repr(first_gamma(ocp))}
 
 
 def _number(ocp: OptimalControl, number: Number) -> str:
     """A number of the code, or its place in the data of the first stage where it is live."""
-    return f"data[{ocp.place_of(number)}]" if isinstance(number, LiveNumber) else repr(float(number))
+    return f"data[{ocp.place_of(number)}]" if isinstance(number, ca.SX) else repr(float(number))
 
 
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
@@ -234,7 +232,7 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
     remembered = plain_memory(ocp).split(ca.if_else(is_finite(memory), memory, 0))
     inputs = clip(ca.reshape(remembered["plan_inputs"], nu, n), arguments.lower, arguments.upper)
     none = ca.MX.zeros(nu, n)
-    first = first_gamma(ocp, arguments.data)
+    first = first_gamma(ocp)
     resume = ca.if_else(remembered["plan_step"] > 0, ca.fmin(remembered["plan_step"], 1), 1)
     # After a rejected T a longer gamma would be rejected again, in every call of one iteration.
     longer = ca.if_else(resume < line_search.SHORTEST, 1, 2) * remembered["plan_gamma"]
@@ -270,7 +268,7 @@ def _converged(
     tried, plan = search.tried(symbols, arguments)
     looked = search.looked(tried, plan, arguments)
     tolerance = settings.tolerance_in(ocp, arguments.data)
-    residual = stationarity(ocp, looked.inputs, looked.slope, arguments.lower, arguments.upper, arguments.data)
+    residual = stationarity(ocp, looked.inputs, looked.slope, arguments.lower, arguments.upper)
     solved = ca.logic_and(
         looked.value < line_search.UNTRIED, ca.logic_and(residual <= tolerance, looked.sent <= tolerance)
     )
@@ -315,7 +313,7 @@ def _results(
     """Plan, diagnostics and memory at the end of a call."""
     posed, evaluated = sane(*arguments), anchor.value < line_search.UNTRIED
     finite = ca.logic_and(posed, evaluated)
-    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper, arguments.data)
+    residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0
     tolerance = settings.tolerance_in(ocp, arguments.data)
     status = status_of(finite, ca.fmax(residual, anchor.sent), 0, tolerance)

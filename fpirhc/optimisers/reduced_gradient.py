@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import casadi as ca
 
@@ -74,7 +75,7 @@ class ReducedGradient(Optimiser):
         inputs, slope = (ca.reshape(_part(ocp, state, k), nu, n) for k in (0, 5))
         values, length = _part(ocp, state, 1), _part(ocp, state, 2)
         best, lowest = ca.reshape(_part(ocp, state, 3), nu, n), _part(ocp, state, 4)
-        scale = ca.repmat(ocp.scale_in(data), 1, n)
+        scale = cast(ca.MX, ca.repmat(ca.DM(ocp.scale), 1, n))
         next_inputs = clip(inputs - length * scale * slope, lower, upper)
         move = next_inputs - inputs
         value, new_slope, _, _ = reduced_gradient(ocp)(s0, next_inputs, data, ca.MX.zeros(ocp.state.size, n))

@@ -5,7 +5,7 @@ The search is built from Functions of a whole horizon, so that an iteration adds
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import casadi as ca
 
@@ -13,10 +13,10 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import backward_sweep, box_policy, in_reverse
-from fpirhc.horizon.stage_data import STEEPEST, settings_in
+from fpirhc.horizon.stage_data import settings_in
 from fpirhc.optimisers.base import clip, sane
 from fpirhc.symbolic.expression import FINITE, TINY, is_finite
-from fpirhc.symbolic.live import PREFIX, Number
+from fpirhc.symbolic.open import PREFIX, Number, is_open
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is required
 ARMIJO = 1e-2  # share of the first-order decrease that is required of a short step
@@ -68,13 +68,8 @@ class _Expanded(NamedTuple):
     accepted: ca.MX
 
 
-def first_gamma(ocp: OptimalControl, data: ca.MX | None = None) -> float | ca.MX:
-    """Return a gamma that is short enough near the reference: SHARE / L in the metric of D.
-
-    Where settings are live, L stands in the data of the stages.
-    """
-    if ocp.settings and data is not None:
-        return SHARE / data[ocp.data.slice(STEEPEST), 0]
+def first_gamma(ocp: OptimalControl) -> float:
+    """Return a gamma that is short enough near the reference: SHARE / L in the metric of D."""
     return SHARE / ocp.steepest
 
 
@@ -94,8 +89,7 @@ class Search:
         inputs, states, costs, a, b, by_state, by_input = tried
         value, slope, costates = self._expand(states, inputs, costs, arguments.data, a, b, by_state, by_input)
         value = ca.if_else(sane(*arguments), value, ca.inf)  # where nothing is posed no plan is accepted
-        live = [self._ocp.scale_in(arguments.data)] if self._ocp.settings else []
-        judged = self._judge(inputs, states, value, slope, arguments.lower, arguments.upper, *anchor, *live)
+        judged = self._judge(inputs, states, value, slope, arguments.lower, arguments.upper, *anchor)
         *fields, accepted = judged
         return Anchor(*fields), _Expanded(inputs, states, a, b, by_state, by_input, costates, accepted)
 
@@ -177,7 +171,7 @@ def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, dam
     hessians = hessian_stage(ocp, hessian).map(n)(states[:, :n], inputs, data[:, :n], costates)
     _, slope, value = hessian_end(ocp)(states[:, n], data[:, n])
     bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
-    damped = [ocp.number_in(damping, data) / ocp.scale_in(data)] if ocp.settings else []
+    damped = [ocp.number_in(damping, data) / ca.DM(ocp.scale)] if is_open(damping) else []
     move, gains, curved, fall = backward_sweep(ocp, damping)(
         *stacked, *hessians, inputs, *bounds, value, slope, *damped
     )
@@ -227,15 +221,14 @@ def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:
 
 
 def _judgement(ocp: OptimalControl) -> ca.Function:
-    """Function (U, X, V, g of the plan tried, lower, upper, anchor, [scale]) -> (anchor, accepted)."""
+    """Function (U, X, V, g of the plan tried, lower, upper, anchor) -> (anchor, accepted)."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
     value, slope = ca.MX.sym("V"), ca.MX.sym("g", nu, n)
     lower, upper = ca.MX.sym("lower", nu), ca.MX.sym("upper", nu)
     shapes = [(nu, n), (ns, n), (nu, n), (nu, ns * n), (nu, n), (nu, n), *[(1, 1)] * 6, (nu, nu * n)]
     old = Anchor(*(ca.MX.sym(name, *shape) for name, shape in zip(Anchor._fields, shapes, strict=True)))
-    live = [ca.MX.sym("scale", nu)] if ocp.settings else []
-    scale = ca.repmat(live[0] if live else ocp.scale_in(None), 1, n)
+    scale = cast(ca.MX, ca.repmat(ca.DM(ocp.scale), 1, n))
     # Flags: whether the anchor was never evaluated, and whether the plan is a step along the sweep's direction.
     metric, flags = _Metric(scale, lower, upper), (old.value >= UNTRIED, old.step >= SHORTEST)
     plain = metric.plain_step(inputs, slope, old.gamma)
@@ -247,7 +240,7 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     here = {"inputs": inputs, "states": states[:, :n], "plain": plain, "slope": slope, "value": value}
     advance = old._replace(**here, envelope=envelope, step=step, sent=ca.MX(10 * UNTRIED))
     next_anchor = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
-    arguments = [inputs, states, value, slope, lower, upper, *old, *live]
+    arguments = [inputs, states, value, slope, lower, upper, *old]
     return ca.Function("fpirhc_judgement", arguments, [*next_anchor, accepted])
 
 

@@ -22,9 +22,8 @@ from fpirhc.fields.checked import Checked, missing
 from fpirhc.fields.kinds import Few
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.parameter import Parameter, with_exact_values
-from fpirhc.symbolic.expression import FINITE, expression, graph
+from fpirhc.symbolic.expression import FINITE, expression, graph, nan_where
 from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
-from fpirhc.symbolic.live import nan_where
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObser
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.live import expressed, stays
+from fpirhc.symbolic.open import expressed, stays
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.disturbance import Disturbance
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.errors import InvalidField, InvalidValue, NotSupported
+from fpirhc.errors import InvalidField, InvalidValue
 from fpirhc.fields.kinds import described, finite_number, named_entries
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.problem import Problem
 
 Changes = Mapping[float, Numbers]  # by time, s
@@ -32,10 +32,8 @@ class InForce:
     later: Sequence[tuple[int, Problem]] = ()  # (first cycle, problem) of every change, for the tables of the run
 
 
-def in_force(
-    live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes, deployed: bool = False
-) -> InForce:
-    """Return the settings of a run, checked before it starts; `deployed` as in `patch`."""
+def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
+    """Return the settings of a run, checked before it starts."""
     named_entries("settings", settings)
     _check_times(changes)
     if not (live.paths or settings or changes):
@@ -54,7 +52,7 @@ def in_force(
         changed, _, values = first.changed(settings_now)
         cycle = int(np.ceil(time / problem.period - 1e-9))
         later.append((cycle, changed))
-        patches.append((cycle, *patch(live, loop, values, deployed)))
+        patches.append((cycle, *patch(live, loop, values)))
         record.append((cycle * problem.period, values))
     return InForce(ready, controller, numbers, patches, record, later)
 
@@ -70,23 +68,9 @@ def _check_times(changes: Changes) -> None:
         named_entries(f"changes at {time:g}", numbers)
 
 
-def patch(
-    live: LiveSettings, loop: Composite, numbers: Mapping[str, float], deployed: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return places in a loop's memory, and the values that these settings and what follows from them have there.
-
-    Args:
-        deployed: whether what is computed from them stays that of the build, as on a device without Python; automatic
-            settings do not.
-
-    Raises:
-        NotSupported: something that follows from them must not stay.
-    """
+def patch(live: LiveSettings, loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return places in a loop's memory, and the values that these settings have there."""
     values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
-    if deployed:
-        _require_data(loop, live.start, numbers)
-    else:
-        values |= loop.derived(numbers).signals
     known = {name: value for name, value in values.items() if name in loop.memory}
     places = [np.arange(loop.memory.slice(n).start, loop.memory.slice(n).stop) for n in known]
     moved = {live.place_moved(loop, path): numbers[path] for path in live.moved}
@@ -95,13 +79,3 @@ def patch(
         np.concatenate([none.astype(int), *places, np.array(list(moved), dtype=int)]),
         np.concatenate([none, *known.values(), np.array(list(moved.values()))]),
     )
-
-
-def _require_data(loop: Composite, build: Mapping[str, float], numbers: Mapping[str, float]) -> None:
-    """Raise where a number that must not be outdated has another value than in the build."""
-    before, after = (loop.derived(values) for values in (build, numbers))
-    for name, effect in after.stale.items():
-        if not effect and not np.array_equal(before.signals[name], after.signals[name]):
-            raise NotSupported(
-                f"'{name.removeprefix(PREFIX)}' follows from it and must not be outdated: only Python computes it"
-            )

@@ -17,9 +17,8 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import FINITE, Signals
+from fpirhc.symbolic.expression import FINITE, Signals, nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import nan_where
 from fpirhc.task.problem import Problem
 
 # In the memory: the last time that was believed, or is expected; the last one that was given; and times in a row that are a period

@@ -33,7 +33,7 @@ from fpirhc.simulation.replay import known_samples
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.live import PREFIX, nominal
+from fpirhc.symbolic.open import PREFIX, nominal
 from fpirhc.task.problem import Problem
 
 
@@ -84,11 +84,9 @@ def start_memory(
     remembered += [delay.now for delay in _plant_delays(problem, controller)]
     starts = {s.name: s.start_vector() for s in remembered}
     if numbers:
-        derived = loop.derived(numbers)
         live = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
         starts |= {name: value for name, value in live.items() if name in loop.memory}
-        starts |= {**derived.signals, **derived.memory()}
-    elif INNER in loop.memory and plans_exactly(loop, problem, controller):
+    if INNER in loop.memory and plans_exactly(loop, problem, controller):
         starts[INNER] = compose_with_sensing(problem, controller).memory.start()
     return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
 

@@ -127,7 +127,6 @@ class Simulator:
         progress: Progress | None = None,
         settings: Numbers | None = None,
         changes: Changes | None = None,
-        deployed: bool = False,
         setpoints: Setpoints | None = None,
     ) -> Run:
         """Run the loop once and return its signals.
@@ -141,20 +140,17 @@ class Simulator:
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build. None: all have them.
             changes: numbers of live settings from a time on, by time in s.
-            deployed: whether a change is that of a device without Python: what is computed from the settings stays that of the
-                build, but for automatic settings.
             setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
         Raises:
             InvalidName: a setting that is not live; a coordinate without set-point.
             InvalidValue: a number that a setting does not accept; a change outside the run; a set-point that cannot be reached.
             NotContractive: a gain with which the deformation cannot converge.
-            NotSupported: a change of a device where something that follows from the setting must not stay.
         """
         problem = variant or self.problem
         own = self.built_for(problem) if self.outdated_by(problem) else self
         given = {} if settings is None else settings, {} if changes is None else changes
-        force = in_force(own.live, own.loop, problem, *given, deployed)
+        force = in_force(own.live, own.loop, problem, *given)
         problem, controller = force.problem, force.controller
         start = start_memory(own.loop, problem, controller, force.numbers)
         rows, talk = _padded(problem, force.patches), moving(problem).exchange(seed)

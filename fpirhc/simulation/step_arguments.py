@@ -27,7 +27,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.checks import check_values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -135,7 +135,7 @@ class StepArguments:
 
     Attributes:
         evaluator: of the Function.
-        settings: arguments of the live settings and derived numbers, by the name of their signal.
+        settings: arguments of the live settings, by the name of their signal.
         setpoints: argument of the set-points; no entries without any.
         time, memory, state, realised, output, taken, command: views; `state` is that of the raw measurements where they are read.
         memory_before, memory_next, trace, command_next: arrays of the memory that is read, and of what is written.
@@ -239,9 +239,8 @@ class NumbersNow:
         self._write(self._numbers)
 
     def start(self) -> np.ndarray:
-        """Return the memory of the controller before its first cycle, with the settings in force."""
-        remembered = self._composite.derived(self._numbers).memory() if self._numbers else {}
-        return self._composite.memory.pack(remembered)
+        """Return the memory of the controller before its first cycle."""
+        return self._composite.memory.start()
 
     def change(self, settings: Numbers) -> bool:
         """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
@@ -283,7 +282,7 @@ class NumbersNow:
 
     @property
     def settings(self) -> Layout:
-        """The live settings among `reads`, 'setting.PATH', and what follows from them, 'setting.derived.NAME'."""
+        """The live settings among `reads`, 'setting.PATH'."""
         return self._composite.settings
 
     def bounds(self) -> dict[str, Interval]:
@@ -310,20 +309,11 @@ class NumbersNow:
         }
         return ByName(values, "Stepper.setpoints")
 
-    def outdated(self) -> dict[str, str]:
-        """Return what follows from live settings by way of Python, and the effect of a deployed build with the outdated value.
-
-        Gains, scales, limits, weights and dead times themselves are data, and may be written at any time. An empty text
-        says that the number must not stay as it was: change the settings that it follows from only where Python computes it.
-        """
-        return ByName(self._composite.derived(self._numbers).stale if self._numbers else {}, "Stepper.outdated()")
-
     def _write(self, numbers: Mapping[str, float]) -> None:
         """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
         if not numbers:
             return
         values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
-        values |= self._composite.derived(numbers).signals
         for name, argument in self._arguments.settings.items():
             argument[:] = values[name]
 

@@ -247,8 +247,8 @@ class Stepper(NumbersNow, Checked):
             output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out. Where
                 they are estimated, use `step_measured`.
             taken: time stamp of the sample, in the plant's unit of time; None: it was taken at `time`. Read with `max_age` only.
-            settings: numbers of live settings from this step on, by path. Checks and derived numbers are computed in Python before
-                the step, a tenth of a millisecond for gains and some tens for the weights of a horizon; see `change`.
+            settings: numbers of live settings from this step on, by path. They are checked in Python before the
+                step, which takes a tenth of a millisecond; see `change`.
             setpoints: set-points from this step on, by coordinate or output: a number, or where they are announced one number per
                 node of the horizon; see `set_reference`.
 

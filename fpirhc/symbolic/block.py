@@ -17,8 +17,7 @@ import casadi as ca
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, kind
 from fpirhc.symbolic.layout import Kind, Layout, Signal, scalar
-from fpirhc.symbolic.live import PREFIX as SETTING
-from fpirhc.symbolic.live import Derived, Values
+from fpirhc.symbolic.open import PREFIX as SETTING
 
 Step = Callable[[Signals], Mapping[str, Value]]
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
@@ -37,7 +36,6 @@ class Block:
         memory: signals that the block remembers.
         opaque: whether the step holds operations that scalar expressions cannot (solver calls, table look-up, short circuits);
             the block is then built with MX.
-        derived: function of the numbers of all settings, by path, that returns what follows from them; None: nothing does.
         inside: the composed step that the block runs, where it is nothing but the guard of one.
     """
 
@@ -47,7 +45,6 @@ class Block:
     step: Step
     memory: Layout = field(default_factory=Layout)
     opaque: bool = False
-    derived: Callable[[Values], Derived] | None = None
     inside: Composite | None = None
 
     @property
@@ -157,20 +154,8 @@ class Composite:
 
     @property
     def settings(self) -> Layout:
-        """The signals of settings and derived numbers among the reads."""
+        """The signals of settings among the reads."""
         return _settings(self.reads.signals)
-
-    @property
-    def derived_if_any(self) -> Callable[[Values], Derived] | None:
-        """The function `derived`, where some block has one."""
-        return self.derived if any(b.derived is not None for b in self.blocks) else None
-
-    def derived(self, values: Values) -> Derived:
-        """Return what follows from the numbers of all settings, by path."""
-        parts = [b.derived(values) for b in self.blocks if b.derived is not None]
-        signals = {name: value for part in parts for name, value in part.signals.items()}
-        stale = {name: words for part in parts for name, words in part.stale.items()}
-        return Derived(signals, lambda: {name: value for part in parts for name, value in part.memory().items()}, stale)
 
     @cached_property
     def opaque(self) -> bool:
@@ -234,7 +219,7 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
 
 
 def open_settings(blocks: Sequence[Block]) -> Layout:
-    """Return the signals of all settings and derived numbers that some blocks read."""
+    """Return the signals of all settings that some blocks read."""
     return _settings([s for b in blocks for s in b._built[1].signals])
 
 
@@ -264,7 +249,7 @@ def every(block: Block, cycles: int) -> Block:
         return values
 
     name = f"{block.name}_every_{cycles}"
-    return Block(name, block.inputs, block.writes, step, own, opaque=True, derived=block.derived)
+    return Block(name, block.inputs, block.writes, step, own, opaque=True)
 
 
 def _settings(signals: Iterable[Signal]) -> Layout:

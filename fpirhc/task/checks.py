@@ -25,7 +25,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Named
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.open import nominal
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality

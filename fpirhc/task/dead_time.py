@@ -17,9 +17,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite, NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, total
+from fpirhc.symbolic.expression import Signals, entry_at, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import entry_at
 
 MEASUREMENT = "measurement"  # the name beside those of the inputs
 

@@ -21,7 +21,7 @@ from fpirhc.plant.motion import derivative_unit
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression, Value
 from fpirhc.symbolic.layout import Named
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.open import nominal
 
 Interval = tuple[float, float]
 

@@ -27,7 +27,7 @@ from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import behind_equals, line, number, table
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.live import nominal
+from fpirhc.symbolic.open import nominal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place

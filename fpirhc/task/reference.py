@@ -25,7 +25,7 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Signal, scalar
-from fpirhc.symbolic.live import PREFIX, live_numbers, nominal
+from fpirhc.symbolic.open import PREFIX, number_of, open_numbers
 
 Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
 
@@ -142,7 +142,7 @@ class Trajectory(Reference):
                 for name, value in named.items()
             }
 
-        scale = nominal(self.scale)
+        scale = self.scale
         if scale == 1:
             return of(t)
         still = ca.SX.sym("t")
@@ -150,17 +150,18 @@ class Trajectory(Reference):
         return {name: first[name] + scale * (value - first[name]) for name, value in of(t).items()}
 
     def _function(self, plant: Plant) -> ca.Function:
-        if nominal(self.scale) == 1:
+        if self.scale == 1:
             return super()._function(plant)
         t = ca.SX.sym("t")
-        results = self._scaled(plant)(t, nominal(self.scale))
+        results = self._scaled(plant)(t, self.scale)
         return ca.Function("fpirhc_reference", [t], list(results), ["t"], ["state", "response"])
 
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
         """The scale where it is live."""
         del plant, stages
         return tuple(
-            scalar(PREFIX + path, start=number.value) for path, number in live_numbers({"scale": self.scale}).items()
+            scalar(PREFIX + path, start=number_of(number))
+            for path, number in open_numbers({"scale": self.scale}).items()
         )
 
     def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NoReturn, cast
+from typing import NoReturn
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import LiveNumber, exp, live_numbers, nominal, power
+from fpirhc.symbolic.open import exp, open_numbers, power
 from fpirhc.task.reference import Reference, Steps, pairs
 
 _GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
@@ -64,9 +64,9 @@ class FilterBank:
         return Signal(_GIVEN, (*names, *later), units * self.nodes)
 
     @property
-    def _open(self) -> list[LiveNumber]:
+    def _open(self) -> list[ca.SX]:
         """The rate where it is live: it passes through Functions as an entry of the own signal."""
-        return list(live_numbers(self.rate).values())
+        return list(open_numbers(self.rate).values())
 
     @property
     def own(self) -> Signal:
@@ -76,7 +76,7 @@ class FilterBank:
 
     def gathered(self, s: Signals) -> Expression:
         """Return the own signal inside a step."""
-        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN), *(cast(Expression, rate) for rate in self._open))
+        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN), *self._open)
 
     def advanced(self, s: Signals, period: float) -> Expression:
         """Return the filters' state one cycle later inside a step, with the set-points held."""
@@ -343,7 +343,7 @@ class Setpoint(Reference):
 
     def _jump(self, plant: Plant, order: int) -> float:
         """Jump of the response at a set-point that changes by one."""
-        rate = nominal(self.rate)
+        rate = self.rate
         return float(ca.evalf(chain_of(plant, rate, ca.SX.zeros(order), ca.SX(1.0), order))[-1])
 
     def _bank(self, plant: Plant, stages: int) -> FilterBank:
@@ -365,7 +365,7 @@ class Setpoint(Reference):
 
     def _along_values(self, plant: Plant, name: str, order: int, t: Expression) -> Expression:
         """(y, y', ..., y^(m)) of one coordinate along `values`: a sum of step responses."""
-        rate, rest = nominal(self.rate), self._rest(name)
+        rate, rest = self.rate, self._rest(name)
         z, held = [expression(ca.SX(rest)), *[expression(ca.SX(0))] * (order - 1)], expression(ca.SX(rest))
         for time, change in self._changes(name):
             phi = transition(rate, ca.fmax(t - time, 0), order)

@@ -17,7 +17,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import numbers, remembered
 
 
 @dataclass(frozen=True)
@@ -181,24 +180,6 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:
     """Delay that carries the updated integral to the next cycle."""
     return (Delay(integral_signal(plant, "_integral_before"), "integral"),)
-
-
-def gains_before(plant: Plant, gains: Sequence[float]) -> Layout:
-    """What a law remembers of its integral gains, one per controlled coordinate: the last ones where some are live."""
-    return remembered("integral_gain", plant.controlled_names, gains)
-
-
-def bumpless(s: Signals, gains: Sequence[float]) -> tuple[Expression, dict[str, Expression]]:
-    """Return the integral of the error, and the gains to remember.
-
-    The contribution of the integral stays where a live gain changes, I+ = I g_before / g, so that the command does not jump by the
-    integral's share. Without a change the factor is exactly 1.
-    """
-    if "integral_gain" not in vars(s):
-        return s._integral_before, {}
-    now = numbers(gains)
-    factor = ca.if_else(now == 0, 1, s.integral_gain / ca.if_else(now == 0, 1, now))
-    return factor * s._integral_before, {"integral_gain_next": now}
 
 
 def error_signal(plant: Plant) -> Signal:

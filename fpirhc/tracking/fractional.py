@@ -20,7 +20,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import following, live_numbers, nominal, power, settled
+from fpirhc.symbolic.open import power, require_closed
 from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
@@ -95,15 +95,14 @@ class Fractional(IntegralLaw):
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         check_modes(self, plant, [self.rate])
-        cycles, size = nominal(self).cycles(period), len(plant.controlled_names)
+        cycles, size = self.cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
         reads, writes = law_signals(plant)
-        row = following("past_weights", live_numbers(self), lambda values: settled(self, values)._row(cycles, period))
-        own = ca.DM(nominal(self)._row(cycles, period))
+        require_closed("the weights of its memory", self)
+        column = ca.DM(self._row(cycles, period))
 
         def step(s: Signals) -> dict[str, Expression]:
-            column = own if row is None else getattr(s, row.signal.name)
             weights, stiffness = column[:cycles], column[cycles]
             error = s._target - getattr(s, plant.output.name)
             errors = error_chains(plant, error)
@@ -126,10 +125,7 @@ class Fractional(IntegralLaw):
                 "decay_first_next": first,
             }
 
-        derived = None
-        if row is not None:
-            reads, derived = reads + row.reads, row.derived
-        return Block("tracking", reads, writes, step, memory, opaque=True, derived=derived)
+        return Block("tracking", reads, writes, step, memory, opaque=True)
 
     def _row(self, cycles: int, period: float) -> np.ndarray:
         """The weights of the past, and (Lambda T)^beta."""

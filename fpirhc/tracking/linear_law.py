@@ -22,17 +22,8 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.live import power
-from fpirhc.tracking.base import (
-    Feedback,
-    IntegralLaw,
-    Useful,
-    bumpless,
-    error_chains,
-    gains_before,
-    law_signals,
-    own_errors,
-)
+from fpirhc.symbolic.open import power
+from fpirhc.tracking.base import Feedback, IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 _REAL = 1e-9  # share of an imaginary part that is rounding
 
@@ -73,23 +64,20 @@ class LinearLaw(IntegralLaw):
         self.check_cycle(plant, period)
         reads, writes = law_signals(plant)
         gains = self.gains_of(plant)
-        first_gains = [own[0] for own in gains] if self.integral else []
 
         def step(s: Signals) -> dict[str, Expression]:
             error = s._target - getattr(s, plant.output.name)
             errors, own = error_chains(plant, error), own_errors(plant, error)
             first_integral = ca.vertcat(*map(self._first_integral, gains, own, errors))
-            integral_before, remembered = bumpless(s, first_gains)
-            integral = ca.if_else(s.warm_up > 0.5, integral_before, first_integral)
+            integral = ca.if_else(s.warm_up > 0.5, s._integral_before, first_integral)
             feedback = [self._feedback(gains[k], integral[k], chain) for k, chain in enumerate(errors)]
             return {
                 "_target_error": ca.vertcat(*own),
                 "desired": s.nominal + ca.vertcat(*feedback),
                 "_integral_used": integral,
-                **remembered,
             }
 
-        return Block("tracking", reads, writes, step, gains_before(plant, first_gains))
+        return Block("tracking", reads, writes, step)
 
     def _useful(self, plant: Plant) -> list[Useful]:
         if not (self.integral and self.largest):

@@ -76,7 +76,7 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
 
 
 def test_a_slider_that_needs_python_is_left_out_and_says_why(tmp_path):
-    """The step of a reference model follows from its rate and must not be old; a zero has no scale; bounds are kept."""
+    """Python computes the step of a reference model from its rate; a zero has no scale; bounds are kept."""
     page, data = exported(tmp_path / "motor", "noisy_motor", "RHC")
     sliders = {s["path"]: s for s in data["sliders"]}
     assert len(sliders) > 5
@@ -89,7 +89,7 @@ def test_a_slider_that_needs_python_is_left_out_and_says_why(tmp_path):
     assert "'wasm-unsafe-eval'; worker-src blob:;" in policy
     assert text.count("</script>") == 4
     _, law = exported(tmp_path / "law", "mrac_pendulum", "Lyapunov MRAC")
-    assert "follows from it and must not be outdated" in law["without"]["rate"]
+    assert "the step of the reference model is computed from it" in law["without"]["rate"]
 
 
 PROBLEM = """from dataclasses import replace

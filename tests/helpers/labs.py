@@ -24,7 +24,7 @@ def exported(folder: Path, of: str, controller: str, live: tuple[str, ...] = ())
 
 
 def run(of: str, controller: str, moved: dict[str, float], live: list[str]) -> fp.Run:
-    """The run of a deployed controller with other numbers: parameters of the plant and of the model, and live settings."""
+    """The run of a controller with other numbers: parameters of the plant and of the model, and live settings."""
     task = fp.load_problem(of)
     ready = fp.simulator(task.problem, task.controllers[controller], compiled=False, live=live)
     parameters = dict(task.problem.plant.parameters)
@@ -34,7 +34,7 @@ def run(of: str, controller: str, moved: dict[str, float], live: list[str]) -> f
             parameters[name] = replace(parameters[name], **{side: value})
     variant = replace(task.problem, plant=replace(task.problem.plant, parameters=parameters))
     changes = {path: value for path, value in moved.items() if path in live}
-    return ready.run(seed=0, variant=variant, changes={0.0: changes} if changes else {}, deployed=True)
+    return ready.run(seed=0, variant=variant, changes={0.0: changes} if changes else {})
 
 
 def same_curves(data: Any, columns: list[list[float]], of: fp.Run) -> None:

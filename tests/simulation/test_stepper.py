@@ -130,7 +130,6 @@ def test_settings_and_set_points_of_a_call():
     assert one.why_refused
     assert one.change({"deformation.gain": -0.6})
     assert one.step(*again, memory)[0] == before
-    assert one.outdated() is not None
 
 
 def test_time_stamps_are_read_where_their_age_counts():

@@ -16,7 +16,7 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import exp, nominal
+from fpirhc.symbolic.open import left_after
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -37,7 +37,7 @@ class AccelerationFeedback(Undeformed):
 
     def pole(self, period: float) -> float:
         """Return the pole p of the low-pass for control cycles of that period, s."""
-        return exp(-period / self.time_constant) if nominal(self.time_constant) > 0 else 0.0
+        return left_after(period, self.time_constant)
 
     def largest_gain(self, period: float) -> float:
         """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""

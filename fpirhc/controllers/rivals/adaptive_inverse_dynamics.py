@@ -22,7 +22,7 @@ from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import following, live_numbers, settled
+from fpirhc.symbolic.open import require_closed
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
@@ -90,10 +90,8 @@ class AdaptiveInverseDynamics(Controller):
     def _learn_block(self, problem: Problem) -> Block:
         plant, learning = problem.plant, self._learning
         equation = equation_function(learning.regressor(problem))
-        rows = following(
-            "lyapunov_row", live_numbers(self.tracking), lambda values: settled(self, values).lyapunov_row()
-        )
-        fixed = self.lyapunov_row() if rows is None else np.zeros(0)
+        require_closed("the row of the Lyapunov equation", self.tracking)
+        weights = self.lyapunov_row()
 
         target, reads = self._target(problem)
         paired = _late(problem)
@@ -104,14 +102,11 @@ class AdaptiveInverseDynamics(Controller):
             chains = error_chains(plant, target(s) - state)
             if self.tracking.integral:
                 chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
-            weights = fixed if rows is None else ca.vertsplit(getattr(s, rows.signal.name))
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
         reads = (*reads, integral_signal(plant, "_integral_used"))
-        if rows is None:
-            return learning.block(problem, reads, gradient)
-        return replace(learning.block(problem, (*reads, *rows.reads.signals), gradient), derived=rows.derived)
+        return learning.block(problem, reads, gradient)
 
     def _target(self, problem: Problem) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
         """The reference when the response was realised, and what it reads; no sample is older than the start."""

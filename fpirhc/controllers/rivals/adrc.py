@@ -22,7 +22,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import exp, power
+from fpirhc.symbolic.open import exp, power
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, own_errors
 

@@ -21,7 +21,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, vector
-from fpirhc.symbolic.live import numbers
+from fpirhc.symbolic.open import numbers
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

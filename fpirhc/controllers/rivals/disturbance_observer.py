@@ -16,7 +16,7 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import exp
+from fpirhc.symbolic.open import exp
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 

@@ -16,7 +16,7 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, discrete, scalar
-from fpirhc.symbolic.live import cos, exp, sqrt
+from fpirhc.symbolic.open import cos, exp, sqrt
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 

@@ -17,7 +17,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, discrete
-from fpirhc.symbolic.live import exp, left_in_mean
+from fpirhc.symbolic.open import exp, left_in_mean
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, error_chains
 

@@ -22,7 +22,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
-from fpirhc.symbolic.live import numbers, power
+from fpirhc.symbolic.open import numbers, power
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

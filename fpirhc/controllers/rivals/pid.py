@@ -19,14 +19,12 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.live import nominal, numbers, quotient
+from fpirhc.symbolic.open import numbers, quotient
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import (
     Useful,
-    bumpless,
     error_chains,
     error_signal,
-    gains_before,
     integral_delay,
     integral_signal,
     integral_update,
@@ -104,7 +102,7 @@ class PID(Undeformed):
 
     def _useful(self, problem: Problem) -> list[Useful]:
         """What the integrals may ask for: commands inside the limits of their inputs, by those of the build."""
-        sizes = np.fmax(*map(np.abs, nominal(problem).limits.input_bounds(problem.plant)))
+        sizes = np.fmax(*map(np.abs, problem.limits.input_bounds(problem.plant)))
         names = problem.plant.controlled_names
         return [
             Useful(self.integral.get(n, 0.0), self.proportional[n], float(size) if size > 0 else math.inf)
@@ -129,7 +127,6 @@ class PID(Undeformed):
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
         plant, seen = problem.plant, problem.plant.output
         gains = [self.gains(name, order) for name, order in plant.response_orders.items()]
-        integral_gains = [k[0] for k in gains]
 
         def step(s: Signals) -> dict[str, Expression]:
             away = s.reference - getattr(s, seen.name)
@@ -141,15 +138,13 @@ class PID(Undeformed):
             ]
             # The integral with which the first command is zero.
             starts = [quotient(-d, k[0]) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
-            integral_before, remembered = bumpless(s, integral_gains)
-            integral = ca.if_else(s.warm_up > 0.5, integral_before, ca.vertcat(*starts))
+            integral = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
             command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
             return {
                 "_target_error": ca.vertcat(*own),
                 "_integral_used": integral,
                 "command_unclipped": command,
                 "_deformed_unclipped": plant.equations.controlled_response(s.state, command, s.parameters),
-                **remembered,
             }
 
         before, in_use = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
@@ -160,7 +155,7 @@ class PID(Undeformed):
             like(plant.input, "command_unclipped"),
             plant.response_signal("_deformed_unclipped"),
         )
-        return Block("pid", Layout(reads), Layout(writes), step, gains_before(plant, integral_gains))
+        return Block("pid", Layout(reads), Layout(writes), step)
 
 
 _CUT_OFF = "_command_cut_off"

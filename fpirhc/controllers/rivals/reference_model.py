@@ -6,7 +6,6 @@ Theory: docs/theory.md.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -17,7 +16,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import Values, following, live_numbers, numbers, power, settled
+from fpirhc.symbolic.open import numbers, power, require_closed
 from fpirhc.tracking.base import error_chains
 
 
@@ -42,13 +41,8 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     gains = [decay_gains(rate, len(chain)) for chain in chains]
     ends_of_steps = np.cumsum([0, *(len(g) ** 2 for g in gains)]).tolist()
 
-    def steps_at(values: Values) -> np.ndarray:
-        orders = [len(chain) for chain in chains]
-        own = (decay_gains(settled(rate, values), order) for order in orders)
-        return np.concatenate([step_of(plant, companion(g), period).ravel(order="F") for g in own])
-
-    live = following("model_steps", live_numbers(rate), steps_at)
-    fixed = steps_at({}) if live is None else np.zeros(0)
+    require_closed("the step of the reference model", rate)
+    fixed = np.concatenate([step_of(plant, companion(g), period).ravel(order="F") for g in gains])
     memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
     ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
 
@@ -60,9 +54,7 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
         lag = ca.vertcat(*(spread.get(e, 0) for e in plant.output.elements))
         pull = [ca.dot(numbers(g), d) for g, d in zip(gains, deviation, strict=True)]
-        entries = ca.vertsplit(
-            expression(ca.DM(fixed)) if live is None else getattr(s, live.signal.name), ends_of_steps
-        )
+        entries = ca.vertsplit(expression(ca.DM(fixed)), ends_of_steps)
         steps = [ca.reshape(m, len(g), len(g)) for m, g in zip(entries, gains, strict=True)]
         deviation_next = [ca.mtimes(m, d) for m, d in zip(steps, deviation, strict=True)]
         return {
@@ -78,5 +70,4 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         scalar("warm_up"),
     )
     writes = (like(plant.output, "model"), plant.response_signal("nominal"))
-    block = Block("reference_model", Layout(reads), Layout(writes), step, memory)
-    return block if live is None else replace(block, reads=block.reads + Layout((live.signal,)), derived=live.derived)
+    return Block("reference_model", Layout(reads), Layout(writes), step, memory)

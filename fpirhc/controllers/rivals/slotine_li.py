@@ -19,7 +19,7 @@ from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.live import numbers
+from fpirhc.symbolic.open import numbers
 from fpirhc.task.problem import Problem
 
 

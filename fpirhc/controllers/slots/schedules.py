@@ -16,7 +16,7 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.live import expressed, rounded
+from fpirhc.symbolic.open import expressed, rounded
 from fpirhc.task.problem import Problem
 
 

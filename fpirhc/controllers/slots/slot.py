@@ -26,7 +26,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -176,15 +176,7 @@ def for_channel(
 
     writes = Layout(tuple(renamed(w) for w in block.writes.signals))
     layout = Layout((*reads, *reads_begun))
-    return Block(
-        f"{block.name}_{one.number}",
-        layout,
-        writes,
-        step,
-        Layout(tuple(own)),
-        opaque=block.opaque,
-        derived=block.derived,
-    )
+    return Block(f"{block.name}_{one.number}", layout, writes, step, Layout(tuple(own)), opaque=block.opaque)
 
 
 def delays_for_channel(delays: tuple[Delay, ...], one: Channel) -> list[Delay]:

@@ -48,11 +48,10 @@ from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.sensing.base import spline_weights
 from fpirhc.sensing.positions import PositionDifference
 from fpirhc.status import Status
-from fpirhc.symbolic import live
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.live import exp, signed, stays
+from fpirhc.symbolic.open import expressed, left_after, signed, stays
 from fpirhc.task.problem import Problem
 
 
@@ -350,7 +349,7 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
         gain = chain.gain(s.state, others, s.parameters)
         measured = dict(zip(seen.elements, ca.vertsplit(getattr(s, seen.name)), strict=True))
         modelled = ca.vertsplit(chain.states(s.state, s.parameters))
-        good = ca.fabs(gain) >= live.expressed(smallest, gain)
+        good = ca.fabs(gain) >= expressed(smallest, gain)
         values = {
             "state": ca.vertcat(*(measured.get(e, own) for e, own in zip(elements, modelled, strict=True))),
             "target": nominal[: chain.order] if chain.order > 1 else nominal[0],
@@ -398,7 +397,7 @@ def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, b
 
     `measured`: signal of y^(r) of every slot.
     """
-    decay = exp(-problem.period / blend) if live.nominal(blend) > 0 else 0.0
+    decay = left_after(problem.period, blend)
     place = problem.plant.input.elements.index(one.chain.input)
     request_before, models = _request_before(one), [n.removeprefix("_") for n in one.slot.deformation.mirror.models]
     names = ("law", "free", "gain", "active", "warm_up", *models)

@@ -130,7 +130,7 @@ def _estimate_block(
     count = len(plant.parameters)
     estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
     memory = estimator.memory(modelled)
-    correct, followed = estimator.step(modelled), estimator.following(modelled)
+    correct = estimator.step(modelled)
     own = memory + Layout((like(estimate, "estimate_change"), discrete("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
@@ -138,9 +138,8 @@ def _estimate_block(
         before = {m: getattr(s, m) for m in memory.names}
         state, command, waiting = pairs.pair(s, s._acted)
         output, others = pairs.output(s)
-        numbers = None if followed is None else getattr(s, followed.signal.name)
         begun = s.estimate_begun > pairs.cycles - 0.5
-        evidence = Seen(state, command, s.realised, parameters, begun, numbers, output)
+        evidence = Seen(state, command, s.realised, parameters, begun, output)
         parameter_change, next_memory = correct(evidence, before)
         # A change that is not finite is not learned: one bad measurement must not spoil the model for ever.
         finite = is_finite(ca.vertcat(parameter_change, *next_memory.values()))
@@ -161,8 +160,7 @@ def _estimate_block(
     outputs = (pairs.seen,) * pairs.with_outputs
     reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
     writes = Layout((believed, estimate))
-    block = Block("estimate", reads, writes, step, own, opaque=True)
-    return block if followed is None else replace(block, reads=reads + followed.reads, derived=followed.derived)
+    return Block("estimate", reads, writes, step, own, opaque=True)
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

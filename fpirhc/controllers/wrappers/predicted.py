@@ -29,7 +29,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import expressed
+from fpirhc.symbolic.open import expressed
 from fpirhc.task.dead_time import MOST, DeadTime, Queue
 from fpirhc.task.problem import Problem
 

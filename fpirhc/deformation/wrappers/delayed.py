@@ -18,7 +18,7 @@ from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pol
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.live import stays
+from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import MOST, Cycles, Queue, every, several
 
 __all__ = ["MOST", "Increment", "Paired"]

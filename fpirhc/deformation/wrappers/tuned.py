@@ -16,7 +16,7 @@ from fpirhc.deformation.base import Deformation, Wrapper, growing_in_a_row, memo
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.live import asin, larger, power, sqrt
+from fpirhc.symbolic.open import asin, larger, power, sqrt
 
 _RATE = 0.02  # gamma
 _GROWING, _RETURNING = 5, 8  # in a row

@@ -152,7 +152,7 @@ function remember() {
     if (!numbers.length && !own.length) return [`print(fp.simulate(${built}, seed=0))`];
     const live = own.length ? `, live=${JSON.stringify(own.map(([p]) => p))}` : "";
     const variant = numbers.length ? `, variant=fp.with_settings(task.problem, ${listed(numbers)})` : "";
-    const given = own.length ? `, changes={0.0: ${listed(own)}}, deployed=True` : "";
+    const given = own.length ? `, changes={0.0: ${listed(own)}}` : "";
     return [`loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}))`];
   });
   const lines = ["import fpirhc as fp", "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, ...texts.flat()];

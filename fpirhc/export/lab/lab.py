@@ -1,8 +1,8 @@
 """A page with sliders: the closed loops of a problem as WebAssembly, run anew in the browser while a slider moves.
 
 Sliders write numbers into the loop's first memory, where parameters and live settings are. One whose number changes anything else
-there, which Python would have to compute, is left out, and the page says why. Automatic settings, scales of plans and the first
-plan stay those of the build, as in a deployed controller.
+there, which Python would have to compute, is left out, and the page says why. Scales of plans and the first plan are those
+of the build.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.studies.comparison.compare import select
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.symbolic.paths import changed_at, paths_to
 from fpirhc.task.problem import Problem
 from fpirhc.whole_file import write_whole

@@ -21,7 +21,7 @@ from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.driver import SIGNATURE
-from fpirhc.symbolic.live import PREFIX, LiveNumber
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.problem import Problem
 
 _POINTS = 2000  # of a curve
@@ -51,7 +51,7 @@ class LabLoop:
     def written(self, numbers: dict[str, float]) -> np.ndarray:
         """Return the first memory into which a device writes these settings."""
         memory, live = self.start.copy(), self.ready.live
-        places, values = patch(live, self.ready.loop, live.changed(numbers)[2], deployed=True)
+        places, values = patch(live, self.ready.loop, live.changed(numbers)[2])
         memory[places] = values
         return memory
 
@@ -187,11 +187,11 @@ class LabLoop:
         step = ca.SX.eye(arguments[1].numel()) - self._read(gain, memory) * weighted
         return ca.Function("fpirhc_factor", [*arguments, memory], [ca.densify(step)])
 
-    def _read(self, number: float | LiveNumber, memory: ca.SX) -> ca.SX:
+    def _read(self, number: float | ca.SX, memory: ca.SX) -> ca.SX:
         """A number with the live settings that the memory holds; the others are those of the build."""
-        if not isinstance(number, LiveNumber):
+        if not isinstance(number, ca.SX):
             return ca.SX(number)
-        layout, start, made = self.ready.loop.memory, self.ready.live.start, number.of(ca.SX)
+        layout, start, made = self.ready.loop.memory, self.ready.live.start, number
         open_ones = ca.symvar(made)
         held = [
             memory[layout.slice(s.name()).start]

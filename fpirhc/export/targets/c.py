@@ -23,7 +23,7 @@ from fpirhc.simulation.machine import SKIPPED
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 
 _FEW = 12  # entries of a signal that are named in C; longer ones are arrays
 _WIDTH = 120
@@ -336,7 +336,6 @@ def layout_of(device: Device) -> dict[str, object]:
         "work": device.sizes,
         **{part: _columns(layout) for part, layout in layouts.items()},
         "bounds": {path: [e if np.isfinite(e) else None for e in ends] for path, ends in device.bounds.items()},
-        "outdated": dict(stepper.outdated()),
     }
 
 

@@ -23,7 +23,7 @@ from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.live import PREFIX
+from fpirhc.symbolic.open import PREFIX
 
 
 @dataclass(frozen=True)

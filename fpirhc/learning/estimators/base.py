@@ -21,7 +21,6 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Deviation, Range
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Layout
-from fpirhc.symbolic.live import Following, nominal
 from fpirhc.task.problem import Problem
 
 
@@ -37,7 +36,6 @@ class Seen:
     parameters: Expression  # those of the model without the estimator's change
     # 0 before the first pair of this run (in the first cycle, and until the first sample of the run arrives), then 1
     valid: Expression
-    followed: Expression | None = None  # what the estimator computes from its live settings; None without any
     # the measured outputs y, y', ... at that instant; None without outputs, or where the estimator does not read them.
     output: Expression | None = None
 
@@ -76,10 +74,6 @@ class ParameterEstimator(Checked, ABC):
     @abstractmethod
     def memory(self, problem: Problem) -> Layout:
         """Signals that are remembered from cycle to cycle."""
-
-    def following(self, problem: Problem) -> Following | None:  # noqa: ARG002
-        """Return the numbers that it computes from its live settings; None: none."""
-        return None
 
     @abstractmethod
     def step(self, problem: Problem) -> Correct:
@@ -205,6 +199,6 @@ def forgetting_factor(time: float, period: float) -> float:
     Raises:
         InvalidValue: a time below the period: a pair would be forgotten before the next one comes.
     """
-    if nominal(time) < period:
-        raise InvalidValue(f"the time of forgetting is {nominal(time):g}, shorter than the control cycle of {period:g}")
+    if time < period:
+        raise InvalidValue(f"the time of forgetting is {time:g}, shorter than the control cycle of {period:g}")
     return math.exp(-period / time)

@@ -23,10 +23,9 @@ from fpirhc.sensing.base import quantities, require_named, response_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.live import Following, following, live_numbers, nominal, settled
+from fpirhc.symbolic.open import require_closed
 from fpirhc.task.problem import Problem
 
-_STALE = "the filter stays stable, and keeps the bandwidth of the old deviations"
 _GAINS: Latest[np.ndarray] = Latest(8)
 _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as undamped
 
@@ -180,14 +179,11 @@ class DisturbanceKalman(ParameterEstimator):
             )
         )
 
-    def following(self, problem: Problem) -> Following | None:
-        fixed = nominal(problem)
-        return following("gain", live_numbers(self), lambda v: settled(self, v).gain(fixed).ravel(order="F"), _STALE)
-
     def step(self, problem: Problem) -> Correct:
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
-        fixed = ca.DM(self.gain(problem)) if self.following(problem) is None else None
+        require_closed("the gain of the filter", self)
+        gain = expression(ca.DM(self.gain(problem)))
         shown, follows = self._shown_function(model), self._has_state(model)
         foresees = self._foresees(model)
         places = [model.parameter.elements.index(n) for n in self.learned()]
@@ -207,7 +203,6 @@ class DisturbanceKalman(ParameterEstimator):
                     advance(observed, seen.command, disturbed_by(before, seen), no_forcing) if follows else predicted
                 )
             innovation = self._measured(model, seen) - shown(predicted, seen.command, disturbed_by(moved, seen))
-            gain = _gain(fixed, seen, len(self.measured))
             on_state, on_disturbance = gain[: model.state.size, :], gain[model.state.size :, :]
             running = seen.valid > 0.5
             state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
@@ -317,14 +312,6 @@ class DisturbanceKalman(ParameterEstimator):
         rest = a[np.ix_(~used, ~used)]
         harmless = used[judged].all() and np.abs(np.linalg.eigvals(rest)).max(initial=0.0) < 1 + _SLOWEST
         return used if harmless else everything
-
-
-def _gain(fixed: ca.DM | None, seen: Seen, measured: int) -> Expression:
-    """The gain of the build, or that of the live settings in force."""
-    if fixed is not None:
-        return expression(fixed)
-    assert seen.followed is not None
-    return ca.reshape(seen.followed, seen.followed.numel() // measured, measured)
 
 
 def _rank(a: np.ndarray, c: np.ndarray) -> int:

@@ -11,7 +11,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Positive
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.live import numbers
+from fpirhc.symbolic.open import numbers
 
 
 @dataclass(frozen=True, eq=False)

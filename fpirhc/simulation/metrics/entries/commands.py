@@ -8,7 +8,6 @@ from fpirhc.plant.motion import derivative_unit
 from fpirhc.simulation.metrics.base import Metric, by_name, input_unit, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
-from fpirhc.symbolic.live import nominal
 from fpirhc.task.problem import Problem
 
 _AT = 1e-9  # of the range between the limits: nearer is at the limit
@@ -35,7 +34,7 @@ def at_limit(problem: Problem, run: Run) -> float:
     near = _AT * np.where(np.isfinite(span), span, np.fmax(1.0, np.fmin(np.abs(lower), np.abs(upper))))
     near, commands = np.where(np.isfinite(near), near, 0.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
-    slowest, fastest = problem.period * np.array(nominal(problem.limits).rate_bounds(problem.plant))
+    slowest, fastest = problem.period * np.array(problem.limits.rate_bounds(problem.plant))
     slack = 1e-6 * np.fmin(fastest, -slowest)
     moves, slack = np.diff(commands, axis=0, prepend=commands[:1]), np.where(np.isfinite(slack), slack, 0.0)
     stands |= (moves <= slowest + slack) | (moves >= fastest - slack)
@@ -55,7 +54,7 @@ def _mean(values: np.ndarray) -> np.ndarray:
 def _limits(problem: Problem, run: Run) -> np.ndarray:
     """The limits of the inputs that were in force, shape (2, cycles, inputs)."""
     inputs = problem.plant.input.elements
-    limits = np.array(nominal(problem.limits).input_bounds(problem.plant))
+    limits = np.array(problem.limits.input_bounds(problem.plant))
     limits = np.repeat(limits[:, None, :], run.cycles, axis=1)
     live = {f"limits.inputs.{name}.{end}": (end, k) for k, name in enumerate(inputs) for end in (0, 1)}
     for time, numbers in run.in_force:
