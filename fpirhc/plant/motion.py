@@ -8,6 +8,7 @@ with the state x = (q, q', ...), derivative-major, and a forcing w that adds to 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -332,6 +333,8 @@ def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
     """Return the unit of a time derivative, with the unit of time: 'm' -> 'm/s' -> 'm/s^2'."""
     if derivative == 0:
         return unit
+    if found := re.fullmatch(rf"(.+)/{re.escape(time)}(?:\^(\d+))?", unit):
+        unit, derivative = found[1], derivative + int(found[2] or 1)
     return f"{unit}/{time}" if derivative == 1 else f"{unit}/{time}^{derivative}"
 
 

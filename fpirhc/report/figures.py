@@ -77,31 +77,33 @@ def colours_of(comparison: Comparison) -> dict[str, str]:
     return dict(zip(names, (*PALETTE, *extra), strict=False))
 
 
-def contraction_figure(comparison: Comparison) -> Drawing | None:
-    """Return a panel for every gain by its own name and scale, and one with the response errors; None where nothing contracts."""
+def contraction_figures(comparison: Comparison) -> list[Drawing]:
+    """Return a picture for every gain by its own name and scale, and one of the response errors; none where nothing contracts."""
     from fpirhc.simulation.picture import Drawing
 
     entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
-    if not entries:
-        return None
     colours, groups = colours_of(comparison), dict[tuple[str, float], list[Any]]()
     for entry in entries:
         if entry.contraction is not None:
             groups.setdefault(_own_gain(entry.contraction.report), []).append((entry.name, entry.contraction))
-    figure = Drawing(figsize=(16.5, 4.0))  # places that are fixed: to fit them takes two thirds of a picture's time
-    figure.subplots_adjust(left=0.06, right=0.99, bottom=0.15, top=0.91, wspace=0.25)
-    [*panels, last] = figure.subplots(1, len(groups) + 1, squeeze=False)[0]
-    for axis, ((name, scale), same) in zip(panels, groups.items(), strict=True):
+    figures = [Drawing(figsize=(5.5, 3.8)) for _ in range(len(groups) + 1) if entries]
+    for figure in figures:  # places that are fixed: to fit them takes two thirds of a picture's time
+        figure.subplots_adjust(left=0.13, right=0.98, bottom=0.14, top=0.92)
+    axes = [figure.subplots() for figure in figures]
+    for axis, ((name, scale), same) in zip(axes, groups.items(), strict=False):
         _draw_factor(axis, name, scale, same, colours)
     for entry in entries:
         apart = (entry.run["realised"][1:] - entry.run["desired"][:-1])[:_CYCLES]
         size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
         shown = np.where((size > 0) & np.isfinite(size), size, np.nan)
-        last.semilogy(np.arange(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1)
-    caption_axes(last, "control cycle", "|realised - desired|, response units")
-    last.set_title("The response error in the first cycles", fontsize=10, y=1.0)
-    draw_legend(last)
-    return figure
+        axes[-1].semilogy(
+            np.arange(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1
+        )
+    for axis in axes[-1:]:
+        caption_axes(axis, "control cycle", "|realised - desired|, response units")
+        axis.set_title("The response error in the first cycles", fontsize=10, y=1.0)
+        draw_legend(axis)
+    return figures
 
 
 def _own_gain(report: ContractionReport) -> tuple[str, float]:
@@ -135,6 +137,6 @@ def _draw_factor(
     axis.set_ylim(0, 1.6)
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
-    caption_axes(axis, literal(gain), "contraction factor max|1 - a lambda|")
-    axis.set_title("Predicted factor; o predicted, x measured", fontsize=10, y=1.0)
+    caption_axes(axis, literal(gain), "max|1 - a lambda|")
+    axis.set_title("Contraction factor per cycle: o predicted, x measured", fontsize=10, y=1.0)
     draw_legend(axis)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import FpirhcError
-from fpirhc.report.figures import colours_of, contraction_figure
+from fpirhc.report.figures import colours_of, contraction_figures
 from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
@@ -62,8 +62,6 @@ def render(comparison: Comparison) -> str:
     series = {**chart_data(comparison), "bands": BANDS, "begin": begin, "motions": motions}
     data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")  # no text ends the script
     scripts = asset("uPlot.iife.min.js"), asset("axes.js"), *([planar.script()] if motions else [])
-    factors = contraction_figure(comparison)
-    caption = "Predicted contraction factor against the gain, and the response error's decay"
     slots: dict[tuple[str, ...], list[str]] = {}  # names of controllers by their time slots
     for e in comparison.entries:
         if e.run.spans():
@@ -77,7 +75,9 @@ def render(comparison: Comparison) -> str:
         bands=BANDS,
         own=own,
         motions=motions,
-        contraction=[Image(factors.address, caption)] if factors else [],
+        contraction=[
+            Image(one.address, "contraction factor or response error") for one in contraction_figures(comparison)
+        ],
         contracts=[f"{e.name}: {e.contraction.report.text}" for e in comparison.entries if e.contraction],
         in_force=changed,
     )

@@ -191,7 +191,7 @@ def progress_bars() -> Iterator[Report]:
         TextColumn("{task.completed:.0f} of {task.total:.0f}"),
         TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
-        TextColumn("left"),
+        TextColumn("to go"),
         TimeRemainingColumn(),
     )
     bars, known = Progress(*columns, console=Console(stderr=True), transient=True), dict[str, TaskID]()

@@ -50,6 +50,7 @@ def test_report_is_self_contained_and_small(written):
     assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", whole)
     assert "@import" not in whole
     assert [p.name for p in written.parent.iterdir()] == ["report.html"]
+    assert whole.count("alt='contraction factor or response error'") == 2  # a picture for the gain, and one of the errors
     marks = ("id='verdict'", "<table>", "<h2>Signals over time", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
     places = [whole.index(mark) for mark in marks]
     assert places == sorted(places)
@@ -99,7 +100,7 @@ def test_a_run_that_ends_early_is_told_in_words(comparison, tmp_path):
 def test_the_plot_of_a_run_names_quantities_units_and_controller():
     """A chart has one unit; a concentration is no position; the name is that of the problem file and not of a class."""
     plant = fp.Plant(
-        coordinates={"c": "mol/l", "T": "K"},
+        coordinates={"c": "mol/s", "T": "K"},
         inputs={"F": "l/s", "Q_dot": "kW"},
         order=1,
         response=lambda q, u, p: {"c": p.k * u.F - q.c, "T": p.k * u.Q_dot - q.T},
@@ -110,8 +111,8 @@ def test_the_plot_of_a_run_names_quantities_units_and_controller():
     loaded = tasks.made(one, {"pump, steady": fp.ComputedTorque(fp.Exponential(rate=6.0))})
     run = fp.simulate(loaded.problem, loaded.controllers["pump, steady"], seed=0, compiled=False)
     labels = [axis.get_ylabel() for axis in run.plot().axes]
-    wanted = ["error of c [mol/l]", "error of T [K]", "c [mol/l]", "T [K]", "F [l/s]", "Q_dot [kW]"]
-    assert labels == [*wanted, "responses of c [mol/l/s]"]
+    wanted = ["error of c [mol/s]", "error of T [K]", "c [mol/s]", "T [K]", "F [l/s]", "Q_dot [kW]"]
+    assert labels == [*wanted, "responses of c [mol/s^2]"]
     assert run.controller == run.plot().get_suptitle() == "pump, steady"
     fresh = fp.ComputedTorque(fp.Exponential(rate=6.0))
     assert fp.simulate(one, fresh, seed=0, compiled=False).controller == "ComputedTorque"
