@@ -50,7 +50,7 @@ def test_report_is_self_contained_and_small(written):
     assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", whole)
     assert "@import" not in whole
     assert [p.name for p in written.parent.iterdir()] == ["report.html"]
-    assert whole.count("alt='contraction factor or response error'") == 2  # a picture for the gain, and one of the errors
+    assert whole.count("alt='contraction factor or response error'") == 2
     marks = ("id='verdict'", "<table>", "<h2>Signals over time", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
     places = [whole.index(mark) for mark in marks]
     assert places == sorted(places)

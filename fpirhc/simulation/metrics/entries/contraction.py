@@ -85,7 +85,13 @@ def _adapts(run: Run) -> bool:
 # A difference of 1e-4 has no meaning: the factor is a fit, or a difference of eigenvalues from one.
 METRICS = (
     Metric(
-        "contraction.predicted", predicted, short="contr. factor", headline=True, floor=1e-4, order=85, reads=("contraction",)
+        "contraction.predicted",
+        predicted,
+        short="contr. factor",
+        headline=True,
+        floor=1e-4,
+        order=85,
+        reads=("contraction",),
     ),
     Metric(
         "contraction.growing",
