@@ -1,4 +1,4 @@
-"""Loops are compiled without optimising: a third of the time, the same bits. Tests of C are as users have it."""
+"""Loops are compiled without optimising: a third of the time, the same bits. Tests of C are as users have it; exports at night."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 os.environ.setdefault("FPIRHC_CFLAGS", "-O0")
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in the background of a shell; tests interrupt processes
     signal.signal(signal.SIGINT, signal.default_int_handler)
-AS_SHIPPED = ("tests/export/", "tests/symbolic/", "tests/optimisers/test_loops_in_c")
+AS_SHIPPED = ("tests/symbolic/", "tests/optimisers/test_loops_in_c")
 
 
 @pytest.fixture(autouse=True)

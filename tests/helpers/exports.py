@@ -51,7 +51,7 @@ def built(folder: Path, *flags: str, main: str = "main.c", compiler: str = "") -
     mains = {"main.c", main} - {main}
     sources = [str(path) for path in sorted(folder.glob("*.c")) if path.name not in mains]
     program = folder / "program"
-    command = [compiler or COMPILERS[0], *STRICT, *(flags or ("-O2",)), *sources, "-o", str(program), "-lm"]
+    command = [compiler or COMPILERS[0], *STRICT, *(flags or ("-O0",)), *sources, "-o", str(program), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return program
