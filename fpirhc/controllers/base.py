@@ -25,7 +25,6 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar, vector
-from fpirhc.symbolic.open import nominal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -226,7 +225,7 @@ def _limit_block(problem: Problem) -> Block:
 def _within_rates(problem: Problem, command: Expression, before: Expression) -> Expression:
     """The command as far as hard limits of rates let it go in a cycle."""
     entries = []
-    for k, ends in enumerate(np.transpose(nominal(problem.limits).rate_bounds(problem.plant))):
+    for k, ends in enumerate(np.transpose(problem.limits.rate_bounds(problem.plant))):
         low, high = (before[k] + problem.period * float(end) if math.isfinite(end) else None for end in ends)
         entry = command[k] if low is None else ca.fmax(command[k], low)
         entries.append(entry if high is None else ca.fmin(entry, high))
@@ -248,11 +247,11 @@ def _meaning(plant: Plant) -> ca.Function:
 
 
 def clip(u: Expression, lower: Iterable[float], upper: Iterable[float]) -> Expression:
-    """Return u clipped entry by entry; a side without a finite limit adds no operation."""
+    """Return u clipped entry by entry; a side without a finite limit adds no operation, and an open one is finite."""
     entries = []
     for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        entry = u[k] if math.isinf(nominal(low)) else ca.fmax(u[k], low)
-        entries.append(entry if math.isinf(nominal(high)) else ca.fmin(entry, high))
+        entry = u[k] if math.isinf(low) else ca.fmax(u[k], low)
+        entries.append(entry if math.isinf(high) else ca.fmin(entry, high))
     return ca.vertcat(*entries)
 
 

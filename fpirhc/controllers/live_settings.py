@@ -2,15 +2,14 @@
 
     live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
 
-Automatic settings, such as the scale of a sigmoid, follow from the others. See docs/simulators.md.
+An automatic setting, such as the scale of a sigmoid, stays as it was chosen for the build. See docs/simulators.md.
 """
 
 from __future__ import annotations
 
 import math
-import re
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -25,15 +24,13 @@ from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
-from fpirhc.symbolic.layout import Layout, Signal, scalar
+from fpirhc.symbolic.layout import Layout, scalar
 from fpirhc.symbolic.open import ANEW, PREFIX, copied, not_live, open_number
-from fpirhc.symbolic.paths import changed_at, content_at, entry, mapped, names_in, paths_to
+from fpirhc.symbolic.paths import Copy, changed_at, content_at, entry, mapped, names_in, paths_to, validated
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
-OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances", "reality")
-MOVING = "_exact"  # signal of the parameters of what moves, in the memory of a loop
-_MOVED = re.compile(r"reality\.plant\.parameters\.(.+)\.exact")
+OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
 _ALWAYS_DATA = (
     "Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes exact.NAME, "
     "approximate.NAME and start.NAME"
@@ -54,46 +51,33 @@ class LiveSettings:
     """The live settings of one loop."""
 
     problem: Problem  # the problem with the numbers of the build
-    unresolved: Controller  # the controller with automatic settings still open, with the numbers of the build
+    unresolved: Controller  # the controller as it was given, for loops of other problems
     controller: Controller  # the same with its automatic settings chosen
     paths: tuple[str, ...] = ()  # of all live numbers, intervals as their ends
-    automatic: tuple[str, ...] = ()  # paths of automatic settings, which follow from the others
 
     @property
     def start(self) -> dict[str, float]:
         """The numbers of the build by path."""
-        return {path: float(self._content(path)) for path in (*self.paths, *self.automatic)}
-
-    @property
-    def of_problem(self) -> list[str]:
-        """The paths that begin at the problem."""
-        return [path for path in self.paths if self._in_problem(path)]
+        return {path: float(self._content(path)) for path in self.paths}
 
     @property
     def signals(self) -> Layout:
         """One signal per setting, with the number of the build as its start."""
         return Layout(tuple(scalar(PREFIX + path, start=value) for path, value in self.start.items()))
 
-    @property
-    def moved(self) -> dict[str, str]:
-        """Those paths that are parameters of what moves, with the parameters' names."""
-        return {path: found[1] for path in self.paths if (found := _MOVED.fullmatch(path))}
-
-    def place_moved(self, loop: Composite, path: str) -> int:
-        """Return the place of a parameter of what moves in the loop's memory."""
-        return int(loop.memory.slice(MOVING).start + loop.memory[MOVING].elements.index(self.moved[path]))
-
     def planted(self) -> tuple[Problem, Controller]:
-        """Return problem and controller with live numbers in place of the settings."""
-        problem, controller, data = self.problem, self.controller, self.moved
+        """Return problem and controller with open numbers in place of the settings."""
+        problem, controller = self.problem, self.controller
         for path, value in self.start.items():
-            if path in data:
-                continue
-            if self._in_problem(path):
-                problem = changed_at(problem, path, open_number(path, value), copied)
-            else:
-                controller = changed_at(controller, path, open_number(path, value), copied)
+            problem, controller = self._at(problem, controller, path, open_number(path, value), copied)
         return problem, controller
+
+    def _at(
+        self, problem: Problem, controller: Controller, path: str, content: object, copy: Copy
+    ) -> tuple[Problem, Controller]:
+        if self._in_problem(path):
+            return changed_at(problem, path, content, copy), controller
+        return problem, changed_at(controller, path, content, copy)
 
     def composed(self, compose: Callable[[Problem, Controller], Composite]) -> Composite:
         """Return what `compose` makes of problem and controller with open numbers.
@@ -110,9 +94,7 @@ class LiveSettings:
             raise self._refusal(error, compose) from None
         read = {s.name for b in composite.blocks for s in b.inputs.signals}
         for path in self.paths:
-            if path in self.moved:
-                _require_moving(path, composite)
-            elif PREFIX + path not in read and not (self._in_problem(path) and path.startswith(_IN_TABLES)):
+            if PREFIX + path not in read and not (self._in_problem(path) and path.startswith(_IN_TABLES)):
                 loop = f"the loop of {type(self.controller).__name__}"
                 raise not_live([path], f"{loop} does not use it, or uses only what was computed from it before; {ANEW}")
         for block in composite.blocks:
@@ -127,7 +109,7 @@ class LiveSettings:
             return error
         for path in self.paths if len(self.paths) > 1 else ():
             try:
-                replace(self, paths=(path,), automatic=()).composed(compose)
+                replace(self, paths=(path,)).composed(compose)
             except NotSupported as alone:
                 return alone
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -137,37 +119,28 @@ class LiveSettings:
         return not_live(self.paths, f"{where} needs its number while the loop is built; {ANEW}", " here")
 
     def held(self, blocks: Sequence[Block]) -> list[Delay]:
-        """Return the settings that some blocks read, as constants of a memory."""
-        return [Delay(s, s.name) for s in self.read_by(blocks)]
-
-    def read_by(self, blocks: Sequence[Block]) -> list[Signal]:
-        """Return the signals of settings that some blocks read, with their numbers of the build."""
-        starts = {s.name: s for s in self.signals.signals}
-        return [starts.get(s.name, s) for s in open_settings(blocks).signals]
+        """Return the settings that some blocks read, as constants of a memory with the numbers of the build."""
+        read = open_settings(blocks)
+        return [Delay(s, s.name) for s in self.signals.signals if s.name in read]
 
     def changed(self, numbers: Numbers) -> tuple[Problem, Controller, dict[str, float]]:
         """Return problem and controller with other numbers, checked, and the numbers of all settings by path.
 
         `numbers`: by path, a pair for an interval; settings that are not named have the numbers of the build.
         """
-        values = {path: value for path, value in self.start.items() if path in self.paths}
-        values |= self.flat(numbers)
-        problem, unresolved = self.problem, self.unresolved
+        values = self.start | self.flat(numbers)
+        problem, controller = self.problem, self.controller
         for path, value in values.items():
-            self._check_side(path, value)
-            if value == self._content(path):
-                continue
-            if self._in_problem(path):
-                problem = changed_at(problem, path, value)
-            else:
-                unresolved = changed_at(unresolved, path, value)
-        controller = resolved(problem, unresolved)
+            if not math.isfinite(value):  # whether there is a limit decides what is compiled
+                raise InvalidValue(
+                    f"setting '{path}' cannot become {value}: the compiled loop has this number in its code; use a large one"
+                )
+            if value != self._content(path):
+                problem, controller = self._at(problem, controller, path, value, validated)
         if [s.elements for s in problem.sensing.drawn] != [s.elements for s in self.problem.sensing.drawn]:
             raise InvalidValue(
                 "whether a sensor loses samples decides what the loop is made of: expected a dropout above 0, as in the build"
             )
-        for path in self.automatic:
-            values[path] = float(cast(float, content_at(controller, path)))
         return problem, checked(problem, controller, numbers_only=True), values
 
     def bounds(self, path: str, reach: float = math.inf) -> Interval:
@@ -224,13 +197,6 @@ class LiveSettings:
                 raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
         return [(name, both[name]) for name in ends]
 
-    def _check_side(self, path: str, value: float) -> None:
-        """Refuse an infinite end of a limit: whether there is a limit decides what is compiled."""
-        if not math.isfinite(value):
-            raise InvalidValue(
-                f"setting '{path}' cannot become {value}: the compiled loop has this number in its code; use a large one"
-            )
-
     def _in_problem(self, path: str) -> bool:
         return _owner(self.problem, self.controller, path) is self.problem
 
@@ -241,9 +207,7 @@ class LiveSettings:
 def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:
     """Return the live settings of a loop, with the controller resolved."""
     every = tuple(dict.fromkeys(end for path in paths for end in _ends(problem, controller, path)))
-    ready = resolved(problem, controller)
-    automatic = tuple(_differences(controller, ready)) if every else ()
-    return LiveSettings(problem, controller, ready, every, automatic)
+    return LiveSettings(problem, controller, resolved(problem, controller), every)
 
 
 def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
@@ -312,24 +276,3 @@ def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Con
     raise InvalidName(
         f"setting '{path}': neither the controller nor the problem's {', '.join(OF_PROBLEM)} have '{first}'.{hint}"
     )
-
-
-def _require_moving(path: str, composite: Composite) -> None:
-    """Raise for a parameter of what moves where nothing moves."""
-    if MOVING not in composite.memory:
-        raise not_live([path], "nothing moves in a controller alone; change the machine", " here")
-
-
-def _differences(before: object, after: object, path: str = "") -> Iterator[str]:
-    """Paths of the numbers that were chosen, None before and a number after, without those that decide what the loop is made of."""
-    if before is after:
-        return
-    if before is None:
-        entries = {f"{path}.{k}": one for k, one in enumerate(after)} if isinstance(after, tuple) else {path: after}
-        yield from (p for p, one in entries.items() if isinstance(one, int | float) and not isinstance(one, bool))
-        return
-    structure = {f.name for f in fields(after) if f.metadata.get("structure")} if is_dataclass(after) else set()
-    for name in (n for n in names_in(after) if n not in structure):
-        inner = getattr(before, name, None) if not isinstance(before, Mapping | Sequence) else None
-        if not isinstance(after, Mapping | Sequence):
-            yield from _differences(inner, getattr(after, name), f"{path}.{name}".lstrip("."))

@@ -22,7 +22,6 @@ from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.open import nominal
 from fpirhc.task.problem import Problem, nominal_start
 from fpirhc.tracking.base import Tracking
 
@@ -109,13 +108,12 @@ _STEPS = 8  # per doubling
 @lru_cache(maxsize=8)  # several blocks of one loop ask for it, and every controller of a comparison
 def _largest_response(problem: Problem) -> tuple[float, ...]:
     """L of every controlled coordinate, not rounded; of outputs along the model's nominal run."""
-    task = nominal(problem)
-    lower, upper = task.limits.input_bounds(task.plant)
+    lower, upper = problem.limits.input_bounds(problem.plant)
     if not np.isfinite(upper - lower).all():
-        return (float("inf"),) * len(task.plant.controlled_names)
-    states, middle = _states(task), (lower + upper) / 2
+        return (float("inf"),) * len(problem.plant.controlled_names)
+    states, middle = _states(problem), (lower + upper) / 2
     corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
-    at_middle, *at_limits = (_responses(task, states, corner) for corner in corners)
+    at_middle, *at_limits = (_responses(problem, states, corner) for corner in corners)
     with np.errstate(all="ignore"):
         reach = [
             np.fmax(abs(low - at_middle), abs(high - at_middle))

@@ -98,7 +98,7 @@ def _transcribed(
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
-    bounds = nominal(limits).input_bounds(plant)
+    bounds = limits.input_bounds(plant)
     values = {path: number_of(number) for path, number in {**open_numbers(cost, limits), **others}.items()}
     if settings:
         size = float(sizes_of_inputs(*bounds, nodes[1]).min())
@@ -420,7 +420,7 @@ def _nodes(
     states, inputs = along["reference"], along["feedforward"]
     if not plant.equations.known_on_reference:
         first = np.zeros(plant.state.size) if start is None else start
-        bounds = nominal(limits).input_bounds(plant)
+        bounds = limits.input_bounds(plant)
         states, inputs = nominal_motion(plant, reference, _advance(plant, horizon), first, bounds, data[0])
     else:
         states = states[list(plant.equations.known_by_outputs)]

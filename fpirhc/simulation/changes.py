@@ -52,7 +52,7 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
         changed, _, values = first.changed(settings_now)
         cycle = int(np.ceil(time / problem.period - 1e-9))
         later.append((cycle, changed))
-        patches.append((cycle, *patch(live, loop, values)))
+        patches.append((cycle, *patch(loop, values)))
         record.append((cycle * problem.period, values))
     return InForce(ready, controller, numbers, patches, record, later)
 
@@ -68,14 +68,8 @@ def _check_times(changes: Changes) -> None:
         named_entries(f"changes at {time:g}", numbers)
 
 
-def patch(live: LiveSettings, loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+def patch(loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """Return places in a loop's memory, and the values that these settings have there."""
-    values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
-    known = {name: value for name, value in values.items() if name in loop.memory}
-    places = [np.arange(loop.memory.slice(n).start, loop.memory.slice(n).stop) for n in known]
-    moved = {live.place_moved(loop, path): numbers[path] for path in live.moved}
-    none = np.zeros(0)
-    return (
-        np.concatenate([none.astype(int), *places, np.array(list(moved), dtype=int)]),
-        np.concatenate([none, *known.values(), np.array(list(moved.values()))]),
-    )
+    held = {PREFIX + path: value for path, value in numbers.items() if PREFIX + path in loop.memory}
+    places = [loop.memory.slice(name).start for name in held]
+    return np.array(places, dtype=int), np.array(list(held.values()), dtype=float)

@@ -33,7 +33,7 @@ from fpirhc.simulation.replay import known_samples
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.open import PREFIX, nominal
+from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.problem import Problem
 
 
@@ -53,10 +53,9 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     ready = checked(problem, controller)
-    task = nominal(problem)
     mover, lost, inner = moving(problem), lost_blocks(problem), compose_with_sensing(problem, ready)
-    ranges, samples = sensor_ranges(task), known_samples(task) if loses(problem) else 0
-    acting = Gate(task, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
+    ranges, samples = sensor_ranges(problem), known_samples(problem) if loses(problem) else 0
+    acting = Gate(problem, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = disturbance_signals(problem)
     seeing = sensing_blocks(problem, given_response(problem, ready), predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had

@@ -250,9 +250,8 @@ class NumbersNow:
         """
         if not named_entries("settings", settings):
             return True
-        before = {path: value for path, value in self._numbers.items() if path in self._live.paths}
         try:
-            _, _, numbers = self._live.changed({**before, **self._live.flat(settings)})
+            _, _, numbers = self._live.changed({**self._numbers, **self._live.flat(settings)})
             self._write(numbers)
         except InvalidName:
             raise

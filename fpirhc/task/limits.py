@@ -206,13 +206,13 @@ class Limits(Checked):
         return {**rates, **self.paths}
 
     def input_ends(self, plant: Plant) -> tuple[list[float], list[float]]:
-        """Lower and upper end of every input, which may be live numbers; infinite where free."""
+        """Lower and upper end of every input, which may be open numbers; infinite where free."""
         free = (-math.inf, math.inf)
         intervals = [self.inputs.get(name, free) for name in plant.input.elements]
         return [low for low, _ in intervals], [high for _, high in intervals]
 
     def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bound of every input, shape (nu,) each; infinite where free."""
+        """Lower and upper bound of every input, of the build where it is open, shape (nu,) each; infinite where free."""
         return _bounds(self.inputs, plant.input.elements)
 
     def rate_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
@@ -243,5 +243,5 @@ def _check_interval(name: str, interval: object, mistakes: Mistakes) -> None:
 
 def _bounds(intervals: Mapping[str, Interval], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     free = (-math.inf, math.inf)
-    pairs = np.array([intervals.get(n, free) for n in names], dtype=float).reshape(-1, 2)
+    pairs = np.array([nominal(intervals.get(n, free)) for n in names], dtype=float).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]

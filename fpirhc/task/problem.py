@@ -369,7 +369,7 @@ class Problem(Checked):
     @cached_property
     def inputs_before(self) -> np.ndarray:
         """Inputs before the first cycle, shape (nu,)."""
-        lower, upper = nominal(self.limits).input_bounds(self.plant)
+        lower, upper = self.limits.input_bounds(self.plant)
         resting = np.clip(np.zeros(len(self.plant.inputs)), lower, upper)
         stated = {**self.dead_time.before, **self.input_before}
         values = [stated.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
@@ -487,7 +487,7 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
 
 def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Bounds, tuple[float, int]]:
     """Return integrator, start, bounds of the inputs, and times of the model's nominal run, as `nominal_run` takes them."""
-    lower, upper = nominal(problem.limits).input_bounds(problem.plant)
+    lower, upper = problem.limits.input_bounds(problem.plant)
     bounds = tuple(map(float, lower)), tuple(map(float, upper))
     return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 

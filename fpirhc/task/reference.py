@@ -25,7 +25,7 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Signal, scalar
-from fpirhc.symbolic.open import PREFIX, number_of, open_numbers
+from fpirhc.symbolic.open import PREFIX, nominal, number_of, open_numbers
 
 Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
 
@@ -142,7 +142,7 @@ class Trajectory(Reference):
                 for name, value in named.items()
             }
 
-        scale = self.scale
+        scale = nominal(self.scale)
         if scale == 1:
             return of(t)
         still = ca.SX.sym("t")
@@ -150,10 +150,10 @@ class Trajectory(Reference):
         return {name: first[name] + scale * (value - first[name]) for name, value in of(t).items()}
 
     def _function(self, plant: Plant) -> ca.Function:
-        if self.scale == 1:
+        if nominal(self.scale) == 1:
             return super()._function(plant)
         t = ca.SX.sym("t")
-        results = self._scaled(plant)(t, self.scale)
+        results = self._scaled(plant)(t, nominal(self.scale))
         return ca.Function("fpirhc_reference", [t], list(results), ["t"], ["state", "response"])
 
     def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:

@@ -24,7 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import exp, open_numbers, power
+from fpirhc.symbolic.open import exp, nominal, open_numbers, power
 from fpirhc.task.reference import Reference, Steps, pairs
 
 _GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
@@ -343,7 +343,7 @@ class Setpoint(Reference):
 
     def _jump(self, plant: Plant, order: int) -> float:
         """Jump of the response at a set-point that changes by one."""
-        rate = self.rate
+        rate = nominal(self.rate)
         return float(ca.evalf(chain_of(plant, rate, ca.SX.zeros(order), ca.SX(1.0), order))[-1])
 
     def _bank(self, plant: Plant, stages: int) -> FilterBank:
@@ -365,7 +365,7 @@ class Setpoint(Reference):
 
     def _along_values(self, plant: Plant, name: str, order: int, t: Expression) -> Expression:
         """(y, y', ..., y^(m)) of one coordinate along `values`: a sum of step responses."""
-        rate, rest = self.rate, self._rest(name)
+        rate, rest = nominal(self.rate), self._rest(name)
         z, held = [expression(ca.SX(rest)), *[expression(ca.SX(0))] * (order - 1)], expression(ca.SX(rest))
         for time, change in self._changes(name):
             phi = transition(rate, ca.fmax(t - time, 0), order)

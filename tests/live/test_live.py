@@ -9,11 +9,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.forms import FORMS
 
 import fpirhc as fp
-from fpirhc.conformance import check_live
-from fpirhc.errors import CompileError, InvalidName, NotSupported
+from fpirhc.errors import CompileError, InvalidName
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.3, measure_from=0.0))
 by_torque = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
@@ -162,32 +160,6 @@ def test_a_compiler_that_fails_is_an_error(monkeypatch):
         fp.simulator(short, by_torque(), live=["deformation.gain"])
     monkeypatch.setenv("FPIRHC_CC", "none")
     assert not fp.simulator(short, by_torque(), live=["deformation.gain"]).compiled
-
-
-MASS = "reality.plant.parameters.m.exact"
-
-
-def test_parameters_of_a_reality_are_live():
-    """Beside numbers of the law, bit by bit those of a loop that is built with them; a machine alone has no reality."""
-    problem, controller = FORMS["reality"][0], fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(gain=-0.2))
-    tried = check_live(problem, controller, paths=[MASS, "deformation.gain"], cycles=40)
-    assert all(t.factor for t in tried), tried
-    with pytest.raises(NotSupported, match="nothing moves in a controller alone"):
-        fp.Stepper(problem, controller, compiled=False, live=[MASS])
-
-
-def test_a_plant_becomes_heavier_during_a_run():
-    """Until then every cycle is the same; from then on each is a step of the integrator with the other mass."""
-    problem = replace(FORMS["reality"][0], duration=0.5)
-    ready = fp.simulator(problem, fp.ComputedTorque(fp.Exponential(6.0)), compiled=False, live=[MASS])
-    at = 40
-    plain, run = ready.run(seed=0), ready.run(seed=0, changes={at * problem.period: {MASS: 1.5}})
-    np.testing.assert_array_equal(run["state"][: at + 1], plain["state"][: at + 1])
-    moves = problem.real_integrator.step(problem.real_plant, problem.period)
-    for k in range(at - 5, at + 5):
-        after = moves(run["reality_state"][k], run["command"][k], [1.5 if k >= at else 1.0, 3.0], [0.0, 0.0])
-        np.testing.assert_allclose(run["reality_state"][k + 1], after.full().ravel(), rtol=1e-12)
-    assert run.in_force[1][1][MASS] == 1.5
 
 
 CHANGED = {0.1: {"deformation.gain": -0.9}, 0.2: {"deformation.gain": -0.9, "deformation.scale": 3.0}}

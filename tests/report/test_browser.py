@@ -199,7 +199,7 @@ def compare_curves(page: Any, data: Any) -> None:
         ("crane_slots", "setpoints.cart.0", 0.5),
         ("turbojet", "approximate.B_T", 0.625),  # with another first plan the error would be 20 % larger
         ("two_mass", "reference.scale", 0.5),
-        ("fishery", "reference.scale", 3.9),  # with another scale of the plans 1e-8
+        ("fishery", "reference.scale", 3.9),
         ("fishery", "exact.survival", 1.5),  # the biomass leaves its range, which ends the run
     ],
 )

@@ -51,7 +51,7 @@ class LabLoop:
     def written(self, numbers: dict[str, float]) -> np.ndarray:
         """Return the first memory into which a device writes these settings."""
         memory, live = self.start.copy(), self.ready.live
-        places, values = patch(live, self.ready.loop, live.changed(numbers)[2])
+        places, values = patch(self.ready.loop, live.changed(numbers)[2])
         memory[places] = values
         return memory
 
