@@ -53,28 +53,6 @@ def test_states_that_do_not_follow_are_refused_by_name(shown):
         horizon_of(plant, REFERENCE, HORIZON, fp.Quadratic(**COST, deviation={"u": 1e-2}), start={"a": 0.3, "b": 0.2})
 
 
-def test_a_loop_with_deviations_on_an_output_runs_and_adapts():
-    """With the exact model a plan follows; with the wrong one adaptation helps."""
-    problem = fp.Problem(
-        plant=SCALED,
-        reference=REFERENCE,
-        start={"a": 0.25 / K, "b": 0.0},
-        period=0.01,
-        duration=4.0,
-        measure_from=2.0,
-        horizon=HORIZON,
-        cost=fp.Quadratic(**COST, deviation={"u": 1e-2}),
-    )
-    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-2))
-    adapted = plan.with_deformation(fp.ModelReferenced(fp.Affine(gain=-1.0)))
-    errors = [
-        fp.measure(problem, fp.simulate(problem, one, seed=0, compiled=False)).rms_error["shown"]
-        for one in (plan, adapted, fp.ExactModel(plan))
-    ]
-    assert errors[1] < 0.2 * errors[0]
-    assert errors[2] < 0.2 * errors[0]
-
-
 FULL = {"upper": 0.2, "lower": 0.2}
 G, A, HOLE = 9.81, 0.01, 1e-4  # m/s^2, m^2, m^2
 

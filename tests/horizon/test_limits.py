@@ -62,15 +62,6 @@ def test_limits_are_kept_at_the_same_optimum_as_ipopt(case):
     assert plan.violations() == ()
 
 
-def test_multipliers_are_those_of_ipopt():
-    """Multipliers fitted to the plan agree with an independent fit at IPOPT's plan."""
-    ocp, data, first = limited(CASES["state"][0])
-    plan, other = fp.solve(ocp, FIXED, first, data), fp.solve(ocp, IPOPT, first, data)
-    np.testing.assert_allclose(
-        plan.state_multipliers, other.state_multipliers, atol=1e-3 * plan.state_multipliers.max()
-    )
-
-
 def test_soft_limits_are_violated_at_their_price():
     """More weight, less violation; the price stands in the cost by name; hard where heavy."""
     lowest, prices = [], []
@@ -87,52 +78,9 @@ def test_soft_limits_are_violated_at_their_price():
     assert fp.solve(parts, FIXED, first, data).slacks() == {"angle'": 0.0}
 
 
-def test_soft_rates_and_paths():
-    """They are no bounds any more, and they pull."""
-    hard, soft = CASES["rate"][0], fp.Limits(rates={"torque": (-10.0, 10.0)}, soft={"torque": 1e-3})
-    ocp, data, first = limited(soft)
-    assert not ocp.bounds_states
-    plan = fp.solve(ocp, FIXED, first, data)
-    strict = fp.solve(*swapped(limited(hard)))
-    steps = [np.abs(np.diff(p.inputs)).max() for p in (plan, strict)]
-    assert steps[0] > steps[1] * 1.01
-
-
 def swapped(arguments):
     ocp, data, first = arguments
     return ocp, FIXED, first, data
-
-
-LOOPS = {
-    "state": (fp.Limits(states={"angle'": (-1.0, 1.0)}), ()),
-    "rate": (fp.Limits(rates={"torque": (-30.0, 30.0)}), ()),
-    "terminal": (fp.Limits(), ("angle",)),
-}
-
-
-@pytest.mark.parametrize("case", LOOPS)
-def test_limits_in_a_closed_loop(case):
-    """A few iterations per cycle keep the limit closely, although it moves along the plan."""
-    limits, terminal = LOOPS[case]
-    problem = fp.Problem(
-        plant=pendulum(),
-        reference=REFERENCE,
-        start={"angle": 0.3},
-        period=0.05,
-        duration=6.0,
-        limits=limits,
-        horizon=fp.Horizon(stages=20, step=0.05, terminal=terminal),
-        cost=COST,
-        measure_from=1.0,
-    )
-    controller = fp.ExactModel(fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3, feasible=1e-3)))
-    run = fp.simulate(problem, controller, seed=0)
-    assert run.stop is None
-    assert fp.measure(problem, run).statuses["OK"] >= 110
-    if case == "state":
-        assert np.abs(run["state.angle'"][20:]).max() < 1.001
-    if case == "rate":
-        assert np.abs(np.diff(run["command.torque"])[5:]).max() <= 30 * 0.05 + 1e-6
 
 
 @pytest.mark.parametrize(
@@ -249,33 +197,6 @@ def test_the_price_of_a_soft_state_counts_the_end_too():
     plan = fp.solve(soft[0], FIXED, soft[2], soft[1])
     costs = [rolled(ocp, first, plan.inputs, data).cost for ocp, data, first in (soft, free)]
     assert plan.slacks()["angle"] == pytest.approx(costs[0] - costs[1], rel=1e-9)
-
-
-def speed_limited(mass, length):
-    """(ocp, data, first state) of a mass without limits of its force, which moves by a length with its speed limited."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"F": "N"},
-        order=2,
-        response=lambda q, v, u, p: {"q": u.F / p.m},
-        parameters={"m": fp.Parameter(mass, mass, "kg")},
-    )
-    reference, horizon = fp.Trajectory(lambda t: {"q": length + 0 * t}), fp.Horizon(stages=8, step=0.1)
-    states = {"q": 10.0 / length**2, "q'": 0.1 / length**2}
-    cost = fp.Quadratic(states=states, effort={"F": 1e-2 / (mass * length) ** 2})
-    ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits(states={"q'": (-length, length)}))
-    return ocp, data, np.zeros(2)
-
-
-@pytest.mark.parametrize(("mass", "length"), [(1.0, 1.0), (1500.0, 1.0), (1e-6, 1.0), (1.0, 1e-9)])
-def test_units_of_forces_and_lengths_do_not_matter(mass, length):
-    """A limit that can be kept is kept at the same optimum, whatever its size and that of a free input."""
-    ocp, data, first = speed_limited(mass, length)
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6 * mass * length), first, data)
-    assert plan.status == fp.Status.OK
-    other, data, first = speed_limited(1.0, 1.0)
-    assert known(plan.cost) == pytest.approx(known(fp.solve(other, IPOPT, first, data).cost), rel=1e-6)
-    assert plan.states[1].max() <= (1 + 1e-6) * length
 
 
 def test_prices_are_refused_by_who_cannot_take_them():

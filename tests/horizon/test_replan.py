@@ -122,15 +122,6 @@ def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
     np.testing.assert_array_equal(again["command"], one["command"])
 
 
-@pytest.mark.parametrize("fastest", [np.inf, FASTEST])
-def test_a_limited_rate_holds_from_cycle_to_cycle(fastest):
-    rates = {"torque": (-fastest, fastest)} if np.isfinite(fastest) else {}
-    limits = fp.Limits(inputs={"torque": (-6.0, 6.0)}, rates=rates)
-    run = fp.simulate(task(limits=limits), planning(), seed=0, compiled=None)
-    largest = np.abs(np.diff(run["command"][:, 0])).max() / PERIOD
-    assert largest <= 1.001 * FASTEST if rates else largest > 2 * FASTEST
-
-
 OPTIMISERS = {
     "fixed point": fp.FixedPoint(iterations=3, tolerance=1e-6),
     "gradient": fp.GradientFixedPoint(iterations=400, tolerance=1e-4),
@@ -199,13 +190,6 @@ def test_long_stages_of_a_map_hold_the_input_over_whole_steps(optimiser):
 
     best = minimize(cost, np.ones(4), bounds=[(-3.0, 3.0)] * 4, options={"ftol": 1e-15, "gtol": 1e-10})
     assert run["command"][0, 0] == pytest.approx(best.x[0], abs=1e-4)
-
-
-def test_on_an_exact_model_one_iteration_from_the_interpolated_plan_is_as_good_as_a_solved_plan():
-    problem = task(mass=1.0, believed=1.0)
-    solved = fp.simulate(problem, planning(), seed=0, compiled=None)["command"]
-    one = fp.simulate(problem, planning(fp.FixedPoint(iterations=1, tolerance=1e-6)), seed=0, compiled=None)["command"]
-    np.testing.assert_allclose(one, solved, atol=1e-3)
 
 
 LIMITED = fp.Limits(inputs={"torque": (-6.0, 6.0)}, states={"angle": (-0.5, 0.5)})

@@ -79,38 +79,12 @@ def test_metanet_is_the_published_run() -> None:
     assert T * cars.sum() == pytest.approx(TOTAL_TIME_SPENT, abs=1e-7)
 
 
-def test_cars_are_conserved() -> None:
-    """What has come is on the road, waits, or has left at the end, whatever the speeds are."""
-    states, hours = open_loop(), T * np.arange(900)
-    come = np.interp(hours, [2, 2.25], [3500, 1000]) + np.interp(hours, [0, 0.15, 0.35, 0.5], [500, 1500, 1500, 500])
-    first = task("freeway_metering").problem.start_state[None, :]
-    before = np.vstack([first, states[:-1]])
-    left = 2 * before[:, 5] * before[:, 11]
-    cars = [2 * s[:, :6].sum(axis=1) + s[:, 12:].sum(axis=1) for s in (before, states)]
-    assert cars[1] - cars[0] == pytest.approx(T * (come - left), abs=1e-10)
-
-
 # Metering
 
 
 def test_an_exact_map_of_a_minute_has_no_error() -> None:
     """Six steps with the rate held are one map, whose inverse the controller has."""
     assert error("freeway_metering", "CTC exact model") < 1e-12
-
-
-def test_the_run_is_a_loop_by_hand() -> None:
-    """The rates of a run through METANET in numpy, six steps per minute, with the demands in the middle of every minute."""
-    problem, run = task("freeway_metering").problem, run_of("freeway_metering", "CTC+FPI")
-    state = np.array(problem.start_state)
-    for k in range(run.cycles):
-        assert run["state"][k] == pytest.approx(state, rel=1e-13, abs=1e-12)
-        middle = (k + 0.5) * problem.period
-        demands = (
-            np.interp(middle, [2, 2.25], [3500, 1000]),
-            np.interp(middle, [0, 0.15, 0.35, 0.5], [500, 1500, 1500, 500]),
-        )
-        for _ in range(6):
-            state = by_hand(state, float(run["command.r"][k]), demands)
 
 
 def by_hand(state: np.ndarray, rate: float, demands: tuple[float, float]) -> np.ndarray:
@@ -124,16 +98,6 @@ def by_hand(state: np.ndarray, rate: float, demands: tuple[float, float]) -> np.
     later = later - 60 * T / (18 / 3600) * (ahead - rho) / (rho + 40) - 0.0122 * T / 2 * merging * v / (rho + 40)
     dense = rho + T / 2 * (np.append(main, flow[:-1]) - flow + merging)
     return np.concatenate([dense, later, w + T * (np.array(demands) - [main, ramp])])
-
-
-def test_a_metered_ramp_saves_time() -> None:
-    """An open ramp lets the density rise to 71, where traffic is slow; metered, all together spend less time, queue included."""
-    metered, start = run_of("freeway_metering", "CTC+FPI")["state"], task("freeway_metering").problem.start_state
-    free = np.vstack([start, open_loop()[:359]])
-    spent = [hours * (2 * s[:, :6].sum() + s[:, 12:].sum()) for hours, s in ((T, free), (6 * T, metered))]
-    assert spent == pytest.approx([570.8, 553.5], abs=0.2)
-    assert free[:, 4].max() == pytest.approx(71, abs=0.5)
-    assert metered[:, 4].max() < 33
 
 
 # The time spent
@@ -227,66 +191,3 @@ def test_the_static_map_is_that_of_settled_traffic(which: str) -> None:
     for rate in np.linspace(0.0, 0.6, 13):
         mapped = float(plant.equations.controlled_response([50.0], rate, values))
         assert mapped == pytest.approx(settled_emission(2500.0, rate, p), rel=1e-9)
-
-
-def test_the_iteration_holds_the_emission() -> None:
-    """The figures of the description; the map alone stays at its largest rate."""
-    assert error("freeway", "static map") == pytest.approx(71.8, rel=0.02)
-    assert error("freeway", "static map+FPI") == pytest.approx(1.56, rel=0.02)
-    assert run_of("freeway", "static map")["clipped"].all()
-    assert run_of("freeway", "static map+FPI")["clipped"][30:].sum() == 0
-    assert run_of("freeway", "static map+FPI")["reality_state.w2"].min() > 6  # so the ramp is never short of cars
-    assert run_of("freeway", "static map+FPI")["reality_state.w2"].max() < 1760
-
-
-def test_the_shift_of_the_target_is_that_of_a_loop_by_hand() -> None:
-    """Half the map's gain times the measured error is taken off the target, once a minute, where the rate is inside its limits."""
-    run, problem = run_of("freeway", "static map+FPI"), task("freeway").problem
-    period, gain, shift = problem.period, 1.25, 0.0
-    emission, free = run["output.emission"], run["clipped"] == 0
-    for k in range(1, 120):
-        wanted = shift - gain * (emission[k] - 2140 - 25 * np.sin(2 * np.pi * k * period))
-        shift = float(run["shift.emission"][k])
-        if free[k - 1] or abs(wanted) < abs(shift):
-            assert shift == pytest.approx(wanted, abs=1e-8)
-
-
-class Road:
-    """METANET in numpy as a body outside: it measures the queue and the emission."""
-
-    def __init__(self, problem: fp.Problem) -> None:
-        self.problem = problem
-
-    def reset(self, seed: int) -> list[float]:  # noqa: ARG002 -- nothing is random
-        """Go to the start."""
-        self.state = np.array(self.problem.real_start)
-        return self.measured()
-
-    def step(self, time: float, command: np.ndarray) -> list[float]:
-        """Hold the rate for a minute; the demand is that of each of its steps."""
-        steps = 6
-        for j in range(steps):
-            middle = time + (j + 0.5) / steps * self.problem.period
-            demands = 2500 + 80 * np.sin(2 * np.pi * middle / 1.7), 1100.0
-            self.state = by_hand(self.state, float(command[0]), demands)
-        return self.measured()
-
-    def measured(self) -> list[float]:
-        """Queue and emission."""
-        density, speed = self.state[:6], self.state[6:12]
-        emitted = 2 * density * speed * (1374 / speed + 47.5 + 0.00867 * speed**2)
-        return [float(self.state[13]), float(emitted.sum() / 1000)]
-
-
-def test_a_body_outside_is_the_same_freeway() -> None:
-    """Reset and step in place of the symbolic reality: the same commands. Without a lag nothing depends on the start before it."""
-    problem = replace(task("freeway").problem, duration=1.0)
-    roomy = replace(
-        problem.plant, ranges={"w2": (0.0, 1000.0)}
-    )  # else the gate of a body doubts a queue of 500 vehicles
-    problem = replace(problem, plant=roomy)
-    outside = replace(problem, reality=fp.ExternalPlant(Road(problem), measures={"w2": "veh", "emission": "kg/h"}))
-    cascade = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-1.0), fp.ThroughModel(lag=0.0))
-    one, other = (fp.simulate(p, cascade, seed=0, compiled=False) for p in (problem, outside))
-    for name in ("command.r", "output.emission", "shift.emission", "realised.emission"):
-        assert other[name] == pytest.approx(one[name], rel=1e-9), name

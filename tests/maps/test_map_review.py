@@ -55,9 +55,7 @@ def on_output(problem: fp.Problem) -> fp.Problem:
 
 
 CASES = {
-    "CTC": (task, fp.ComputedTorque(LAW)),
     "CTC+FPI": (task, fp.ComputedTorque(LAW, ITERATION)),
-    "CTC+plain": (task, fp.ComputedTorque(LAW, fp.Affine(gain=-1.0))),
     "RHC+FPI": (task, fp.RecedingHorizon(OPTIMISER, ITERATION)),
     "output": (lambda: on_output(task()), fp.ComputedTorque(LAW, ITERATION)),
 }

@@ -106,18 +106,6 @@ def test_a_run_is_the_loop_by_hand(steps: int, gain: float) -> None:
     assert np.abs(run["command"][:, 0] - commands).max() <= tolerance
 
 
-def test_a_cycle_of_three_steps_is_the_map_three_times() -> None:
-    """To the last bit: no integrator, and no difference that is multiplied back."""
-    problem = task(period=3 * T, duration=30 * T)
-    run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.01)))
-    growth, caught = (p.exact for p in FISH.values())
-    for k in range(9):
-        x, u = run["plant_state"][k, 0], run["command"][k, 0]
-        for _ in range(3):
-            x = x + T * (growth * x * (1 - x) - caught * u)
-        assert run["plant_state"][k + 1, 0] == x
-
-
 def chain(order: int) -> fp.Plant:
     """x1+ = x2, x2+ = x3, ..., xr+ = a x1 + b u, controlled at x1."""
     names = [f"x{k}" for k in range(1, order + 1)]

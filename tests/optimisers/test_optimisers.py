@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -11,9 +10,7 @@ import numpy as np
 import pytest
 from helpers import tasks
 from helpers.horizons import horizon_of
-from helpers.plants import chain, known
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from helpers.plants import known
 
 import fpirhc as fp
 from fpirhc.contracts import judge
@@ -54,28 +51,6 @@ def test_all_find_the_same_stationary_plan(optimiser, limits):
     assert np.all(plan.inputs.max(axis=1) <= ocp.input_upper)
 
 
-def receding(optimiser, deformation=None, **settings):
-    """A short closed loop of two_mass."""
-    problem = replace(SHIPPED.two_mass.problem, duration=0.3, measure_from=0.1)
-    return problem, fp.RecedingHorizon(optimiser, deformation or fp.Identity(), **settings)
-
-
-@cache
-def by_gradient():
-    return fp.simulate(*receding(GRADIENT, fp.Sigmoid(gain=-0.5, scale=20.0)), seed=0)
-
-
-@pytest.mark.parametrize("optimiser", BACKENDS, ids=ids[2:])
-def test_all_backends_drive_the_same_loop(optimiser):
-    """RHC+FPI with any optimiser gives the same motion."""
-    problem, controller = receding(optimiser, fp.Sigmoid(gain=-0.5, scale=20.0))
-    run = fp.simulate(problem, controller, seed=0)
-    other = by_gradient()
-    assert run.stop is None
-    assert run["status"].max() <= fp.Status.NOT_CONVERGED
-    np.testing.assert_allclose(run["state"][:, :2], other["state"][:, :2], atol=1e-4)
-
-
 @pytest.mark.parametrize(
     "nominal",
     [pytest.param(fp.FromMeasurement(), marks=pytest.mark.slow), fp.FromPlan(fp.Exponential(rate=6.0))],
@@ -106,33 +81,6 @@ def test_bounds_of_the_plan_are_shifted_by_the_correction():
     meant = run["planned.Q1"][fresh] + run["command_shift.Q1"][fresh - 1]
     assert meant.max() <= 10.0 + 1e-6
     assert meant.max() > 9.9
-
-
-def scaled(factor):
-    """The shipped problem with every weight times `factor`."""
-    cost: Any = SHIPPED.two_mass.problem.cost
-    return replace(
-        SHIPPED.two_mass.problem,
-        cost=fp.Quadratic(
-            states={n: factor * w for n, w in cost.states.items()},
-            deviation={n: factor * w for n, w in cost.deviation.items()},
-        ),
-    )
-
-
-@pytest.mark.parametrize("factor", [1e-9, 1e-3, 1e6])
-@pytest.mark.parametrize("iterations", [1, 40])
-def test_the_size_of_the_weights_changes_neither_plan_nor_status(factor, iterations):
-    """A cost in other units is the same problem: tiny weights must not make every plan look converged."""
-    diagnostics = {}
-    for name, problem in (("one", SHIPPED.two_mass.problem), ("scaled", scaled(factor))):
-        ocp, data = horizon_of(problem.plant, problem.reference, problem.horizon, problem.cost, BOXES["active"])
-        optimiser = fp.ReducedGradient(iterations=iterations, tolerance=1e-3)
-        diagnostics[name] = fp.solve(ocp, optimiser, problem.start_state, data, calls=1)
-    one, other = diagnostics.values()
-    assert other.status == one.status == (fp.Status.NOT_CONVERGED if iterations == 1 else fp.Status.OK)
-    np.testing.assert_allclose(other.inputs, one.inputs, atol=1e-4)
-    assert other.cost == pytest.approx(factor * one.cost, rel=1e-8)
 
 
 def broken(ocp, data, first):
@@ -170,18 +118,6 @@ def test_broken_problems_are_statuses_and_leave_no_trace(optimiser, capfd):
     assert printed.out == ""
 
 
-@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e200])
-@pytest.mark.parametrize("optimiser", EVERY, ids=ids)
-def test_poisoned_warm_start_is_forgotten(optimiser, poison):
-    """A memory of nonsense costs at most one failed call, and never a plan that is not finite."""
-    ocp, data, first = two_mass(BOXES["active"])
-    step, memory = optimiser.step(ocp), np.full(optimiser.memory(ocp).size, poison)
-    for _ in range(3):
-        inputs, diagnostics, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
-        assert np.isfinite(inputs.full()).all()
-    assert int(diagnostics[4]) == fp.Status.OK
-
-
 RIDING = {
     "upper": fp.Limits(inputs={"Q1": (-40.0, 60.0)}, states={"q1'": (-0.3, 0.4), "q1": (2.1, 2.4)}),
     "lower": fp.Limits(inputs={"Q1": (-40.0, 60.0)}, states={"q2'": (-0.3, 2.0)}),
@@ -215,29 +151,3 @@ def test_a_first_state_outside_its_limits_is_infeasible():
     assert plan.status == fp.Status.INFEASIBLE
     assert known(plan.feasibility) > 1e-2
     assert plan.verify()[2] == pytest.approx(plan.feasibility)
-
-
-@settings(deadline=None, derandomize=True, max_examples=25)
-@given(seed=st.integers(0, 10**6), width=st.floats(0.0, 20.0), centre=st.floats(-10.0, 10.0))
-def test_random_boxes_have_the_same_optimum_by_two_methods(seed, width, centre):
-    """Linear plant, quadratic cost, any box (also a single point): where both say OK they are the same, and both do."""
-    data, gradient, exact = _linear_quadratic()
-    first = np.random.default_rng(seed).normal(size=2)
-    box = (np.array([centre - width]), np.array([centre + width]))
-    plans = []
-    for step, memory in (gradient, exact):
-        inputs, diagnostics, _ = step(first, data, *box, memory)
-        assert int(diagnostics[4]) == fp.Status.OK
-        plans.append((inputs.full(), float(diagnostics[0])))
-    assert plans[0][1] == pytest.approx(plans[1][1], rel=1e-7, abs=1e-10)
-    np.testing.assert_allclose(plans[0][0], plans[1][0], atol=1e-3)
-
-
-@cache
-def _linear_quadratic():
-    plant, reference = chain(2), fp.Trajectory(lambda t: {"y": 0 * t})
-    horizon = fp.Horizon(stages=10, step=0.1)
-    cost = fp.Quadratic(states={"y": 3.0, "y'": 0.5}, effort={"u": 0.2})
-    ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits())
-    pair = (fp.ReducedGradient(iterations=300, tolerance=1e-4), fp.SequentialQuadratic(tolerance=1e-4))
-    return data, *((o.step(ocp), o.memory(ocp).start()) for o in pair)

@@ -105,14 +105,6 @@ def test_the_plain_form_bears_every_slope_below_two_over_the_gain(gain):
         assert bool(run.stop is None and late < early) is settles, (share, early, late)
 
 
-def test_the_output_settles_at_the_reference_whatever_the_map_is():
-    """In the steady state the target in force is the target, so the shift rests only where output and reference agree."""
-    for slope in (0.3, 0.7, 1.8):
-        for deformation in (affine(0.5), fp.Sigmoid(gain=-0.8)):
-            run = fp.simulate(linear(slope), fp.Cascade(STATIC, deformation, LAGGED), seed=1, compiled=False)
-            assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)
-
-
 def test_a_target_out_of_reach_does_not_wind_the_shift_up():
     """The reference is beyond the limit of the valve for 800 s; afterwards the output is as near as if it had never been."""
 
@@ -125,33 +117,6 @@ def test_a_target_out_of_reach_does_not_wind_the_shift_up():
     assert run["state.y"][out] == pytest.approx(1.4, abs=1e-3)
     assert np.abs(run["shift"]).max() < 2.0
     assert np.abs(run["error.y"][run.time > 1320]).max() < 1e-2
-
-
-def test_a_receding_horizon_inside_follows_the_shifted_target():
-    """A plan with a wrong model keeps an offset; the cascade takes it away. Errors are those of the reference."""
-    horizon = {"horizon": fp.Horizon(stages=6, step=4.0), "cost": fp.Quadratic(states={"y": 1.0}, effort={"u": 0.05})}
-    problem = linear(0.6, **horizon, duration=800.0)
-    inner = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6))
-    offset = fp.simulate(problem, inner, seed=1, compiled=False)
-    run = fp.simulate(problem, fp.Cascade(inner, affine(0.5), LAGGED), seed=1, compiled=False)
-    assert abs(offset["error.y"][-1]) > 0.2
-    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-4)
-    assert run["error.y"][-1] == pytest.approx(run["reference.y"][-1] - run["state.y"][-1], abs=1e-12)
-    assert run["target.y"][-1] > 1.2
-
-
-def test_set_points_and_a_stepper():
-    """Set-points pass through to the target; by hand the commands are those of the loop."""
-    problem = linear(0.6, reference=fp.Setpoint({"y": [(0.0, 1.0), (200.0, 2.0)]}, rate=0.1), duration=400.0)
-    controller = fp.Cascade(STATIC, affine(0.5), LAGGED)
-    run = fp.simulate(problem, controller, seed=1, compiled=False)
-    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-3)
-    stepper = fp.Stepper(problem, controller, compiled=False)
-    memory = stepper.start()
-    for k in range(100):
-        point = {"y": float(run["setpoint.y"][k])}
-        command, memory = stepper.step(run.time[k], run["state"][k], run["realised"][k], memory, setpoints=point)
-        assert np.array_equal(command, run["command"][k])
 
 
 def test_two_channels_have_lags_of_their_own():

@@ -90,24 +90,6 @@ def test_response_and_nominal_response_are_the_output_itself() -> None:
     assert run["command.u"] == pytest.approx(np.sqrt(14.0 * run["desired.power"]), rel=1e-12)
 
 
-def test_an_exact_model_leaves_the_drift_of_one_cycle() -> None:
-    """The voltage fits the temperature at the beginning of a cycle, so the error halves with the period."""
-    errors = [rms(heated(element(), period=period, duration=20.0), fp.ExactModel(STATIC)) for period in (0.4, 0.2, 0.1)]
-    assert errors[0] < 4.0
-    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
-    assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.05)
-
-
-def test_the_shift_is_that_of_the_recursion_by_hand() -> None:
-    """y_k belongs to reference_k + shift_{k-1}: shift_k = shift_{k-1} - a (y_k - reference_k)."""
-    gain = 0.4
-    run = simulated(heated(element()), fp.Cascade(STATIC, affine(gain), AT_ONCE))
-    shift = 0.0
-    for k in range(run.cycles):
-        shift = shift - gain * (run["output.power"][k] - run["reference.power"][k]) if k else 0.0
-        assert run["shift.power"][k] == pytest.approx(shift, abs=1e-10)
-
-
 def test_a_wrong_static_map_is_made_up_for() -> None:
     """Without iteration a quarter of the power is missing; with it the error is that of one cycle, whatever the gain."""
     problem = heated(element())

@@ -12,7 +12,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.of_outputs import OPTIMISER, curve, hill, planned, sedated
+from helpers.of_outputs import curve, hill, sedated
 from helpers.plants import simulated
 
 import fpirhc as fp
@@ -85,23 +85,6 @@ def test_without_feedback_no_state_feels_it() -> None:
     runs = [simulated(replace(problem, disturbances=d), held) for d in ({}, {"depth": fp.Step(at=5.0, size=3.0)})]
     assert np.allclose(runs[0]["plant_state"], runs[1]["plant_state"], atol=1e-6)
     assert np.allclose(runs[1]["output.depth"][-1] - runs[0]["output.depth"][-1], 3.0, atol=1e-5)
-
-
-def test_plans_follow_a_disturbed_output_and_adaptation_helps() -> None:
-    problem = planned(disturbances={"depth": WAVE})
-    plain, adaptive = fp.RecedingHorizon(OPTIMISER), fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.5))
-    errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (plain, adaptive)]
-    assert errors[1] < 0.6 * errors[0]
-    assert errors[0] < 0.6  # a third of the wave: its distance is held over a horizon, and not its slope
-
-
-def test_a_reality_has_it_on_its_own_output() -> None:
-    model = hill(5.5)
-    problem = sedated(model, disturbances={"depth": WAVE})
-    real = replace(problem, reality=fp.Reality(model))
-    one, other = (simulated(p, fp.ComputedTorque(LAW, fp.Affine(-1.0))) for p in (problem, real))
-    assert np.array_equal(one["output"], other["output"])
-    assert np.array_equal(one["realised"], other["realised"])
 
 
 def shifting(order: int) -> fp.Problem:

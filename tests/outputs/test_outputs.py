@@ -104,69 +104,7 @@ def test_an_output_that_is_only_judged_is_measured_and_not_controlled() -> None:
     assert np.array_equal(run["true_error.level"], 4.0 - run["plant_state.E"])
 
 
-def test_set_points_of_an_output_are_filtered_and_followed() -> None:
-    problem = sedated(hill(5.5))
-    first = float(curve(1.5, 4.0))
-    aims = fp.Setpoint({"depth": [(0.0, first), (2.0, 50.0)]}, rate=1.0)
-    run = simulated(
-        replace(problem, reference=aims, duration=20.0), fp.ComputedTorque(fp.Exponential(rate=1.0), fp.Affine(-1.5))
-    )
-    assert run["reference.depth"][-1] == pytest.approx(50.0, abs=1e-3)
-    assert np.abs(run["true_error.depth"]).max() < 1.0
-    planned_run = simulated(replace(planned(), reference=aims), fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.5)))
-    assert abs(planned_run["output.depth"][-1] - 50.0) < 0.05
-
-
-def test_the_patients_kinetics_conserve_the_drug() -> None:
-    """What is infused is in the compartments or has been cleared: V1 C1 + V2 C2 + V3 C3 changes by u - CL C1."""
-    age, weight, height = 61.0, 77.0, 175.0
-    lean = 1.1 * weight - 128 * (weight / height) ** 2
-    clearance = 1.89 + 0.0456 * (weight - 77) - 0.0681 * (lean - 59) + 0.0264 * (height - 177)
-    volumes = np.array([4.27, 18.9 - 0.391 * (age - 53), 238.0])
-    plant, x = fp.load_problem("anaesthesia").problem.plant, np.array([3.0, 1.0, 0.4, 2.0])
-    rates = plant.equations.rate(x, 20.0, plant.exact).full().ravel()
-    assert volumes @ rates[:3] == pytest.approx(20.0 - clearance * x[0], rel=1e-12)
-
-
 # Outputs that the wrong model computes in place of a measurement
-
-
-PATIENT = tasks.anaesthesia.problem
-
-
-def judged_by(curve: np.ndarray, name: str) -> float:
-    """Rms error of bis of a controller that is given the outputs and the response that a curve makes of the real states.
-
-    Their derivatives are those along the real motion: an observer that is right about everything but the curve.
-    """
-    x, u, p, real = (ca.SX.sym(n, s) for n, s in (("x", 4), ("u", 1), ("p", 4), ("real", 4)))
-    rate = PATIENT.plant.equations.rate(x, u, real)
-    chain = [PATIENT.plant.equations.output(x, u, p, ca.SX.zeros(4))[0]]
-    for _ in range(2):
-        chain.append(ca.jtimes(chain[-1], x, rate))
-    shown = ca.Function("shown", [x, u, p, real], [ca.vertcat(*chain)])
-    wanted = PATIENT.reference.function(PATIENT.plant)
-    advance = PATIENT.integrator.step(PATIENT.plant, PATIENT.period)
-    stepper = fp.Stepper(PATIENT, tasks.anaesthesia.controllers[name], compiled=False)
-    memory, state, command, realised = stepper.start(), PATIENT.start_state.copy(), np.zeros(1), np.zeros(1)
-    errors = []
-    for k in range(PATIENT.cycles):
-        time, depth = k * PATIENT.period, float(shown(state, command, PATIENT.plant.exact, PATIENT.plant.exact)[0])
-        errors.append(depth - float(wanted(time)[0][0]))
-        seen = np.asarray(shown(state, command, curve, PATIENT.plant.exact).full()).ravel()
-        command, memory = stepper.step(time, state, realised, memory, output=seen[:2])
-        state = np.asarray(advance(state, command, PATIENT.plant.exact, np.zeros(4)).full()).ravel()
-        realised = np.asarray(shown(state, command, curve, PATIENT.plant.exact).full()).ravel()[2:]
-    late = np.array(errors[round(PATIENT.measure_from / PATIENT.period) :])
-    return float(np.sqrt(np.mean(late**2)))
-
-
-def test_the_iteration_helps_with_measured_outputs_and_not_with_those_of_the_wrong_curve():
-    """It corrects the derivative of what it is shown: eleven times better, and no better at all."""
-    measured = [judged_by(PATIENT.plant.exact, name) for name in ("CTC", "CTC+FPI")]
-    modelled = [judged_by(PATIENT.plant.approximate, name) for name in ("CTC", "CTC+FPI")]
-    assert measured == pytest.approx([0.142, 0.0126], rel=0.01)
-    assert modelled == pytest.approx([2.33, 2.34], rel=0.01)
 
 
 # What is refused, and how

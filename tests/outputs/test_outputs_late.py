@@ -93,15 +93,6 @@ def test_a_prediction_helps_behind_dead_time_and_leaves_no_error_at_rest() -> No
     assert abs(run["true_error.depth"][-1]) < 0.05
 
 
-def test_adaptation_behind_dead_time_helps() -> None:
-    """The form that compares with the model's response; it takes no drift of the response within the dead time for an error."""
-    problem = replace(late(sedated(hill(5.5)), 0.05), input_before={"u": 1.5}, measure_from=8.0)
-    plain = fp.Predicted(fp.ComputedTorque(LAW), inputs=0.05)
-    adaptive = plain.with_deformation(fp.ModelReferenced(fp.Affine(-0.4), cycles=3))
-    errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (plain, adaptive)]
-    assert errors[1] < 0.5 * errors[0]
-
-
 def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
     """The filter compares what was measured with what it expected then, and not what is predicted."""
     problem, law = late(sedated(hill(4.0))), fp.ComputedTorque(LAW)

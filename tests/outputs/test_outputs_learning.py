@@ -113,28 +113,6 @@ def test_the_mass_of_an_arm_is_found_from_the_acceleration_of_its_hand() -> None
     assert run["estimate.m"][-1] == pytest.approx(1.0, abs=3e-3)
 
 
-def test_the_exact_model_may_be_written_in_other_words() -> None:
-    """The reality of the heat exchanger has no outputs; the model has the coordinate as an output, and is replaced by it."""
-    task = fp.load_problem("heat_exchanger")
-    spelled = replace(task.problem.plant, outputs={"outlet": fp.Output("K", lambda q, p: q.outlet)})
-    short = replace(task.problem, duration=60.0, measure_from=0.0)
-    exact = task.controllers["static inverse, exact map"]
-    plain, run = (simulated(p, exact) for p in (short, replace(short, plant=spelled)))
-    assert np.array_equal(plain["command"], run["command"])
-
-
-def test_a_disturbed_coordinate_that_is_an_output_keeps_the_inverse_of_the_user() -> None:
-    """The turbojet's offset-free plan, with its temperature as an output: the same bits."""
-    task = fp.load_problem("turbojet")
-    plant, cost = task.problem.plant, task.problem.cost
-    outputs = {n: fp.Output(unit, lambda q, v, p, *, n=n: q[n]) for n, unit in plant.coordinates.items()}
-    assert isinstance(cost, fp.Quadratic)
-    short = replace(task.problem, duration=20 * task.problem.period, measure_from=0.0)
-    spelled = replace(short, plant=replace(plant, outputs=outputs), cost=replace(cost, states={}, outputs=cost.states))
-    plain, run = (simulated(p, task.controllers["RHC offset-free"]) for p in (short, spelled))
-    assert np.array_equal(plain["command"], run["command"])
-
-
 def estimating(inner: Controller, *numbers: Mapping[str, float]) -> Callable[[], object]:
     return lambda: simulated(sedated(hill(5.5)), fp.Estimating(inner, fp.DisturbanceKalman(*numbers)))
 

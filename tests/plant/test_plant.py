@@ -74,33 +74,6 @@ def test_user_inverse_is_used():
     assert float(plant.equations.inverse([0.0], [np.e], [])) == pytest.approx(1.0)
 
 
-def test_an_over_actuated_plant_is_one_command_with_shares():
-    """What the refusal advises: two jets of 3 : 1 as one command have the errors of one jet of their sum."""
-
-    def jets(share: float) -> fp.Plant:
-        return fp.Plant(
-            coordinates={"y": "m"},
-            inputs={"thrust": "N"},
-            order=2,
-            parameters={"m": fp.Parameter(1.3, 1.0, "kg")},
-            response=lambda _q, _v, u, p: {"y": (share * u.thrust + (1 - share) * u.thrust) / p.m},
-        )
-
-    errors = []
-    for share in (1.0, 0.75):
-        problem = fp.Problem(
-            plant=jets(share),
-            reference=fp.Trajectory(lambda t: {"y": ca.sin(t)}),
-            start={"y": 0.0},
-            period=0.01,
-            duration=2.0,
-        )
-        law = fp.ComputedTorque(fp.Exponential(rate=5.0), fp.ModelReferenced(fp.Affine(gain=-1.0)))
-        errors.append(fp.measure(problem, fp.simulate(problem, law, seed=0, compiled=False)).rms_error["y"])
-    assert 0 < errors[1] < 0.1
-    assert errors[1] == pytest.approx(errors[0], rel=1e-9)
-
-
 def test_published_inertia_and_gravity_load_of_the_puma():
     """At the posture (0, 45, 180, 0, 45, 0) deg without load; numbers as P. Corke's toolbox prints them (from memory)."""
     plant = fp.load_problem("puma560").problem.plant

@@ -94,39 +94,6 @@ def outcome(problem: fp.Problem, controller: Controller) -> fp.Run | type[Fpirhc
         return type(error)
 
 
-def test_limits_inside_a_stage_of_several_steps_are_those_of_the_state():
-    """The level of a tank after each step of a map, where the pump is called level too."""
-    stages = []
-    for pump in ("level", "pump"):
-
-        def later(x, u, p, pump=pump):
-            del p
-            return {"level": x.level + 0.1 * x.flow, "flow": x.flow + 0.1 * getattr(u, pump)}
-
-        plant = fp.Plant.discrete(
-            states={"level": "m", "flow": "m/s"},
-            inputs={pump: "m/s^2"},
-            parameters={},
-            next=later,
-            step=0.1,
-            outputs={"depth": fp.Output("m", lambda x, _: x.level)},
-        )
-        one = fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(lambda t: {"depth": 1.0 + 0 * t}),
-            start={"level": 0.5, "flow": 3.0},
-            period=0.1,
-            duration=1.0,
-            horizon=fp.Horizon(stages=2, step=0.3),
-            cost=fp.Quadratic(outputs={"depth": 1.0}),
-            limits=fp.Limits(states={"level": (-1.0, 1.05)}),
-        )
-        stages.append(fp.simulate(one, fp.RecedingHorizon(fp.FixedPoint(10, 1e-6)), seed=0, compiled=False))
-    for name in ("state", "command", "planned"):
-        np.testing.assert_array_equal(stages[0][name], stages[1][name])
-    assert stages[0]["state.level"].max() < 1.05 + 1e-4  # 1.2 without the limit
-
-
 def test_disturbances_act_where_they_are_said_to():
     """With the disturbance of one kind alone the run differs from that with the other one."""
     runs = [

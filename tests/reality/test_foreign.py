@@ -13,8 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.drives import CONTROLLERS, MEASURES, PAIRS, SENSING, TAU, Wrapped, lagged, run, task
-from helpers.faults import Failing
+from helpers.drives import CONTROLLERS, MEASURES, PAIRS, SENSING, Wrapped, lagged, run, task
 
 import fpirhc as fp
 from fpirhc.contracts import Deformation
@@ -212,46 +211,12 @@ def test_contraction_is_identified_where_the_response_is_measured():
     assert np.allclose(result["contraction"], 1 - controller.deformation.effective_gain() * 2.0, atol=0.02)
 
 
-def test_lagged_body_is_the_lagged_reality():
-    """An actuator outside is what an actuator in symbols is: two ways to the same run."""
-    problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}, integrator=fp.RungeKutta4(substeps=8)))
-
-    class Actuated(Wrapped):
-        """Y'' = 2 F, F exactly exponential within a cycle, y by the closed form."""
-
-        force = 0.0
-
-        def step(self, time, command):
-            """The closed form of one cycle."""
-            del time
-            h, gap = self.problem.period, self.force - command[0]
-            decay = np.exp(-h / TAU)
-            moved = TAU * gap * (1 - decay)
-            y = self.x[0] + h * self.x[1] + 2.0 * (command[0] * h**2 / 2 + TAU * (gap * h - moved))
-            self.x = np.array([y, self.x[1] + 2.0 * (command[0] * h + moved)])
-            self.force = command[0] + gap * decay
-            return self._answer(np.array([self.force]))
-
-    controller = CONTROLLERS["plain form"]
-    one = run(problem, controller)
-    other = run(replace(problem, reality=fp.ExternalPlant(Actuated(task()), MEASURES)), controller)
-    assert np.abs(one["command"] - other["command"]).max() < 1e-6 * np.abs(one["command"]).max()
-
-
 def test_a_gain_that_changes_during_a_run_acts_from_that_cycle_on():
     """The commands before are those of the run without the change."""
     ready = fp.simulator(outside(task(duration=0.1)), CONTROLLERS["plain form"], compiled=False, live=["tracking.rate"])
     before, after = (ready.run(seed=0, changes=one)["command.u"] for one in (None, {0.05: {"tracking.rate": 12.0}}))
     assert np.array_equal(before[:50], after[:50])
     assert np.abs(after[50:] - before[50:]).max() > 0.1 * np.abs(before).max()
-
-
-def test_solver_that_fails_ends_the_run():
-    """The reason is the solver's last line; the cycles before are kept."""
-    failing = fp.RecedingHorizon(Failing(iterations=1, tolerance=1e-3, at=3))
-    result = run(outside(task(duration=0.1)), failing)
-    assert re.search(r"a solver failed \(OSQP failed\) at t = 0.0\d+ s", str(result.stop))
-    assert 0 < result.cycles < 100
 
 
 # Physical ranges

@@ -142,14 +142,6 @@ def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
         run(task(reality=fp.Reality(lagged(gain=-2.0), start={"F": 0.0})), CONTROLLERS["plain form"])
 
 
-def test_the_named_sub_steps_would_do():
-    """With five sub-steps the stiff lag moves as its exact discretisation, and the run is finite."""
-    reality = fp.Reality(lagged(tau=1e-4), start={"F": 0.0}, integrator=fp.RungeKutta4(substeps=5))
-    result = run(task(reality=reality))
-    assert result.stop is None
-    assert np.allclose(result["reality_state.F"][1:], np.asarray(result["command"])[:-1, 0], rtol=1e-3, atol=1e-3)
-
-
 def test_comparison_and_report_show_what_moves(tmp_path):
     """Its own states are on the page, and the factor of the iteration is that of a whole cycle."""
     problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}))
@@ -249,15 +241,6 @@ def test_the_belief_is_nobodys_state():
     assert np.ptp(result["state.c2"]) > 0.1
     for own in ("fast", "slow"):
         assert np.abs(result["state.c2"] - result[f"reality_state.{own}"]).max() > 0.5
-
-
-def test_adaptation_helps_where_the_model_has_too_few_states():
-    """The response is measured, so the deformation sees what the model lacks: the error is four times smaller."""
-    problem = other(measure_from=2.0)
-    errors = [
-        fp.measure(problem, run(problem, replace(BLOOD, deformation=d))).rms_error["c1"] for d in (fp.Identity(), DRUG)
-    ]
-    assert errors[1] < 0.25 * errors[0]
 
 
 def test_no_cost_of_states_that_do_not_exist():

@@ -84,24 +84,6 @@ def test_sample_outside_the_domain_is_a_skipped_tick(name):
     assert changed == {"clock", "skipped_before", "not_finite"}
 
 
-@needs_compiler
-@pytest.mark.parametrize("name", ["Sigmoid-0", "plan"])
-def test_compiled_code_skips_alike(name):
-    """C and the virtual machine hold, keep and go on alike, also over many such samples."""
-    name = next(n for n in CONTROLLERS if n.startswith(name.partition("-")[0]))
-    steppers = [fp.Stepper(TANK, CONTROLLERS[name], compiled=c) for c in (False, True)]
-    assert [s.compiled for s in steppers] == [False, True]
-    times, rows = measurements()
-    memories = [s.start() for s in steppers]
-    for k in range(80):
-        row = rows[k] * [0, 1] + [BELOW, 0] if k in {0, 30} or 40 <= k < 65 else rows[k]
-        results = [s.step_measured(times[k], row, m) for s, m in zip(steppers, memories, strict=True)]
-        memories = [memory for _, memory in results]
-        np.testing.assert_allclose(results[0][0], results[1][0], rtol=1e-9, atol=1e-12, equal_nan=False)
-        assert len({status(s) for s in steppers}) == 1
-        assert (status(steppers[0]) == fp.Status.NON_FINITE) == (row[0] < 0)
-
-
 def test_what_was_learned_survives_a_sensor_below_the_bottom():
     """However long the sensor is wrong: trials with the memory of the start fail too, so the memory is not at fault."""
     stepper = fp.Stepper(TANK, fp.ComputedTorque(TRACK, SHAPE), compiled=False)

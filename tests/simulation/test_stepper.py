@@ -85,17 +85,6 @@ def test_results_are_nobody_elses():
     np.testing.assert_array_equal(one.step(*SAMPLE, one.start())[0], kept[0])
 
 
-def test_the_command_is_that_of_the_law():
-    """The law is q'' = w^2 e - 2 w q', the command u = m (q'' + 2 q), clipped at its limits."""
-    law = fp.Exponential(rate=4.0, integral=False)
-    one = small(controller=fp.ComputedTorque(law))
-    command, memory = one.step(*SAMPLE, one.start())
-    wanted = 16.0 * (0.2 - 0.1) - 8.0 * 0.3
-    assert command == pytest.approx([1.2 * (wanted + 2.0 * 0.1)])
-    far, _ = one.step(0.01, np.array([1.6, 0.3]), SAMPLE[2], memory)
-    assert far == pytest.approx([-20.0])
-
-
 def test_raw_measurements_are_given_in_their_order():
     """States and then responses where nothing is estimated; with estimators what the sensors show."""
     one = small()

@@ -191,16 +191,6 @@ def test_who_is_told_what():
     assert np.array_equal(exact["state"], right["state"])
 
 
-def test_unknown_weather_is_what_adaptation_is_for():
-    """The deformation learns the missing heat: the same law with FPI is more than twice as good."""
-    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Unknown(FRONT)}, measure_from=5.0)
-    errors = {
-        n: np.sqrt(np.mean(run(problem, CONTROLLERS[n])["error.air"][20:] ** 2))
-        for n in ("CTC", "CTC+model-referenced")
-    }
-    assert errors["CTC+model-referenced"] < 0.5 * errors["CTC"]
-
-
 def test_a_reality_may_have_signals_that_the_model_does_not_have():
     """The sun shines on the reality alone; both have the weather."""
 

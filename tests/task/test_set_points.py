@@ -248,20 +248,6 @@ def test_slots_need_the_order_of_their_chain():
         fp.simulate(problem, task.controllers["slots"], seed=0, compiled=False)
 
 
-def test_a_higher_filter_makes_a_step_smooth():
-    """With the plant's order the command jumps by about m a^2 change; with one order more it goes on as it was."""
-    steps = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": 5.4}
-    jumps = []
-    for order in (2, 3):
-        run = fp.simulate(
-            two_mass(values=steps, order=order), tasks.two_mass.controllers["CTC"], seed=0, compiled=False
-        )
-        jumps.append(abs(np.diff(run["command.Q1"])[99]))
-    mass = tasks.two_mass.problem.plant.parameters["m1"].approximate
-    assert jumps[0] == pytest.approx(mass * 10.0**2 * 0.2, rel=0.02)
-    assert jumps[1] < 0.02 * jumps[0]
-
-
 def test_predicted_says_that_set_points_are_late():
     """With dead time the plant follows later by it; without adaptation errors it is the same motion, shifted."""
     task = fp.load_problem("delayed_mass")
