@@ -6,6 +6,8 @@ docs/extending.md has an example of each; `fpirhc.conformance` has the laws.
 from fpirhc.controllers.base import closing_blocks as closing_blocks
 from fpirhc.controllers.base import like as like
 from fpirhc.controllers.base import reference_block as reference_block
+from fpirhc.controllers.built import Built as Built
+from fpirhc.controllers.built import build as build
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import ControllerWrapper as ControllerWrapper
 from fpirhc.controllers.contract import PlantModel as PlantModel

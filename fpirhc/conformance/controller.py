@@ -16,6 +16,7 @@ import numpy.typing as npt
 from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
 from fpirhc.conformance.loops import REPLAYED, Replay, Trial, coarse_steps, spelled_by_states, two_masses
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.built import build
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.composed import compose_controller
 from fpirhc.controllers.contract import resolved, tracking_law, with_optimiser
@@ -76,7 +77,7 @@ def deformation_acts(trial: Trial, generator: np.random.Generator) -> None:  # n
         any(differ),
         f"with half of the effective gain {deformation.effective_gain():.3g} its commands are the same in the first "
         f"{len(trial.replay.commands)} cycles of a run with a wrong model; use the deformation, "
-        "closing_blocks(problem, self.deformation)",
+        "closing_blocks(built, self.deformation)",
     )
 
 
@@ -302,7 +303,7 @@ def facts_hold(trial: Trial, generator: np.random.Generator) -> None:  # noqa: A
 
 def writes_a_command_and_a_status(trial: Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """A cycle writes what every run logs: reference, error, desired, deformed, command, clipped, status."""
-    written = compose_controller(trial.problem, trial.controller).trace
+    written = compose_controller(build(trial.problem, trial.controller)).trace
     expected = ("reference", "error", "desired", "deformed", "command", "clipped", "status")
     missing = [name for name in expected if name not in written]
     hold(not missing, f"its blocks do not write {missing}; end them with closing_blocks()")

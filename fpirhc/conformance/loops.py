@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.built import build
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.composed import compose_controller
 from fpirhc.horizon.cost import Quadratic
@@ -162,7 +163,7 @@ class Replay:
 
     @cached_property
     def _composite(self) -> Composite:
-        return compose_controller(self.problem, self.controller)
+        return compose_controller(build(self.problem, self.controller))
 
     @cached_property
     def _evaluator(self) -> Evaluator:

@@ -13,10 +13,10 @@ from functools import reduce
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
-from fpirhc.controllers.path import believed_path, model_block
-from fpirhc.controllers.reference_states import largest_response, motion_of, own_signals, own_values
+from fpirhc.controllers.path import model_block
 from fpirhc.deformation.base import Deformation, LastRequest
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.motion import followed_units, time_signal
@@ -60,26 +60,21 @@ def under_names(block: Block, names: Mapping[str, str]) -> Block:
     return replace(block, reads=reads, writes=writes, memory=memory, step=step)
 
 
-def reference_block(problem: Problem) -> Block:
+def reference_block(built: Built) -> Block:
     """Block (time, state or outputs) -> (their reference, response of the controlled ones, error of the judged ones)."""
-    plant, seen = problem.plant, problem.plant.output
-    function = motion_of(problem)
-    places = [seen.elements.index(c) for c in problem.judged_names]
+    plant, seen, places = built.plant, built.plant.output, list(built.judged)
 
     def step(s: Signals) -> dict[str, Expression]:
-        own = own_values(problem, s)
-        state, response = function(s.time, *own)
-        return {
-            "reference": state,
-            "_reference_response": nominal_responses(
-                plant, state, response, lambda: motion_of(problem, ahead=problem.period)(s.time, *own)[0]
-            ),
-            "error": state[places] - getattr(s, seen.name)[places],
-        }
+        own = built.own_values(s)
+        outputs, response = built.motion(s.time, *own)
+        wanted = nominal_responses(plant, outputs, response, lambda: built.later(s.time, *own)[0])
+        error = outputs[places] - getattr(s, seen.name)[places]
+        return {"reference": outputs, "_reference_response": wanted, "error": error}
 
-    reads = Layout((time_signal(plant), seen, *own_signals(problem)))
-    writes = (like(seen, "reference"), plant.response_signal("_reference_response"), error_signal(problem, "error"))
-    return Block("reference", reads, Layout(writes), step, opaque=problem.reference.opaque)
+    reads = Layout((time_signal(plant), seen, *built.own))
+    error = error_signal(built.problem, "error")
+    writes = Layout((like(seen, "reference"), plant.response_signal("_reference_response"), error))
+    return Block("reference", reads, writes, step, opaque=built.problem.reference.opaque)
 
 
 def error_signal(problem: Problem, name: str) -> Signal:
@@ -95,29 +90,27 @@ def rename(name: str, source: Signal, target: Signal) -> Block:
 
 
 def closing_blocks(
-    problem: Problem, deformation: Deformation, judged: Sequence[Signal] = ()
+    built: Built, deformation: Deformation, judged: Sequence[Signal] = ()
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks deform, invert, limit, judge and running with what they remember; `judged` are solver statuses."""
-    plant = problem.plant
-    closing, delays = commanding_blocks(problem, judged)
-    deform = deform_block(plant, deformation, problem.warm_up_cycles, largest_response(problem))
+    plant = built.plant
+    closing, delays = commanding_blocks(built, judged)
+    deform = deform_block(plant, deformation, built.warm_up, built.largest)
     last = plant.response_signal(_REQUEST)
     before, remembered = (
-        ([], [Delay(last, "deformed")])
-        if last.name in deform.reads
-        else ([model_block(believed_path(problem, deformation))], [])
+        ([], [Delay(last, "deformed")]) if last.name in deform.reads else ([model_block(built.path(deformation))], [])
     )
     return [*before, deform, invert_block(plant), *closing], [*delays, *remembered]
 
 
-def commanding_blocks(problem: Problem, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
+def commanding_blocks(built: Built, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
     """Return the blocks limit, judge and running with what they remember, for a controller that writes 'command_unclipped'.
 
     The controller also writes 'desired', and '_deformed_unclipped': the response that its model expects of this command.
     `judged` are solver statuses.
     """
-    delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(command_before(problem), "command")]
-    return [_limit_block(problem), _judge_block(judged), warm_up_block(problem.warm_up_cycles)], delays
+    delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(built.before, "command")]
+    return [_limit_block(built), _judge_block(judged), warm_up_block(built.warm_up)], delays
 
 
 def warm_up_block(warm_up_cycles: float) -> Block:
@@ -190,9 +183,9 @@ def invert_block(plant: Plant) -> Block:
     )
 
 
-def _limit_block(problem: Problem) -> Block:
-    plant = problem.plant
-    lower, upper = problem.limits.input_ends(plant)
+def _limit_block(built: Built) -> Block:
+    plant = built.plant
+    lower, upper = built.ends
     meaning = _meaning(plant)
     reads = (
         like(plant.input, "command_unclipped"),
@@ -209,7 +202,7 @@ def _limit_block(problem: Problem) -> Block:
         # Finiteness is checked before the clamp: fmin and fmax turn NaN into a full-scale command.
         finite = is_finite(s.command_unclipped)
         safe = ca.if_else(finite, s.command_unclipped, s._command_before)
-        command = clip(_within_rates(problem, safe, s._command_before), lower, upper)
+        command = clip(_within_rates(built, safe, s._command_before), lower, upper)
         clipped_request = meaning(s.state, command, safe, s._deformed_unclipped, s.parameters)
         return {
             "command": command,
@@ -222,11 +215,11 @@ def _limit_block(problem: Problem) -> Block:
     return Block("limit", Layout(reads), Layout(writes), step)
 
 
-def _within_rates(problem: Problem, command: Expression, before: Expression) -> Expression:
+def _within_rates(built: Built, command: Expression, before: Expression) -> Expression:
     """The command as far as hard limits of rates let it go in a cycle."""
     entries = []
-    for k, ends in enumerate(np.transpose(problem.limits.rate_bounds(problem.plant))):
-        low, high = (before[k] + problem.period * float(end) if math.isfinite(end) else None for end in ends)
+    for k, ends in enumerate(np.transpose(built.problem.limits.rate_bounds(built.plant))):
+        low, high = (before[k] + built.period * float(end) if math.isfinite(end) else None for end in ends)
         entry = command[k] if low is None else ca.fmax(command[k], low)
         entries.append(entry if high is None else ca.fmin(entry, high))
     return ca.vertcat(*entries)
@@ -267,51 +260,45 @@ def _judge_block(judged: Sequence[Signal]) -> Block:
     return Block("judge", reads, Layout((scalar("status"),)), step)
 
 
-def command_before(problem: Problem) -> Signal:
-    """Return the signal of the last command; in the first cycle it is the input before it."""
-    plant = problem.plant
-    return Signal("_command_before", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
-
-
 def like(signal: Signal, name: str) -> Signal:
     """Return a signal of the same shape and units under another name."""
     return Signal(name, signal.elements, signal.units)
 
 
-def bounded(problem: Problem, tracking: Tracking) -> Tracking:
+def bounded(built: Built, tracking: Tracking) -> Tracking:
     """Return the law with its memory bounded by what the problem's limits can need."""
-    return tracking.within(largest_response(problem))
+    return tracking.within(built.largest)
 
 
-def desired_blocks(problem: Problem, tracking: Tracking) -> list[Block]:
+def desired_blocks(built: Built, tracking: Tracking) -> list[Block]:
     """Return the blocks reference, target, nominal and tracking: together they write 'desired'."""
-    plant = problem.plant
+    plant = built.plant
     return [
-        reference_block(problem),
+        reference_block(built),
         rename("target", like(plant.output, "reference"), like(plant.output, "_target")),
         rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-        bounded(problem, tracking).law(plant, problem.period),
+        bounded(built, tracking).law(plant, built.period),
     ]
 
 
-def tracked_blocks(problem: Problem, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
+def tracked_blocks(built: Built, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
     """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
-    return _between(problem, tracking, closing_blocks(problem, deformation))
+    return _between(built, tracking, closing_blocks(built, deformation))
 
 
-def law_blocks(problem: Problem, tracking: Tracking, *law: Block) -> tuple[list[Block], list[Delay]]:
+def law_blocks(built: Built, tracking: Tracking, *law: Block) -> tuple[list[Block], list[Delay]]:
     """Return the blocks reference, tracking, those of a law without a deformation, limit, judge, running and tracking update.
 
     The law reads 'desired' and writes 'command_unclipped' and '_deformed_unclipped'; see `commanding_blocks`.
     """
-    closing, delays = commanding_blocks(problem)
-    return _between(problem, tracking, ([*law, *closing], delays))
+    closing, delays = commanding_blocks(built)
+    return _between(built, tracking, ([*law, *closing], delays))
 
 
 def _between(
-    problem: Problem, tracking: Tracking, closing: tuple[list[Block], list[Delay]]
+    built: Built, tracking: Tracking, closing: tuple[list[Block], list[Delay]]
 ) -> tuple[list[Block], list[Delay]]:
     """The blocks between those of the desired response and the update of the tracking law."""
-    plant, (blocks, delays) = problem.plant, closing
-    update = bounded(problem, tracking).update(plant, problem.period)
-    return [*desired_blocks(problem, tracking), *blocks, update], [*delays, *tracking.delays(plant)]
+    plant, (blocks, delays) = built.plant, closing
+    update = bounded(built, tracking).update(plant, built.period)
+    return [*desired_blocks(built, tracking), *blocks, update], [*delays, *tracking.delays(plant)]

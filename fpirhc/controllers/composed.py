@@ -10,9 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fpirhc.controllers.base import Controller, like
-from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import given_response
+from fpirhc.controllers.base import like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.observable import check_believed
 from fpirhc.controllers.path import (
     ACTED,
@@ -20,72 +19,61 @@ from fpirhc.controllers.path import (
     MEASURED_OUTPUT,
     MEASURED_TIME,
     NOW,
-    Told,
     measured_output,
     measured_state,
 )
-from fpirhc.controllers.reference_states import given_signals, with_reference
-from fpirhc.controllers.seeing import given_states, raw_signal, seeing_blocks
+from fpirhc.controllers.reference_states import with_reference
+from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose
-from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.task.problem import Problem
 
 _LATEST: Latest[Composite] = Latest(4)
 
 
-def compose_with_sensing(problem: Problem, controller: Controller) -> Composite:
+def compose_with_sensing(built: Built) -> Composite:
     """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
 
     Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
     """
-    return _LATEST.of((problem, controller), (plans_are_compiled(),), lambda: _composed(problem, controller))
+    return _LATEST.of((built,), (), lambda: _composed(built))
 
 
-def _composed(problem: Problem, controller: Controller) -> Composite:
-    raw = raw_signal(problem)
-    if raw is None:
-        return compose_controller(problem, controller)
-    ready = checked(problem, controller)
-    blocks, delays = _blocks_of(problem, ready)
-    check_believed(problem, ready)
-    seeing, seen = seeing_blocks(problem)
-    time, *others = controller_reads(problem, ready).signals
-    reads = Layout((time, *given_states(problem), raw, *others[1 + len(measured_signals(problem.plant)) :]))
-    return _informed(problem, ready, reads, [*seeing, *_with_measured(problem.plant, blocks)], [*delays, *seen])
+def _composed(built: Built) -> Composite:
+    if built.raw is None:
+        return compose_controller(built)
+    blocks, delays = _blocks_of(built)
+    check_believed(built.problem, built.controller)
+    seeing, seen = seeing_blocks(built.problem)
+    time, *others = _reads(built).signals
+    reads = Layout((time, *built.states, built.raw, *others[1 + len(measured_signals(built.plant)) :]))
+    return _informed(built, reads, [*seeing, *_with_measured(built.plant, blocks)], [*delays, *seen])
 
 
-def controller_reads(problem: Problem, controller: Controller) -> Layout:
-    """Return what a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
-    plant, response = problem.plant, given_response(problem, controller)
+def _reads(built: Built) -> Layout:
+    """What a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
+    plant, response = built.plant, built.response
     realised = response.signal if response else plant.response_signal("realised")
-    parameters = controller.plant_model(problem).plant.parameter
-    return Layout((time_signal(plant), *measured_signals(plant), realised, parameters, *given_signals(problem)))
+    return Layout((time_signal(plant), *measured_signals(plant), realised, built.model.plant.parameter, *built.given))
 
 
-def compose_controller(problem: Problem, controller: Controller, *, ahead: bool = False) -> Composite:
+def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
     """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
 
-    Args:
-        problem: that the controller is composed for.
-        controller: checked here against the problem.
-        ahead: whether time and state are those at which the command will act. The step then also reads the measured state, its
-            time, and the signals of the last cycle, where a block needs them.
+    `ahead`: whether time and state are those at which the command will act. The step then also reads the measured state, its time,
+    and the signals of the last cycle, where a block needs them.
     """
-    ready = checked(problem, controller)
-    blocks, delays = _blocks_of(problem, ready)
-    reads = controller_reads(problem, ready)
+    blocks, delays = _blocks_of(built)
     if ahead:
-        reads = reads + Layout(_measured_reads(problem.plant, blocks))
-        return _informed(problem, ready, reads, blocks, delays, ahead=True)
-    return _informed(problem, ready, reads, _with_measured(problem.plant, blocks), delays)
+        reads = _reads(built) + Layout(_measured_reads(built.plant, blocks))
+        return _informed(built, reads, blocks, delays, ahead=True)
+    return _informed(built, _reads(built), _with_measured(built.plant, blocks), delays)
 
 
 def dependencies_of_command(step: Composite) -> frozenset[str]:
@@ -96,8 +84,8 @@ def dependencies_of_command(step: Composite) -> frozenset[str]:
     return frozenset(name for k, name in reads if any(function.jac_sparsity(one, k).nnz() for one in results))
 
 
-def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], list[Delay]]:
-    given: object = controller.blocks(problem)
+def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
+    given: object = built.controller.blocks(built)
     pair = given if isinstance(given, tuple) and len(given) == 2 else None
     kinds = (Block, Delay)
     if pair is None or not all(
@@ -105,26 +93,19 @@ def _blocks_of(problem: Problem, controller: Controller) -> tuple[list[Block], l
         for part, kind in zip(pair, kinds, strict=True)
     ):
         raise InvalidProblem(
-            f"{type(controller).__name__}.blocks(problem) must return two lists (blocks, delays), got {described(given)}"
+            f"{type(built.controller).__name__}.blocks(built) must return two lists (blocks, delays), got {described(given)}"
         )
-    return with_reference(problem, pair[0]), list(pair[1])
+    return with_reference(built.problem, pair[0]), list(pair[1])
 
 
 def _informed(
-    problem: Problem,
-    ready: Controller,
-    reads: Layout,
-    blocks: Sequence[Block],
-    delays: Sequence[Delay],
-    *,
-    ahead: bool = False,
+    built: Built, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay], *, ahead: bool = False
 ) -> Composite:
     """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
 
     `ahead`: whether the time is the one at which the command will act.
     """
-    model = ready.plant_model(problem)
-    told = Told(model.plant, model.signals, problem.period)
+    told = built.told
     compares = any(ACTED in block.reads for block in blocks)
     first = told.block(remembers=compares and not ahead)
     if first is None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, tracked_blocks
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
@@ -37,8 +38,8 @@ class ComputedTorque(Controller):
     tracking: Tracking
     deformation: Deformation = field(default_factory=Identity)
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return tracked_blocks(problem, self.tracking, self.deformation)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return tracked_blocks(built, self.tracking, self.deformation)
 
 
 _SEEN = "_seen_status"
@@ -66,13 +67,13 @@ class FeedforwardOnly(Undeformed):
                 "errors would add up; use a controller with a tracking law",
             )
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        closing, delays = commanding_blocks(problem, [scalar(_SEEN)])
-        return [reference_block(problem), self._block(problem), *closing], delays
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        closing, delays = commanding_blocks(built, [scalar(_SEEN)])
+        return [reference_block(built), self._block(built), *closing], delays
 
-    def _block(self, problem: Problem) -> Block:
+    def _block(self, built: Built) -> Block:
         """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
-        plant, wanted = problem.plant, problem.plant.response_signal("_reference_response")
+        plant, wanted = built.plant, built.plant.response_signal("_reference_response")
         inverse, response = plant.equations.inverse, plant.equations.controlled_response
         known = plant.equations.known_on_reference
 

@@ -33,6 +33,7 @@ from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
 from fpirhc.tracking.base import Tracking
 
 if TYPE_CHECKING:
+    from fpirhc.controllers.built import Built
     from fpirhc.optimisers.base import Optimiser
 
 Deforms = Literal["response", "command", "target"]
@@ -169,7 +170,7 @@ class Controller(Checked, ABC):
             )
 
     @abstractmethod
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of one control cycle, from (time, state, realised, parameters) to 'command', and what they remember."""
 
     def inner_problem(self, problem: Problem) -> Problem:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, closing_blocks, command_before, like, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.reference_states import own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import (
@@ -40,7 +41,7 @@ from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
 from fpirhc.symbolic.open import PREFIX, expressed, is_open, nominal, numbers, open_numbers, smallest
 from fpirhc.task.exogenous import previewed_values
-from fpirhc.task.problem import Problem, cycles_per_plan
+from fpirhc.task.problem import Problem
 
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
@@ -88,17 +89,15 @@ class RecedingHorizon(Controller):
         _room(problem, self.replanning)
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        task, problem = problem, self.planner.planned(problem)
-        assert problem.horizon is not None
-        plant = problem.plant
-        cycles = cycles_per_plan(problem.horizon, problem.period)
-        before, after, late, remembered = self.replanning.parts(problem)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        problem, plant, cycles = built.planned, built.plant, built.every
+        assert problem is not None
+        before, after, late, remembered = self.replanning.parts(built)
         room = _room(problem, self.replanning)
-        same = task, self.optimiser, self.replanning, self.cost, self.margins
+        same = built.problem, self.optimiser, self.replanning, self.cost, self.margins
         others = self.deformation.adapts, self.follows_model, plans_are_compiled()
         plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
-        closing, delays = closing_blocks(problem, self.deformation, [scalar("_solve_status")])
+        closing, delays = closing_blocks(built, self.deformation, [scalar("_solve_status")])
         if self.planner.starts_consistent(plant):
             before, after = (at_consistent_start(plant, some) for some in (before, after))
             before = [consistent_start(plant), *before]
@@ -106,12 +105,12 @@ class RecedingHorizon(Controller):
         if self.follows_model:
             held, own = held_model(problem)
             after, delays = [held, *(as_planned(block, problem) for block in after)], [*delays, own]
-        blocks = [reference_block(problem), _due_block(cycles), *before, plan, *after, *closing, *late]
+        blocks = [reference_block(built), _due_block(cycles), *before, plan, *after, *closing, *late]
         delays = [*delays, *remembered]
         blocks.append(_command_shift_block(problem, self.deformation))
         delays.append(Delay(like(plant.input, "_command_shift_last"), "command_shift"))
         if room is not None:
-            delays.append(Delay(replace(command_before(problem), name=_PLANNED_BEFORE), "planned"))
+            delays.append(Delay(replace(built.before, name=_PLANNED_BEFORE), "planned"))
         return blocks, delays
 
 

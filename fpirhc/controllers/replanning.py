@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import fed, like
-from fpirhc.controllers.reference_states import largest_response
+from fpirhc.controllers.built import Built
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.nominal import consistent_state
@@ -57,7 +57,7 @@ class Replanning(Checked, ABC):
         return None
 
     @abstractmethod
-    def parts(self, problem: Problem) -> Parts:
+    def parts(self, built: Built) -> Parts:
         """Return the blocks before the plan, after the plan, and after the command is limited; and what is remembered."""
 
 
@@ -75,8 +75,8 @@ class FromMeasurement(Replanning):
 
     restarts = True
 
-    def parts(self, problem: Problem) -> Parts:
-        plant = problem.plant
+    def parts(self, built: Built) -> Parts:
+        plant = built.plant
         start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
         response = without_disturbances(plant).equations.controlled_response
         reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
@@ -107,24 +107,24 @@ class FromPlan(Replanning):
 
     restarts = False
 
-    def parts(self, problem: Problem) -> Parts:
+    def parts(self, built: Built) -> Parts:
         def start(s: Signals) -> dict[str, Expression]:
             target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
             return {"_plan_state": target, _FOLLOWED: target}
 
-        return _tracked(problem, self.tracking, start)
+        return _tracked(built, self.tracking, start)
 
 
 _FOLLOWED = "_followed_state"  # of the model on the planned motion
 
 
-def _tracked(problem: Problem, tracking: Tracking, start: Callable[[Signals], dict[str, Expression]]) -> Parts:
-    plant = problem.plant
-    law = tracking.within(largest_response(problem))
+def _tracked(built: Built, tracking: Tracking, start: Callable[[Signals], dict[str, Expression]]) -> Parts:
+    plant = built.plant
+    law = tracking.within(built.largest)
     begin = _choose("plan_state", plant, start, ["_plan_state", _FOLLOWED])
     delay = Delay(like(plant.state, "_target_before"), "target")
-    after = [_propagate(plant, problem.period), law.law(plant, problem.period)]
-    return [begin], after, [law.update(plant, problem.period)], [delay, *law.delays(plant)]
+    after = [_propagate(plant, built.period), law.law(plant, built.period)]
+    return [begin], after, [law.update(plant, built.period)], [delay, *law.delays(plant)]
 
 
 def _choose(name: str, plant: Plant, step: Callable[[Signals], dict[str, Expression]], writes: list[str]) -> Block:

@@ -7,17 +7,16 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
-from fpirhc.controllers.contract import Undeformed, given_response
+from fpirhc.controllers.contract import PlantModel, Undeformed, given_response
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.reference_states import given_signals
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import (
@@ -52,19 +51,19 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
-    ready = checked(problem, controller)
-    mover, lost, inner = moving(problem), lost_blocks(problem), compose_with_sensing(problem, ready)
+    built = build(problem, controller)
+    mover, lost, inner = moving(problem), lost_blocks(problem), compose_with_sensing(built)
     ranges, samples = sensor_ranges(problem), known_samples(problem) if loses(problem) else 0
     acting = Gate(problem, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = disturbance_signals(problem)
-    seeing = sensing_blocks(problem, given_response(problem, ready), predicts="state_ahead" in acting.inner.trace)
+    seeing = sensing_blocks(problem, built.response, predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(problem, disturbed)
-    around = [clock, *outside_blocks(problem, ready), *seeing, *lost, acting.block(), *judging, *actuating]
+    around = [clock, *outside_blocks(problem, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
-    reads = Layout((*disturbed, *problem.sensing.drawn, *given_signals(problem), *mover.reads))
-    return compose("loop", reads, around, [*_plant_delays(problem, ready), *constants], outputs=mover.sent)
+    reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
+    return compose("loop", reads, around, [*_plant_delays(problem, built.model), *constants], outputs=mover.sent)
 
 
 def start_memory(
@@ -80,13 +79,13 @@ def start_memory(
     if not problem.sees_plant:
         sensing = sensing_blocks(problem, given_response(problem, controller), predicts=False)
         remembered += [s for block in sensing for s in block.memory.signals]
-    remembered += [delay.now for delay in _plant_delays(problem, controller)]
+    remembered += [delay.now for delay in _plant_delays(problem, controller.plant_model(problem))]
     starts = {s.name: s.start_vector() for s in remembered}
     if numbers:
         live = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
         starts |= {name: value for name, value in live.items() if name in loop.memory}
     if INNER in loop.memory and plans_exactly(loop, problem, controller):
-        starts[INNER] = compose_with_sensing(problem, controller).memory.start()
+        starts[INNER] = compose_with_sensing(build(problem, controller)).memory.start()
     return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
 
 
@@ -110,9 +109,8 @@ def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.
     return {INNER: start}
 
 
-def _plant_delays(problem: Problem, controller: Controller) -> list[Delay]:
+def _plant_delays(problem: Problem, model: PlantModel) -> list[Delay]:
     """What moves carries from cycle to cycle, and the parameters that the model has during a run."""
-    model = controller.plant_model(problem)
     values, parameter = tuple(map(float, model.parameters(model.plant))), model.plant.parameter
     return [
         *moving(problem).delays,
@@ -136,10 +134,9 @@ HELD_INPUT = "_held_input"  # signal in the memory of the loop, with one entry p
 class HeldInput(Undeformed):
     """Sends the input that stands in its memory, within the limits."""
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant, (closing, delays) = problem.plant, commanding_blocks(problem)
-        before = tuple(map(float, problem.inputs_before))
-        held = Signal(HELD_INPUT, plant.input.elements, plant.input.units, before)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant, (closing, delays) = built.plant, commanding_blocks(built)
+        held = replace(built.before, name=HELD_INPUT)
         responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -148,4 +145,4 @@ class HeldInput(Undeformed):
 
         writes = Layout((*responses, like(plant.input, "command_unclipped")))
         hold = Block("hold", Layout((held, plant.state, plant.parameter)), writes, step)
-        return [reference_block(problem), hold, *closing], [*delays, Delay(held, HELD_INPUT)]
+        return [reference_block(built), hold, *closing], [*delays, Delay(held, HELD_INPUT)]

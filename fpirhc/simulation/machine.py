@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, fed, under_names
+from fpirhc.controllers.built import build
 from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, was_skipped
@@ -205,7 +206,7 @@ def composed_step(
     gates: list[Gate] = []
 
     def compose(problem: Problem, controller: Controller) -> Composite:
-        inner = compose_with_sensing(problem, controller)
+        inner = compose_with_sensing(build(problem, controller))
         samples = known_samples(live.problem)
         gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), max_age=max_age, samples=samples))
         return machine_step(live.problem, ready, gates[-1], monitor)

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Response, error_signal, like, rename
-from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.seeing import first_estimates, first_shown, sensor_ranges
@@ -510,10 +510,9 @@ def _difference(samples: Sequence[Expression], order: int) -> Expression:
 _REAL_NOW = "_exact_now"
 
 
-def outside_blocks(problem: Problem, controller: Controller) -> list[Block]:
+def outside_blocks(problem: Problem, known: PlantModel) -> list[Block]:
     """Return blocks that write the real parameters of this cycle, 'signals' and 'signals_told'; none without signals."""
-    real, known = problem.real_plant, controller.plant_model(problem)
-    model = known.plant
+    real, model = problem.real_plant, known.plant
     blocks = []
     if moving(problem).parameters == _REAL_NOW:
         values = real_values(real, problem.signals)

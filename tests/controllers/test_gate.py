@@ -42,8 +42,8 @@ class Counting(Controller):
     opaque: bool
     deformation: Deformation = field(default_factory=fp.Identity)
 
-    def blocks(self, problem):
-        plant = problem.plant
+    def blocks(self, built):
+        plant = built.plant
         reads = Layout((scalar("time", "s"), plant.state, plant.response_signal("realised")))
         memory = Layout((scalar("count"), scalar("total", start=7.0)))
 

@@ -23,8 +23,8 @@ class Around(Controller):
 
     other: Controller
 
-    def blocks(self, problem):
-        return self.other.blocks(problem)
+    def blocks(self, built):
+        return self.other.blocks(built)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,8 @@ class Alone(Controller):
 
     rate: float = 1.0
 
-    def blocks(self, problem):
-        del problem
+    def blocks(self, built):
+        del built
         return []
 
 
@@ -59,9 +59,9 @@ class Halfway(Controller):
     inner: Any
     deformation: Deformation = field(default_factory=fp.Identity)
 
-    def blocks(self, problem):
+    def blocks(self, built):
         """Those of the inner one."""
-        return self.inner.blocks(problem)
+        return self.inner.blocks(built)
 
 
 class Nothing(Controller):

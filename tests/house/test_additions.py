@@ -58,8 +58,8 @@ class Named(Controller):
     def deformation(self):
         return self.controller.deformation
 
-    def blocks(self, problem):
-        return self.controller.blocks(problem)
+    def blocks(self, built):
+        return self.controller.blocks(built)
 
 
 def examples(inner):

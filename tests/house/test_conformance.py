@@ -296,8 +296,8 @@ def test_what_a_class_raises_is_noted():
 
     @dataclass(frozen=True)
     class Broken(fp.ComputedTorque):
-        def blocks(self, problem):
-            return len(problem.plant.names) / 0
+        def blocks(self, built):
+            return len(built.plant.names) / 0
 
     with pytest.raises(ZeroDivisionError) as raised:
         check_controller(Broken(TRACKING), seed=1)

@@ -68,8 +68,8 @@ class Named(Controller):
     def deformation(self):
         return self.wrapped.deformation
 
-    def blocks(self, problem):
-        return self.wrapped.blocks(problem)
+    def blocks(self, built):
+        return self.wrapped.blocks(built)
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,13 @@ class Follower(Controller):
 
     deformation: Deformation = field(default_factory=fp.Identity)
 
-    def blocks(self, problem):
-        response = problem.plant.response_signal
-        closing, delays = closing_blocks(problem, self.deformation)
+    def blocks(self, built):
+        response = built.plant.response_signal
+        closing, delays = closing_blocks(built, self.deformation)
         wanted = response("_reference_response")
         both = Layout((response("nominal"), response("desired")))
         copy = Block("copy", Layout((wanted,)), both, lambda s: dict.fromkeys(both.names, s._reference_response))
-        return [reference_block(problem), copy, *closing], delays
+        return [reference_block(built), copy, *closing], delays
 
 
 def twice(controller: Controller) -> Named:

@@ -56,8 +56,8 @@ class Played(Controller):
     adaptive: Facts
     deformation: Deformation = field(default_factory=fp.Identity)
 
-    def blocks(self, problem):
-        facts, response = self.adaptive if self.deformation.adapts else self.plain, problem.plant.response_signal
+    def blocks(self, built):
+        facts, response = self.adaptive if self.deformation.adapts else self.plain, built.plant.response_signal
         writes = Layout((response("nominal"), response("desired")))
 
         def step(s):
@@ -68,9 +68,9 @@ class Played(Controller):
             rates = ca.vertcat((wanted - s.state[:2]) / PERIOD, sent) + ca.if_else(s.time < facts.ends, 0.0, 1e200)
             return {"nominal": rates, "desired": rates}
 
-        played = Block("played", Layout((scalar("time", "s"), problem.plant.state)), writes, step)
-        closing, delays = closing_blocks(problem, self.deformation)
-        return [reference_block(problem), played, *closing], delays
+        played = Block("played", Layout((scalar("time", "s"), built.plant.state)), writes, step)
+        closing, delays = closing_blocks(built, self.deformation)
+        return [reference_block(built), played, *closing], delays
 
 
 def problem() -> fp.Problem:

@@ -19,8 +19,8 @@ class Gentle(Controller):
     deformation: Deformation = field(default_factory=fp.Identity)
     limit: float = 40.0
 
-    def blocks(self, problem):
-        plant, motion = problem.plant, self.motion(problem.plant)
+    def blocks(self, built):
+        plant, motion = built.plant, self.motion(built.plant)
         size = len(plant.chains)
 
         def step(s):
@@ -31,8 +31,8 @@ class Gentle(Controller):
 
         reads = Layout((motion, like(plant.output, "reference"), plant.response_signal("_reference_response")))
         writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
-        closing, delays = closing_blocks(problem, self.deformation)
-        return [reference_block(problem), Block("law", reads, writes, step), *closing], delays
+        closing, delays = closing_blocks(built, self.deformation)
+        return [reference_block(built), Block("law", reads, writes, step), *closing], delays
 
     def check(self, problem):
         if problem.plant.step is not None or set(problem.plant.chains.values()) != {2}:
@@ -41,9 +41,9 @@ class Gentle(Controller):
     def motion(self, plant):
         return plant.output
 
-    def changed(self, problem, name, change):
+    def changed(self, built, name, change):
         """Return its blocks with the step of one of them wrapped: change(step, signals)."""
-        blocks, delays = Gentle.blocks(self, problem)
+        blocks, delays = Gentle.blocks(self, built)
         return [
             replace(b, step=lambda s, b=b: change(b.step, s)) if name in (b.name, "every") else b for b in blocks
         ], delays
@@ -52,20 +52,20 @@ class Gentle(Controller):
 class KnowsThePlant(Gentle):
     """Inverts the plant and not the model."""
 
-    def blocks(self, problem):
+    def blocks(self, built):
         def exact(step, s):
             if hasattr(s, "parameters"):
-                s.parameters = ca.DM(problem.plant.exact)
+                s.parameters = ca.DM(built.plant.exact)
             return step(s)
 
-        return self.changed(problem, "every", exact)
+        return self.changed(built, "every", exact)
 
 
 class LeavesTheLimits(Gentle):
     """Gives the command before it is limited."""
 
-    def blocks(self, problem):
-        return self.changed(problem, "limit", lambda step, s: {**step(s), "command": s.command_unclipped})
+    def blocks(self, built):
+        return self.changed(built, "limit", lambda step, s: {**step(s), "command": s.command_unclipped})
 
 
 class SaysItLearns(Gentle):
@@ -87,12 +87,12 @@ class SaysItDeformsNoResponse(Gentle):
 class DeformsAnotherResponse(Gentle):
     """Deforms another desired response than the one that it logs."""
 
-    def blocks(self, problem):
+    def blocks(self, built):
         def louder(step, s):
             s.desired = 1.05 * s.desired
             return step(s)
 
-        return self.changed(problem, "deform", louder)
+        return self.changed(built, "deform", louder)
 
 
 class TellsAnotherModel(Gentle):
@@ -114,8 +114,8 @@ class IsGivenTheExactParameters(Gentle):
 class AlwaysOk(Gentle):
     """Hides a command that was held."""
 
-    def blocks(self, problem):
-        return self.changed(problem, "judge", lambda step, s: {"status": 0 * s._held})
+    def blocks(self, built):
+        return self.changed(built, "judge", lambda step, s: {"status": 0 * s._held})
 
 
 class TakesTheStateForTheOutput(Gentle):
@@ -128,8 +128,8 @@ class TakesTheStateForTheOutput(Gentle):
 class IgnoresItsDeformation(Gentle):
     """Builds itself without the deformation that it was given."""
 
-    def blocks(self, problem):
-        return Gentle(self.rate).blocks(problem)
+    def blocks(self, built):
+        return Gentle(self.rate).blocks(built)
 
 
 class NamesAnotherLaw(Gentle):

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
@@ -17,7 +18,6 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.symbolic.open import left_after
-from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 
@@ -43,12 +43,12 @@ class AccelerationFeedback(Undeformed):
         """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""
         return (1 + self.pole(period)) / (1 - self.pole(period))
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(problem, self.tracking, self._feedback_block(problem), invert_block(problem.plant))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return law_blocks(built, self.tracking, self._feedback_block(built), invert_block(built.plant))
 
-    def _feedback_block(self, problem: Problem) -> Block:
+    def _feedback_block(self, built: Built) -> Block:
         """Block (desired, realised) -> request; before the first response the request is the desired response."""
-        plant, pole, warm_up_cycles = problem.plant, self.pole(problem.period), problem.warm_up_cycles
+        plant, pole, warm_up_cycles = built.plant, self.pole(built.period), built.warm_up
         memory = Layout((plant.response_signal("filtered_error"),))
 
         def step(s: Signals) -> dict[str, Expression]:

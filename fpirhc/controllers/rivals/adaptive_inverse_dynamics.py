@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.path import MEASURED_TIME, Pairs
-from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
@@ -70,16 +70,16 @@ class AdaptiveInverseDynamics(Controller):
         """Raise if plant, bounds or rule do not fit, as `Learning.check` does."""
         self._learning.check(problem, inverts=True)
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant, regressor = problem.plant, self._learning.regressor(problem)
-        closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant, regressor = built.plant, self._learning.regressor(built.problem)
+        closing, delays = closing_blocks(built.of_plant(regressor.believed), self.deformation)
         believed = like(regressor.believed.parameter, "_believed")
         blocks = [
-            *desired_blocks(problem, self.tracking),
-            *([_earlier_targets(problem)] if self._remembers(problem) else []),
-            self._learn_block(problem),
+            *desired_blocks(built, self.tracking),
+            *([_earlier_targets(built)] if self._remembers(built) else []),
+            self._learn_block(built),
             *(fed(block, "parameters", believed) for block in closing),
-            bounded(problem, self.tracking).update(plant, problem.period),
+            bounded(built, self.tracking).update(plant, built.period),
         ]
         return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
 
@@ -87,14 +87,14 @@ class AdaptiveInverseDynamics(Controller):
     def _learning(self) -> Learning:
         return Learning(self.rule, self.bounds, dict(self.combinations))
 
-    def _learn_block(self, problem: Problem) -> Block:
-        plant, learning = problem.plant, self._learning
-        equation = equation_function(learning.regressor(problem))
+    def _learn_block(self, built: Built) -> Block:
+        plant, learning = built.plant, self._learning
+        equation = equation_function(learning.regressor(built.problem))
         require_closed("the row of the Lyapunov equation", self.tracking)
         weights = self.lyapunov_row()
 
-        target, reads = self._target(problem)
-        paired = _late(problem)
+        target, reads = self._target(built)
+        paired = _late(built)
 
         def gradient(s: Signals, then: Expression, estimate: Expression) -> Pair:
             state = then if paired else s.state
@@ -106,24 +106,24 @@ class AdaptiveInverseDynamics(Controller):
             return matrix, ca.vertcat(*along)
 
         reads = (*reads, integral_signal(plant, "_integral_used"))
-        return learning.block(problem, reads, gradient)
+        return learning.block(built, reads, gradient)
 
-    def _target(self, problem: Problem) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
+    def _target(self, built: Built) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
-        plant, pairs = problem.plant, Pairs(problem, problem.dead_time)
-        if not _late(problem) or given_signals(problem):
-            target = like(plant.output, _EARLIER if self._remembers(problem) else "_target")
+        plant, pairs = built.plant, Pairs(built.problem, built.problem.dead_time)
+        if not _late(built) or built.given:
+            target = like(plant.output, _EARLIER if self._remembers(built) else "_target")
             return lambda s: getattr(s, target.name), (target,)
-        reference = motion_of(problem)
+        reference = built.motion
 
         def then(s: Signals) -> Expression:
-            return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0), *own_values(problem, s))[0]
+            return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0), *built.own_values(s))[0]
 
-        return then, (replace(time_signal(plant), name=MEASURED_TIME), *own_signals(problem))
+        return then, (replace(time_signal(plant), name=MEASURED_TIME), *built.own)
 
-    def _remembers(self, problem: Problem) -> bool:
+    def _remembers(self, built: Built) -> bool:
         """Whether it learns from errors of an earlier instant, to set-points, which only a memory knows."""
-        return bool(_late(problem) and given_signals(problem) and not self.rule.reads_response)
+        return bool(_late(built) and built.given and not self.rule.reads_response)
 
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
@@ -136,14 +136,14 @@ class AdaptiveInverseDynamics(Controller):
 _EARLIER = "_target_earlier"
 
 
-def _earlier_targets(problem: Problem) -> Block:
+def _earlier_targets(built: Built) -> Block:
     """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
-    plant, period, pairs = problem.plant, problem.period, Pairs(problem, problem.dead_time)
-    late = problem.dead_time
+    plant, period, pairs = built.plant, built.period, Pairs(built.problem, built.problem.dead_time)
+    late = built.problem.dead_time
     whole = late.measurement + max(late.inputs.values(), default=0.0)
-    queue = Queue(2 * whole / period + problem.sensing.delay(plant, period))
+    queue = Queue(2 * whole / period + built.problem.sensing.delay(plant, period))
     target, time = like(plant.output, "_target"), time_signal(plant)
-    first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()
+    first = np.asarray(built.problem.reference.function(plant)(0.0)[0].full()).ravel()
     memory = queue.memory("targets", target.elements, tuple(map(float, first)))
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -155,9 +155,9 @@ def _earlier_targets(problem: Problem) -> Block:
     return Block("earlier_targets", reads, Layout((like(target, _EARLIER),)), step, Layout(memory))
 
 
-def _late(problem: Problem) -> bool:
+def _late(built: Built) -> bool:
     """Whether there is dead time, behind which state, reference and response are of other instants."""
-    return bool(problem.dead_time.queued)
+    return bool(built.problem.dead_time.queued)
 
 
 EXAMPLES = (

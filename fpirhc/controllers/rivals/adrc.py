@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import command_before, commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.base import commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
@@ -50,16 +51,16 @@ class ADRC(Undeformed):
         for order in problem.plant.response_orders.values():
             check_modes(self, problem.plant, decay_gains(self.bandwidth, order))
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        closing, delays = commanding_blocks(problem)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        closing, delays = commanding_blocks(built)
         response = plant.response_signal("_reference_response")
         blocks = [
-            reference_block(problem),
+            reference_block(built),
             rename("nominal", response, plant.response_signal("nominal")),
-            self._observer_block(problem),
+            self._observer_block(built),
             *closing,
-            _prediction_block(problem),
+            _prediction_block(built),
         ]
         return blocks, [*delays, Delay(_states(plant, "_predicted"), "_predicted_later")]
 
@@ -67,9 +68,9 @@ class ADRC(Undeformed):
         """Return l_1 ... l_{n+1} of z += l (y - z_1), for a coordinate of that relative order; all poles at exp(-w_o T)."""
         return list(_corrections(plant, order, period, exp(-self.observer * period)))
 
-    def _observer_block(self, problem: Problem) -> Block:
+    def _observer_block(self, built: Built) -> Block:
         """Block (outputs, prediction, reference) -> (command, extended state)."""
-        plant, orders = problem.plant, list(problem.plant.response_orders.values())
+        plant, orders = built.plant, list(built.plant.response_orders.values())
         gain, response = plant.equations.input_gain, plant.equations.controlled_response
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -79,7 +80,7 @@ class ADRC(Undeformed):
                 begun = s.warm_up > 0.5
                 # The observer begins at the first sample, with the derivatives of the reference and no disturbance.
                 before = [ca.if_else(begun, z, r) for z, r in zip(predicted, [y, *target[k][1:], 0 * y], strict=True)]
-                shares = self.corrections(plant, orders[k], problem.period)
+                shares = self.corrections(plant, orders[k], built.period)
                 z = [x + share * (y - before[0]) for x, share in zip(before, shares, strict=True)]
                 errors = zip(decay_gains(self.bandwidth, orders[k]), target[k], z[:-1], strict=True)
                 feedback.append(total(g * (r - x) for g, r, x in errors))
@@ -96,25 +97,21 @@ class ADRC(Undeformed):
 
         measured = dict.fromkeys((plant.state, plant.output))
         known = (like(plant.output, "reference"), plant.response_signal("nominal"), plant.parameter)
-        reads = Layout((*measured, *known, command_before(problem), scalar("warm_up"), _states(plant, "_predicted")))
+        reads = Layout((*measured, *known, built.before, scalar("warm_up"), _states(plant, "_predicted")))
         responses = map(plant.response_signal, ("desired", "_deformed_unclipped"))
         writes = Layout((_states(plant, "extended_state"), *responses, like(plant.input, "command_unclipped")))
         return Block("observer", reads, writes, step)
 
 
-def _prediction_block(problem: Problem) -> Block:
+def _prediction_block(built: Built) -> Block:
     """Block (extended state, command) -> the extended state before the next sample."""
-    plant, gain, orders = (
-        problem.plant,
-        problem.plant.equations.input_gain,
-        list(problem.plant.response_orders.values()),
-    )
+    plant, gain, orders = (built.plant, built.plant.equations.input_gain, list(built.plant.response_orders.values()))
     acting, predicted = plant.response_signal("acting"), _states(plant, "_predicted")
 
     def later(states: Expression, effect: Expression) -> Expression:
         moved = []
         for chain, own in zip(_split(states, orders), ca.vertsplit(effect), strict=True):
-            step = step_of(plant, np.eye(len(chain), k=1), problem.period)
+            step = step_of(plant, np.eye(len(chain), k=1), built.period)
             step_of_effect = [*step[:-1, -1], 0.0]  # a held input acts as the disturbance does, and does not change it
             moved.append(ca.DM(step) @ ca.vertcat(*chain) + ca.DM(step_of_effect) * own)
         return ca.vertcat(*moved)

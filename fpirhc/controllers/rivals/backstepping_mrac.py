@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
 from fpirhc.errors import InvalidValue, Mistakes
@@ -72,11 +73,11 @@ class BacksteppingMRAC(Controller):
             rows.append([last[k - 1] + rate * last[k] + before[k] for k in range(size + 1)])
         return rows
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        closing, delays = closing_blocks(problem, self.deformation)
-        own = model_block(plant, self.model_rate, problem.period), self._nested_block(plant)
-        return [reference_block(problem), *own, *closing], delays
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        closing, delays = closing_blocks(built, self.deformation)
+        own = model_block(plant, self.model_rate, built.period), self._nested_block(plant)
+        return [reference_block(built), *own, *closing], delays
 
     def _nested_block(self, plant: Plant) -> Block:
         """Block (state, model, response of the model) -> (nested errors, desired)."""

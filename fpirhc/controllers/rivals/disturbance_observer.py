@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import command_before, law_blocks, like
+from fpirhc.controllers.base import law_blocks, like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PairedAtOnce
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
@@ -17,7 +18,6 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.symbolic.open import exp
-from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 
@@ -33,12 +33,12 @@ class DisturbanceObserver(PairedAtOnce):
     tracking: Tracking
     bandwidth: Positive
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(problem, self.tracking, self._observer_block(problem))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return law_blocks(built, self.tracking, self._observer_block(built))
 
-    def _observer_block(self, problem: Problem) -> Block:
+    def _observer_block(self, built: Built) -> Block:
         """Block (state, last command, realised, desired) -> (command, disturbance at the input)."""
-        plant, warm_up_cycles, pole = problem.plant, problem.warm_up_cycles, exp(-self.bandwidth * problem.period)
+        plant, warm_up_cycles, pole = built.plant, built.warm_up, exp(-self.bandwidth * built.period)
         response, inverse = plant.equations.controlled_response, plant.equations.inverse
         disturbance = like(plant.input, "input_disturbance")
 
@@ -56,7 +56,7 @@ class DisturbanceObserver(PairedAtOnce):
                 "disturbance_before_next": ca.if_else(is_finite(used), used, s.disturbance_before),
             }
 
-        signals = (command_before(problem), plant.response_signal("realised"), plant.response_signal("desired"))
+        signals = (built.before, plant.response_signal("realised"), plant.response_signal("desired"))
         reads = Layout((plant.state, *signals, plant.parameter, scalar("warm_up")))
         request = plant.response_signal("_deformed_unclipped")
         writes = Layout((like(plant.input, "command_unclipped"), request, disturbance))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, law_blocks, like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic
@@ -68,8 +69,8 @@ class ForceMRAC(Controller):
         mistakes.unknown("model: parameter", self.model, problem.plant.parameters)
         mistakes.raise_if_any()
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(problem, self.tracking, self._force_block(problem.plant, problem.warm_up_cycles))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return law_blocks(built, self.tracking, self._force_block(built.plant, built.warm_up))
 
     def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import command_before, law_blocks, like
+from fpirhc.controllers.base import law_blocks, like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PairedAtOnce
 from fpirhc.fields.kinds import Accuracy, Positive
 from fpirhc.members import Example
@@ -17,7 +18,6 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, discrete, scalar
 from fpirhc.symbolic.open import cos, exp, sqrt
-from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 
@@ -42,12 +42,12 @@ class INDI(PairedAtOnce):
         decay = exp(-self.damping * self.frequency * period)
         return 2 * decay * cos(self.frequency * period * sqrt(1 - self.damping * self.damping)), -decay * decay
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(problem, self.tracking, self._increment_block(problem))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return law_blocks(built, self.tracking, self._increment_block(built))
 
-    def _increment_block(self, problem: Problem) -> Block:
+    def _increment_block(self, built: Built) -> Block:
         """Block (state, last command, realised, desired) -> command; before the first response it is the model's inverse."""
-        plant, warm_up_cycles, coefficients = problem.plant, problem.warm_up_cycles, self.filter(problem.period)
+        plant, warm_up_cycles, coefficients = built.plant, built.warm_up, self.filter(built.period)
         gain, response, inverse = (
             plant.equations.input_gain,
             plant.equations.controlled_response,
@@ -83,7 +83,7 @@ class INDI(PairedAtOnce):
             request = response(s.state, command, s.parameters)
             return {"command_unclipped": command, "_deformed_unclipped": request, **after}
 
-        signals = (command_before(problem), plant.response_signal("realised"), plant.response_signal("desired"))
+        signals = (built.before, plant.response_signal("realised"), plant.response_signal("desired"))
         reads = Layout((plant.state, *signals, plant.parameter, scalar("warm_up")))
         writes = Layout((like(plant.input, "command_unclipped"), plant.response_signal("_deformed_unclipped")))
         return Block("increment", reads, writes, step, memory, opaque=plant.equations.inverse_opaque)

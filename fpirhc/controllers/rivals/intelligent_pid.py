@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import command_before, law_blocks, like
+from fpirhc.controllers.base import law_blocks, like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import Few, finite_number
@@ -62,14 +63,14 @@ class IntelligentPID(Undeformed):
                 mistakes.add(f"window = {self.window} cycles: '{name}' {words}; it needs an order from 1 to the window")
         mistakes.raise_if_any()
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(problem, self.tracking, self._model_block(problem))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return law_blocks(built, self.tracking, self._model_block(built))
 
-    def _model_block(self, problem: Problem) -> Block:
+    def _model_block(self, built: Built) -> Block:
         """Block (outputs, last command, desired) -> (command, F); F is the last one until the window is full, at first zero."""
-        plant, length = problem.plant, self.window
+        plant, length = built.plant, self.window
         names, size = plant.controlled_names, len(plant.controlled_names)
-        weights = [window_weights(plant, order, length, problem.period) for order in plant.response_orders.values()]
+        weights = [window_weights(plant, order, length, built.period) for order in plant.response_orders.values()]
         alpha, response = numbers([self.alpha[n] for n in names]), plant.equations.controlled_response
         places = tuple(f"{name}@{k}" for k in range(length) for name in names)
         memory = Layout((Signal("window_outputs", places), Signal("window_commands", places)))
@@ -101,7 +102,7 @@ class IntelligentPID(Undeformed):
             }
 
         measured = dict.fromkeys((plant.state, plant.output))
-        reads = (*measured, command_before(problem), plant.response_signal("desired"), plant.parameter)
+        reads = (*measured, built.before, plant.response_signal("desired"), plant.parameter)
         writes = ("_deformed_unclipped", "ultra_local")
         signals = Layout((like(plant.input, "command_unclipped"), *map(plant.response_signal, writes)))
         return Block("ultra_local_model", Layout(reads), signals, step, memory)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
@@ -44,15 +45,15 @@ class L1Adaptive(Undeformed):
         """
         check_chains(problem, "L1Adaptive predicts a derivative below the response")
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        blocks, delays = law_blocks(problem, self.tracking, self._predictor_block(problem), invert_block(plant))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        blocks, delays = law_blocks(built, self.tracking, self._predictor_block(built), invert_block(plant))
         expected = plant.response_signal("_expected")
         return [*blocks, _expected_block(plant)], [*delays, Delay(expected, "_expected_now")]
 
-    def _predictor_block(self, problem: Problem) -> Block:
+    def _predictor_block(self, built: Built) -> Block:
         """Block (state or outputs, desired, response that the model expected of the last command) -> request."""
-        plant, period = problem.plant, problem.period
+        plant, period = built.plant, built.period
         left, pole = exp(-self.predictor * period), exp(-self.bandwidth * period)
         moves = period * left_in_mean(period, 1 / self.predictor)  # (1 - left) / a_s
         gain = left / moves

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import clip, like
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import refuse
 from fpirhc.controllers.path import Pairs
 from fpirhc.errors import InvalidValue
@@ -75,7 +76,7 @@ class Learning:
         if inverts or self.rule.reads_response:
             _check_definite(self.bounds, coefficients)
 
-    def block(self, problem: Problem, extra: Sequence[Signal], gradient: Gradient) -> Block:
+    def block(self, built: Built, extra: Sequence[Signal], gradient: Gradient) -> Block:
         """Return Block (what every controller reads, last command, `extra`) -> (estimate, _believed).
 
         '_believed' holds the parameters of `Regressor.believed`.
@@ -85,15 +86,15 @@ class Learning:
             extra: signals that `gradient` reads.
             gradient: of the Lyapunov function, for rules that follow it.
         """
-        plant, regressor = problem.plant, self.regressor(problem)
+        plant, regressor = built.plant, self.regressor(built.problem)
         believed = like(regressor.believed.parameter, "_believed")
         others = [k for k in range(len(plant.parameters)) if k not in regressor.covered]
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
         learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
-        pairs = Pairs(problem, problem.dead_time)
+        pairs = Pairs(built.problem, built.problem.dead_time)
         late = (pairs.state,) if pairs.waiting else ()
-        begins = problem.warm_up_cycles if self.rule.reads_response else 1
+        begins = built.warm_up if self.rule.reads_response else 1
         reads = (
             plant.state,
             *late,
@@ -114,7 +115,7 @@ class Learning:
                 lambda: pair(equation(state, s.realised, command, old, s.parameters)),
                 s._clipped_before,
             )
-            candidate = old + self.rule.change(evidence, self.bounds, problem.period)
+            candidate = old + self.rule.change(evidence, self.bounds, built.period)
             good = ca.logic_and(running, is_finite(candidate))
             new = ca.if_else(good, clip(candidate, lower, upper), old)
             return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new, **waiting}

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import commanding_blocks, like, reference_block
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.errors import Mistakes
@@ -67,15 +68,15 @@ class LyapunovMRAC(Undeformed):
             )
         mistakes.raise_if_any()
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        closing, delays = commanding_blocks(problem)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        closing, delays = commanding_blocks(built)
         blocks = [
-            reference_block(problem),
-            model_block(plant, self.rate, problem.period),
+            reference_block(built),
+            model_block(plant, self.rate, built.period),
             self._law_block(plant),
             *closing,
-            self._adapt_block(plant, problem.period, _sign(problem)),
+            self._adapt_block(plant, built.period, _sign(built.problem)),
         ]
         gains, first = _gains(plant, "_gains_before"), _gains(plant, "_gains_first_before")
         return blocks, [*delays, Delay(gains, "gains"), Delay(first, "_gains_first")]

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import commanding_blocks, fed, like, reference_block, rename
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import finite_number
@@ -85,25 +86,25 @@ class PID(Undeformed):
                 )
         mistakes.raise_if_any()
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
         response = plant.response_signal("_reference_response")
-        closing, delays = commanding_blocks(problem)
+        closing, delays = commanding_blocks(built)
         blocks = [
-            reference_block(problem),
+            reference_block(built),
             rename("nominal", response, plant.response_signal("nominal")),
             rename("desired", response, plant.response_signal("desired")),
-            self._law(problem),
+            self._law(built),
             *closing,
             self._cut_off_block(plant),
-            fed(integral_update(plant, problem.period, self._useful(problem)), "_cut_off", _cut_off(plant)),
+            fed(integral_update(plant, built.period, self._useful(built)), "_cut_off", _cut_off(plant)),
         ]
         return blocks, [*delays, *integral_delay(plant)]
 
-    def _useful(self, problem: Problem) -> list[Useful]:
+    def _useful(self, built: Built) -> list[Useful]:
         """What the integrals may ask for: commands inside the limits of their inputs, by those of the build."""
-        sizes = np.fmax(*map(np.abs, problem.limits.input_bounds(problem.plant)))
-        names = problem.plant.controlled_names
+        sizes = np.fmax(*map(np.abs, built.problem.limits.input_bounds(built.plant)))
+        names = built.plant.controlled_names
         return [
             Useful(self.integral.get(n, 0.0), self.proportional[n], float(size) if size > 0 else math.inf)
             for n, size in zip(names, sizes, strict=False)
@@ -123,9 +124,9 @@ class PID(Undeformed):
             "cut_off", Layout((like(plant.input, "command_unclipped"), plant.input)), Layout((_cut_off(plant),)), step
         )
 
-    def _law(self, problem: Problem) -> Block:
+    def _law(self, built: Built) -> Block:
         """Block (state, reference, integral, warm_up) -> command, and the model's response to it (for readers of a log)."""
-        plant, seen = problem.plant, problem.plant.output
+        plant, seen = built.plant, built.plant.output
         gains = [self.gains(name, order) for name, order in plant.response_orders.items()]
 
         def step(s: Signals) -> dict[str, Expression]:

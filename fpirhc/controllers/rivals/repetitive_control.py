@@ -11,6 +11,7 @@ from typing import Annotated
 import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PairedAtOnce
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import Duration, Positive, Range
@@ -57,16 +58,16 @@ class RepetitiveControl(PairedAtOnce):
     def check(self, problem: Problem) -> None:
         self.cycles(problem)
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        blocks, delays = law_blocks(problem, self.tracking, self._repetition_block(problem), invert_block(plant))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        blocks, delays = law_blocks(built, self.tracking, self._repetition_block(built), invert_block(plant))
         desired, request = plant.response_signal("_desired_last"), plant.response_signal("_deformed_last")
         return blocks, [*delays, Delay(desired, "desired"), Delay(request, "deformed")]
 
-    def _repetition_block(self, problem: Problem) -> Block:
+    def _repetition_block(self, built: Built) -> Block:
         """Block (desired, realised, last request and desired response) -> request."""
-        plant, size, warm_up_cycles = problem.plant, len(problem.plant.controlled_names), problem.warm_up_cycles
-        length = self.cycles(problem) + 1
+        plant, size, warm_up_cycles = built.plant, len(built.plant.controlled_names), built.warm_up
+        length = self.cycles(built.problem) + 1
         places = tuple(f"{name}@{k}" for k in range(length) for name in plant.controlled_names)
         lessons = Signal("lessons", places)
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import commanding_blocks, invert_block, like, reference_block
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_derivatives
-from fpirhc.controllers.reference_states import motion_of, own_signals, own_values
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
@@ -47,22 +47,22 @@ class ResolvedAccelerationRate(Undeformed):
         """
         check_derivatives(problem, "ResolvedAccelerationRate prescribes")
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        closing, delays = commanding_blocks(problem)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        closing, delays = commanding_blocks(built)
         blocks = [
-            reference_block(problem),
-            _nominal_block(problem),
-            self._rate_block(problem),
-            _increment_block(problem),
+            reference_block(built),
+            _nominal_block(built),
+            self._rate_block(built),
+            _increment_block(built),
             invert_block(plant),
             *closing,
         ]
         return blocks, delays
 
-    def _rate_block(self, problem: Problem) -> Block:
+    def _rate_block(self, built: Built) -> Block:
         """Block (state, realised, reference now and one cycle later) -> (desired, its change in this cycle)."""
-        plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
+        plant, period, warm_up_cycles = built.plant, built.period, built.warm_up
 
         def step(s: Signals) -> dict[str, Expression]:
             errors = error_chains(plant, s.reference - getattr(s, plant.output.name))
@@ -83,23 +83,23 @@ class ResolvedAccelerationRate(Undeformed):
         )
 
 
-def _nominal_block(problem: Problem) -> Block:
+def _nominal_block(built: Built) -> Block:
     """Block time -> nominal response now and one cycle later."""
-    plant, function = problem.plant, motion_of(problem, ahead=problem.period)
+    plant, function = built.plant, built.later
     controlled = controlled_places(plant)
 
     def step(s: Signals) -> dict[str, Expression]:
-        later = function(s.time, *own_values(problem, s))[1][controlled]
+        later = function(s.time, *built.own_values(s))[1][controlled]
         return {"nominal": s._reference_response, "_nominal_later": later}
 
-    reads = Layout((time_signal(plant), plant.response_signal("_reference_response"), *own_signals(problem)))
+    reads = Layout((time_signal(plant), plant.response_signal("_reference_response"), *built.own))
     writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
-    return Block("nominal", reads, writes, step, opaque=problem.reference.opaque)
+    return Block("nominal", reads, writes, step, opaque=built.problem.reference.opaque)
 
 
-def _increment_block(problem: Problem) -> Block:
+def _increment_block(built: Built) -> Block:
     """Block (change, last command, state) -> request: the model's response to the last command plus the change."""
-    plant, period, warm_up_cycles = problem.plant, problem.period, problem.warm_up_cycles
+    plant, period, warm_up_cycles = built.plant, built.period, built.warm_up
     x, u, p = plant.symbols()
     measured = ca.SX.sym("f", len(plant.controlled_names))
     response = plant.equations.controlled_response(x, u, p)

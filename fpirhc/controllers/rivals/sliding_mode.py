@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.errors import Mistakes
@@ -63,13 +64,13 @@ class SlidingMode(Undeformed):
         for order in problem.plant.response_orders.values():
             check_modes(self, problem.plant, decay_gains(self.rate, order - 1))
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        response = problem.plant.response_signal("_reference_response")
-        closing, delays = closing_blocks(problem, self.deformation)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        response = built.plant.response_signal("_reference_response")
+        closing, delays = closing_blocks(built, self.deformation)
         blocks = [
-            reference_block(problem),
-            rename("nominal", response, problem.plant.response_signal("nominal")),
-            self._surface_block(problem.plant),
+            reference_block(built),
+            rename("nominal", response, built.plant.response_signal("nominal")),
+            self._surface_block(built.plant),
             *closing,
         ]
         return blocks, delays

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, closing_blocks, fed, like, reference_block
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.rivals.learned_parameters import Learning, learning_delays
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.errors import InvalidValue
@@ -68,18 +69,18 @@ class SlotineLi(Controller):
                 f"SlotineLi: damping must name every coordinate and no other; '{odd[0]}' is on one side only"
             )
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        regressor = self._learning.regressor(problem)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        regressor = self._learning.regressor(built.problem)
         believed = like(regressor.believed.parameter, "_believed")
-        front = [reference_block(problem), self._sliding_block(problem), self._learn_block(problem, regressor)]
+        front = [reference_block(built), self._sliding_block(built), self._learn_block(built, regressor)]
         if self._deforms:
-            closing, delays = closing_blocks(replace(problem, plant=regressor.believed), self.deformation)
+            closing, delays = closing_blocks(built.of_plant(regressor.believed), self.deformation)
             closing = [fed(block, "parameters", believed) for block in closing]
-            return [*front, self._demand_block(problem, regressor), *closing], [*delays, *learning_delays()]
-        closing, delays = closing_blocks(problem, self.deformation)
+            return [*front, self._demand_block(built, regressor), *closing], [*delays, *learning_delays()]
+        closing, delays = closing_blocks(built, self.deformation)
         # The request of a clipped command comes from the approximate model: the estimated one may have no inverse.
         deform, _, *rest = closing
-        return [*front, deform, self._force_block(problem, regressor), *rest], [*delays, *learning_delays()]
+        return [*front, deform, self._force_block(built, regressor), *rest], [*delays, *learning_delays()]
 
     @property
     def _deforms(self) -> bool:
@@ -89,14 +90,14 @@ class SlotineLi(Controller):
     def _learning(self) -> Learning:
         return Learning(self.rule, self.bounds, dict(self.combinations))
 
-    def _sliding_block(self, problem: Problem) -> Block:
+    def _sliding_block(self, built: Built) -> Block:
         """Block (state, reference) -> (sliding rho, v, v'); v' is also 'desired' where nothing is deformed."""
-        plant = problem.plant
+        plant = built.plant
         at, moving = places(plant, 0), places(plant, 1)
         seen = plant.output
         reads = (seen, like(seen, "reference"), plant.response_signal("_reference_response"))
         slope = plant.response_signal("_velocity_slope" if self._deforms else "desired")
-        writes = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope, plant.response_signal("nominal"))
+        writes = (_rates(built, "sliding"), _rates(built, "_velocity"), slope, plant.response_signal("nominal"))
 
         def step(s: Signals) -> dict[str, Expression]:
             motion = getattr(s, seen.name)
@@ -111,22 +112,22 @@ class SlotineLi(Controller):
 
         return Block("sliding", Layout(reads), Layout(writes), step)
 
-    def _learn_block(self, problem: Problem, regressor: Regressor) -> Block:
-        slope = problem.plant.response_signal("_velocity_slope" if self._deforms else "desired")
+    def _learn_block(self, built: Built, regressor: Regressor) -> Block:
+        slope = built.plant.response_signal("_velocity_slope" if self._deforms else "desired")
 
         def gradient(s: Signals, state: Expression, estimate: Expression) -> Pair:
             del state, estimate  # law and error of this cycle belong together; no response is read
             matrix, _ = regressor.split_function(s.state, s._velocity, getattr(s, slope.name), s.parameters)
             return matrix, s.sliding
 
-        reads = (_rates(problem, "sliding"), _rates(problem, "_velocity"), slope)
-        return self._learning.block(problem, reads, gradient)
+        reads = (_rates(built, "sliding"), _rates(built, "_velocity"), slope)
+        return self._learning.block(built, reads, gradient)
 
-    def _demand_block(self, problem: Problem, regressor: Regressor) -> Block:
+    def _demand_block(self, built: Built, regressor: Regressor) -> Block:
         """Block -> desired: the model's response to the law."""
-        plant, damping = problem.plant, self._damping(problem)
+        plant, damping = built.plant, self._damping(built)
         slope = plant.response_signal("_velocity_slope")
-        reads = (plant.state, plant.parameter, regressor.signal, _rates(problem, "sliding"), slope)
+        reads = (plant.state, plant.parameter, regressor.signal, _rates(built, "sliding"), slope)
 
         def step(s: Signals) -> dict[str, Expression]:
             mass = regressor.mass_function(s.state, s.estimate, s.parameters)
@@ -135,16 +136,16 @@ class SlotineLi(Controller):
 
         return Block("demand", Layout(reads), Layout((plant.response_signal("desired"),)), step)
 
-    def _force_block(self, problem: Problem, regressor: Regressor) -> Block:
+    def _force_block(self, built: Built, regressor: Regressor) -> Block:
         """Block -> command_unclipped: the law itself, linear in the estimate."""
-        plant, damping = problem.plant, self._damping(problem)
+        plant, damping = built.plant, self._damping(built)
         slope = plant.response_signal("_deformed_unclipped")
         reads = (
             plant.state,
             plant.parameter,
             regressor.signal,
-            _rates(problem, "sliding"),
-            _rates(problem, "_velocity"),
+            _rates(built, "sliding"),
+            _rates(built, "_velocity"),
             slope,
         )
 
@@ -154,12 +155,12 @@ class SlotineLi(Controller):
 
         return Block("force", Layout(reads), Layout((like(plant.input, "command_unclipped"),)), step)
 
-    def _damping(self, problem: Problem) -> Expression:
-        return numbers([self.damping[name] for name in problem.plant.names])
+    def _damping(self, built: Built) -> Expression:
+        return numbers([self.damping[name] for name in built.plant.names])
 
 
-def _rates(problem: Problem, name: str) -> Signal:
-    plant = problem.plant
+def _rates(built: Built, name: str) -> Signal:
+    plant = built.plant
     return vector(name, plant.names, [derivative_unit(plant.coordinates[c], 1, plant.time_unit) for c in plant.names])
 
 

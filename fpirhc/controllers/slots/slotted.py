@@ -15,17 +15,17 @@ from fpirhc.controllers.base import (
     Controller,
     Response,
     clip,
-    command_before,
     deform_block,
     like,
     reference_block,
     under_names,
     warm_up_block,
 )
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.check import limit_behind
 from fpirhc.controllers.contract import late_deformation
-from fpirhc.controllers.path import Answers, answer_block, believed_path, measured_output
-from fpirhc.controllers.reference_states import own_signals, own_values, stages_of
+from fpirhc.controllers.path import Answers, answer_block, measured_output
+from fpirhc.controllers.reference_states import stages_of
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.controllers.slots.slot import (
     Channel,
@@ -157,31 +157,32 @@ class Slotted(Controller):
                 )
         mistakes.raise_if_any()
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        channels, realised = self.channels(problem), _realised(problem, self.channels(problem))
-        blocks = [*_realised_blocks(problem, channels), reference_block(problem)]
-        blocks += [state_block(problem, one, self.smallest_gain) for one in channels]
-        blocks += [self.schedule.block(problem, channels), switch_block(channels)]
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        channels = self.channels(built.problem)
+        realised = _realised(built.problem, channels)
+        blocks = [*_realised_blocks(built, channels), reference_block(built)]
+        blocks += [state_block(built, one, self.smallest_gain) for one in channels]
+        blocks += [self.schedule.block(built.problem, channels), switch_block(channels)]
         delays: list[Delay] = []
         for one in channels:
             light, law = one.plant, one.slot.tracking
-            blocks.append(for_channel(law.law(light, problem.period), one, {"time"}, {"desired": one.wire("law")}))
-            blocks += [_mirror(problem, one, name) for name in one.slot.deformation.mirror.models]
-            blocks.append(join_block(problem, realised, one, self.blend, self.blank))
+            blocks.append(for_channel(law.law(light, built.period), one, {"time"}, {"desired": one.wire("law")}))
+            blocks += [_mirror(built, one, name) for name in one.slot.deformation.mirror.models]
+            blocks.append(join_block(built, realised, one, self.blend, self.blank))
             names = {name: f"{name}_{one.slot.coordinate}" for name in one.slot.deformation.shown()}
             names["warm_up"] = one.wire("valid")
             blocks.append(for_channel(deform_block(light, one.slot.deformation), one, set(), names, settled_in(one)))
             delays += delays_for_channel(law.delays(light), one)
-        blocks += [command_block(problem, channels), judge_block(), _count_block(problem, channels)]
+        blocks += [command_block(built, channels), judge_block(), _count_block(built, channels)]
         blocks += [
-            for_channel(c.slot.tracking.update(c.plant, problem.period), c, {"clipped", "time"}, {"_held": "_repeated"})
+            for_channel(c.slot.tracking.update(c.plant, built.period), c, {"clipped", "time"}, {"_held": "_repeated"})
             for c in channels
         ]
         counted = {"warm_up": "_warm_up_now", "_slot_before": "slot", "_age_before": "_age"}
         delays += [Delay(discrete(now), source) for now, source in counted.items()]
         remembered = {"_offset_before": "_offset", "_distance_before": "_distance"}
         delays += [Delay(scalar(now), source) for now, source in remembered.items()]
-        delays.append(Delay(command_before(problem), "command"))
+        delays.append(Delay(built.before, "command"))
         delays.append(Delay(by_slot(channels, "_deformed_before"), "deformed"))
         return blocks, delays
 
@@ -206,12 +207,12 @@ def _realised(problem: Problem, channels: Sequence[Channel]) -> Signal:
     return by_slot(channels, "realised" if reads_equations(problem) else "realised_of_slots")
 
 
-def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Block]:
+def _realised_blocks(built: Built, channels: Sequence[Channel]) -> list[Block]:
     """Blocks (measured outputs, realised) -> y^(r) of every slot, measured or differenced; none where equations give it."""
-    if reads_equations(problem):
+    if reads_equations(built.problem):
         return []
-    plant, motion, differences = problem.plant, measured_output(problem.plant), "_slot_differences"
-    measured, realised = plant.response_signal("realised"), _realised(problem, channels)
+    plant, motion, differences = built.plant, measured_output(built.plant), "_slot_differences"
+    measured, realised = plant.response_signal("realised"), _realised(built.problem, channels)
     differenced = [c for c in channels if c.differences]
     names = tuple(c.slot.coordinate for c in differenced)
     blocks, reads = [], [measured]
@@ -226,7 +227,7 @@ def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Bloc
                 Layout((samples,)),
                 lambda s: {samples.name: getattr(s, motion.name)[places]},
             ),
-            _difference_block(problem, differenced, orders, samples, differences),
+            _difference_block(built, differenced, orders, samples, differences),
         ]
         reads.append(Signal(differences, names))
 
@@ -243,10 +244,10 @@ def _realised_blocks(problem: Problem, channels: Sequence[Channel]) -> list[Bloc
 
 
 def _difference_block(
-    problem: Problem, channels: Sequence[Channel], orders: Sequence[int], samples: Signal, differences: str
+    built: Built, channels: Sequence[Channel], orders: Sequence[int], samples: Signal, differences: str
 ) -> Block:
     """Block (samples) -> their backward differences, which go on over gaps as those of positions do."""
-    plant, at = problem.plant, (problem.start_state, problem.plant.approximate)
+    plant, at = built.plant, (built.problem.start_state, built.plant.approximate)
     quantities = {c.slot.coordinate: (c.chain.unit, c.differences) for c in channels}
     light = integrators(plant, quantities, tuple(quantities))
     starts = {
@@ -255,7 +256,7 @@ def _difference_block(
         for k, v in enumerate(np.asarray(c.chain.states(*at).full()).ravel()[order:])
     }
     first = np.array([starts[e] for e in light.state.elements])
-    estimate = PositionDifference().block(light, problem.period, first, samples)
+    estimate = PositionDifference().block(light, built.period, first, samples)
     names = {light.state.name: "_slot_chains", "realised": differences, "estimate_past": "_slot_past"}
     return under_names(replace(estimate, name="slot_differences"), names)
 
@@ -272,16 +273,16 @@ def _usable_from(problem: Problem, one: Channel, measurement: float) -> float:
     return late + one.differences + (estimator.fills(plant.chains[name]) if estimated else 0)
 
 
-def _count_block(problem: Problem, channels: Sequence[Channel]) -> Block:
+def _count_block(built: Built, channels: Sequence[Channel]) -> Block:
     """Block that counts the cycles until every y^(r) may be used."""
-    late = problem.dead_time.measurement
-    return warm_up_block(max(_usable_from(problem, c, late) for c in channels))
+    late = built.problem.dead_time.measurement
+    return warm_up_block(max(_usable_from(built.problem, c, late) for c in channels))
 
 
-def _mirror(problem: Problem, one: Channel, name: str) -> Block:
+def _mirror(built: Built, one: Channel, name: str) -> Block:
     """Block -> y^(r) of the model at what is measured and under the command that acted, as late as the plant's."""
-    chain, calm = one.chain, ca.DM.zeros(len(problem.plant.names))
-    path = believed_path(problem, one.slot.deformation, f"mirror_{one.number}")
+    chain, calm = one.chain, ca.DM.zeros(len(built.plant.names))
+    path = built.path(one.slot.deformation, f"mirror_{one.number}")
     answers = Answers(lambda x, u, p: chain.response(x, u, p, calm), {chain.coordinate: chain.order}, one.signal(name))
     return answer_block(path, answers)
 
@@ -332,19 +333,19 @@ def by_slot(channels: Sequence[Channel], name: str) -> Signal:
     return Signal(name, tuple(c.slot.coordinate for c in channels), tuple(c.chain.response_unit for c in channels))
 
 
-def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
+def state_block(built: Built, one: Channel, smallest_gain: float) -> Block:
     """Block -> the slot's chain, its target, y^(r),N, alpha and beta of the model, and whether beta is large enough.
 
     What is measured of the chain is the measured value; the rest is the model's.
     """
-    plant, chain, seen = problem.plant, one.chain, problem.plant.output
+    plant, chain, seen = built.plant, one.chain, built.plant.output
     elements = one.plant.state.elements
-    derivatives = problem.reference.chain(plant, stages_of(problem), chain.coordinate, chain.order)
+    derivatives = built.problem.reference.chain(plant, stages_of(built.problem), chain.coordinate, chain.order)
     place = plant.input.elements.index(chain.input)
     smallest = smallest_gain * abs(one.start_gain)
 
     def step(s: Signals) -> dict[str, Expression]:
-        nominal = derivatives(s.time, *own_values(problem, s))
+        nominal = derivatives(s.time, *built.own_values(s))
         others = ca.vertcat(*(0 if k == place else s._command_before[k] for k in range(plant.input.size)))
         gain = chain.gain(s.state, others, s.parameters)
         measured = dict(zip(seen.elements, ca.vertsplit(getattr(s, seen.name)), strict=True))
@@ -365,9 +366,9 @@ def state_block(problem: Problem, one: Channel, smallest_gain: float) -> Block:
     writes = [one.signal(n, elements) for n in ("state", "target")]
     writes += [one.signal(n) for n in ("nominal", "free", "gain", "good", "divisor")]
     motion, before = measured_signals(plant), like(plant.input, "_command_before")
-    reads = (time_signal(plant), *motion, plant.parameter, before, *own_signals(problem))
+    reads = (time_signal(plant), *motion, plant.parameter, before, *built.own)
     return Block(
-        f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=problem.reference.opaque
+        f"slot_state_{one.number}", Layout(reads), Layout(tuple(writes)), step, opaque=built.problem.reference.opaque
     )
 
 
@@ -392,16 +393,16 @@ def switch_block(channels: Sequence[Channel]) -> Block:
     return Block("switch", reads, Layout((scalar("_age"), *writes)), step)
 
 
-def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, blank: int) -> Block:
+def join_block(built: Built, measured: Signal, one: Channel, blend: float, blank: int) -> Block:
     """Block that joins the slot's law to the plant's last motion: the desired response and the pair of the last cycle.
 
     `measured`: signal of y^(r) of every slot.
     """
-    decay = left_after(problem.period, blend)
-    place = problem.plant.input.elements.index(one.chain.input)
+    decay = left_after(built.period, blend)
+    place = built.plant.input.elements.index(one.chain.input)
     request_before, models = _request_before(one), [n.removeprefix("_") for n in one.slot.deformation.mirror.models]
     names = ("law", "free", "gain", "active", "warm_up", *models)
-    first = _usable_from(problem, one, problem.dead_time.measurement)
+    first = _usable_from(built.problem, one, built.problem.dead_time.measurement)
     at_once = stays(first, 1)
 
     def step(s: Signals) -> dict[str, Expression]:
@@ -433,7 +434,7 @@ def join_block(problem: Problem, measured: Signal, one: Channel, blend: float, b
 
     shared = [scalar(n) for n in ("warm_up", "_age", "_offset_before", "_distance_before")]
     columns = [measured, replace(measured, name="_deformed_before")]
-    reads = [*(one.signal(n) for n in names), *shared, *columns, like(problem.plant.input, "_command_before")]
+    reads = [*(one.signal(n) for n in names), *shared, *columns, like(built.plant.input, "_command_before")]
     own = () if models else (request_before,)
     results = ("offset", "desired", "distance", "realised", "valid", "blanked", *own)
     return Block(f"join_{one.number}", Layout(tuple(reads)), Layout(tuple(one.signal(n) for n in results)), step)
@@ -459,10 +460,10 @@ _VALUES = ("nominal", "desired", "deformed_unclipped", "distance", "offset", "fr
 _PER_SLOT = (*_FLAGS, *_VALUES)
 
 
-def command_block(problem: Problem, channels: Sequence[Channel]) -> Block:
+def command_block(built: Built, channels: Sequence[Channel]) -> Block:
     """Block that inverts the active slot's request, clips the command, and writes what the command means for every slot."""
-    plant = problem.plant
-    lower, upper = problem.limits.input_ends(plant)
+    plant = built.plant
+    lower, upper = built.ends
     places = [plant.input.elements.index(c.chain.input) for c in channels]
 
     def step(s: Signals) -> dict[str, Value]:

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like, reference_block
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation, RequestChange, automatic
@@ -274,22 +275,22 @@ class Cascade(Controller):
             self.paired.decays(problem)
             self.paired.queue(problem)
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        reference, shift = reference_block(problem), self._shift_block(problem)
-        inner = compose_controller(self.inner_problem(problem), self.controller)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        reference, shift = reference_block(built), self._shift_block(built)
+        inner = compose_controller(build(self.inner_problem(built.problem), self.controller))
         written = {*reference.writes.names, *shift.writes.names}
         last = (
             Delay(scalar("clipped_last"), "clipped"),
-            *(Delay(like(problem.plant.input, last), source) for last, source in _COMMANDS.items()),
+            *(Delay(like(built.plant.input, last), source) for last, source in _COMMANDS.items()),
         )
         return [reference, shift, _renamed(inner, written)], list(last)
 
-    def _shift_block(self, problem: Problem) -> Block:
+    def _shift_block(self, built: Built) -> Block:
         """Block (reference, measured outputs, what a limit did to the last command) -> shift of the target."""
-        plant, names = problem.plant, problem.plant.controlled_names
+        plant, names = built.plant, built.plant.controlled_names
         seen, pairing = plant.output, self.paired
         places, units = [seen.elements.index(n) for n in names], tuple(followed_units(plant)[n] for n in names)
-        begun, first = problem.start_output[places], _first_reference(problem)
+        begun, first = built.problem.start_output[places], _first_reference(built.problem)
         start, own = tuple(map(float, begun)), self.deformation.memory(names)
         # The plain form begins at the target in force from its first cycle on, and moves it once samples count.
         held = tuple(map(float, begun - first)) if pairing is not None and pairing.plain else ()
@@ -299,22 +300,22 @@ class Cascade(Controller):
             scalar("shift_cycles"),
         )
         response = plant.equations.controlled_response
-        memory = Layout((*last, *(pairing.memory(problem, first, begun - first) if pairing else ()))) + own
+        memory = Layout((*last, *(pairing.memory(built.problem, first, begun - first) if pairing else ()))) + own
 
         def step(s: Signals) -> dict[str, Expression]:
             wanted, output, before = s.reference[places], getattr(s, seen.name)[places], s.shift_last
-            in_force = pairing.in_force(problem, s, wanted) if pairing else s.target_last
+            in_force = pairing.in_force(built.problem, s, wanted) if pairing else s.target_last
             undeformed = pairing.undeformed(s, in_force) if pairing else wanted
             remembered = {m: getattr(s, m) for m in own.names}
             request, after = self.deformation.step(in_force, output, undeformed, remembered)
             change = request - undeformed
-            running = ca.logic_and(s.shift_cycles > problem.warm_up_cycles - 0.5, is_finite(change))
+            running = ca.logic_and(s.shift_cycles > built.warm_up - 0.5, is_finite(change))
             beyond, sent = (response(s.state, getattr(s, u), s.parameters) for u in _COMMANDS)
             onwards = ca.logic_not(ca.dot(change - before, beyond - sent) < 0)  # NaN is no way back
             grows = ca.logic_and(ca.logic_and(s.clipped_last > 0.5, onwards), ca.fabs(change) > ca.fabs(before))
             shift = ca.if_else(running, ca.if_else(grows, before, change), before)
-            paired = pairing.remembered(problem, s, wanted, shift) if pairing else {}
-            counted = {"shift_cycles_next": ca.fmin(s.shift_cycles + 1, problem.warm_up_cycles)}
+            paired = pairing.remembered(built.problem, s, wanted, shift) if pairing else {}
+            counted = {"shift_cycles_next": ca.fmin(s.shift_cycles + 1, built.warm_up)}
             own_next = {f"{m}_next": ca.if_else(running, after[m], remembered[m]) for m in own.names}
             held = {"shift_last_next": shift, "target_last_next": wanted + shift, **counted}
             return {SHIFT: shift, "shift": shift, **held, **paired, **own_next}

@@ -13,7 +13,8 @@ from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, command_before, like
+from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_controller, dependencies_of_command, embedded
 from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
 from fpirhc.controllers.path import Pairs
@@ -98,26 +99,26 @@ class Estimating(ControllerWrapper):
             f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another",
         )
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        modelled = self.inner_problem(problem)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        modelled = self.inner_problem(built.problem)
         following = with_setting(self.controller, "follows_model", True) if self.at_once else None
         controller = following or self.controller
-        inner = compose_controller(modelled, controller)
+        inner = compose_controller(build(modelled, controller))
         if "parameters" not in dependencies_of_command(inner):
             raise NotSupported(
                 f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
                 "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon"
             )
         outputs = self.estimator.reads_outputs(modelled.plant)
-        age = response_age(problem.plant) if self.estimator.reads_response(modelled.plant) else 0
-        pairs = Pairs(problem, self.dead_time or problem.dead_time, outputs, age)
+        age = response_age(built.plant) if self.estimator.reads_response(modelled.plant) else 0
+        pairs = Pairs(built.problem, self.dead_time or built.problem.dead_time, outputs, age)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
-        acted = replace(command_before(problem), name="_acted")
+        acted = replace(built.before, name="_acted")
         blocks = [
             _estimate_block(pairs, modelled, self.estimator, believed, acted),
             embedded("controller", inner, {"parameters": believed}),
         ]
-        return blocks, [Delay(acted, problem.plant.input.name)]
+        return blocks, [Delay(acted, built.plant.input.name)]
 
 
 def _estimate_block(

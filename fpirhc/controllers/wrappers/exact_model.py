@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.contract import ControllerWrapper, PlantModel
 from fpirhc.plant.motion import known_exactly
 from fpirhc.plant.plant import Plant
@@ -35,8 +36,8 @@ class ExactModel(ControllerWrapper):
         plant = problem.moves.as_model(problem.plant)
         return PlantModel(plant, really_known(problem.signals), exact=True)
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        return self.controller.blocks(self.inner_problem(problem))
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return self.controller.blocks(build(self.inner_problem(built.problem), self.controller))
 
 
 _EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper, require_controlled_response
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
@@ -200,17 +201,17 @@ class Predicted(ControllerWrapper):
         if self._length(problem) > MOST:
             raise InvalidValue(f"Predicted: {self._length(problem)} cycles of dead time, more than {MOST}")
 
-    def blocks(self, problem: Problem) -> tuple[list[Block], list[Delay]]:
-        plant = problem.plant
-        if not self._length(problem):
-            return self.controller.blocks(problem)
-        inner = compose_controller(problem, self.controller, ahead=True)
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        plant = built.plant
+        if not self._length(built.problem):
+            return self.controller.blocks(build(built.problem, self.controller))
+        inner = compose_controller(build(built.problem, self.controller), ahead=True)
         ahead = {"time": like(time_signal(plant), "time_ahead"), "state": like(plant.state, "state_ahead")}
         ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
         sent = self.by.sent(plant)
-        before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
-        predict = _predict_block(problem, self, self._queue(problem), before, tuple(ahead.values()))
+        before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(built.problem))
+        predict = _predict_block(built.problem, self, self._queue(built.problem), before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
     def _queue(self, problem: Problem) -> Queue:
