@@ -12,7 +12,6 @@ from dataclasses import replace
 
 from fpirhc.controllers.base import like
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.observable import check_believed
 from fpirhc.controllers.path import (
     ACTED,
     MEASURED,
@@ -23,7 +22,7 @@ from fpirhc.controllers.path import (
     measured_state,
 )
 from fpirhc.controllers.reference_states import with_reference
-from fpirhc.controllers.seeing import seeing_blocks
+from fpirhc.controllers.seeing import check_believed, seeing_blocks
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals

@@ -1,25 +1,33 @@
-"""What a controller sees: from the raw measurements to state, outputs and response; and what sensors show at the start."""
+"""What a controller sees: from the raw measurements to state, outputs and response; what sensors show at the start.
+
+A controller is refused states that cannot be right: where no measurement corrects an error, and it stays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.contract import Controller, refuse
 from fpirhc.controllers.path import believe_block, stated_path
+from fpirhc.controllers.reference_states import nominal_motion
+from fpirhc.errors import NoAnswer
+from fpirhc.horizon.nominal import nominal_run, reference_state
 from fpirhc.plant.chain import measured_signals
-from fpirhc.plant.maps import response_age
+from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import response_names
+from fpirhc.sensing.base import members, response_names, slowest, unobservable, values_of
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.limits import Interval
-from fpirhc.task.problem import Problem
+from fpirhc.task.problem import Problem, nominal_start
 
 _SHOWN: Latest[np.ndarray] = Latest(8)
 
@@ -139,3 +147,96 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
     reads, own = Layout((measured, plant.state, plant.parameter)), Layout((*memory, scalar("ahead_cycles")))
     ahead = Block("steps_ahead", reads, Layout((plant.output,)), step, own)
     return [replace(estimate, step=renamed, writes=writes), ahead]
+
+
+_INSTANTS = 25
+_STAYS = 1e-9  # share of the fastest pole below which an error counts as staying
+
+
+def check_believed(problem: Problem, controller: Controller) -> None:
+    """Raise if a controller cannot be given believed states, or errors of them are neither observed nor decay.
+
+    Raises:
+        NotSupported: the controller adapts to what is believed, or has a model with other parameters.
+        NoAnswer: an error that no measurement corrects stays.
+    """
+    if problem.sensing.observer is None:
+        return
+    refuse(_against(problem, controller))
+    _check_observed(problem)
+
+
+@lru_cache(maxsize=8)  # several controllers are checked on one problem
+def _check_observed(problem: Problem) -> None:
+    plant, observer = problem.plant, problem.sensing.observer
+    assert observer is not None
+    names = observer.uses(problem.sensing.measures(plant))
+    states, slopes, shown = _linearised(problem, names)
+    size = np.maximum(np.abs(states).max(axis=0), np.abs(problem.start_state))
+    size[size == 0] = 1.0
+    scaled = [a * size / size[:, None] for a in slopes]
+    basis = unobservable(scaled, [c * size for c in shown])
+    pole = slowest(scaled, basis, growth_of(plant))
+    fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
+    if pole >= -_STAYS * fastest:
+        hidden = [plant.state.elements[k] for k in members(basis)]
+        raise NoAnswer(
+            f"{type(observer).__name__}: {' and '.join(hidden)} cannot be observed along the reference from {', '.join(names)}, "
+            f"and an error of what is believed does not decay (pole {pole:.3g} {problem.rate_unit}); measure {hidden[0]}, or "
+            "another quantity that depends on it"
+        )
+
+
+def _against(problem: Problem, controller: Controller) -> Iterator[str]:
+    """Reasons against believed states."""
+    sensing, plant = problem.sensing, problem.plant
+    lost = sensing.believed_response(plant)
+    if lost and controller.deformation.adapts:
+        yield (
+            f"the response that {type(controller.deformation).__name__} compares needs {', '.join(lost)}, which no sensor shows: "
+            "the model's own response is the request, from which nothing can be learned. Measure it, or choose an estimator of "
+            f"what is measured ({', '.join(sensing.measures(plant))})"
+        )
+    model = controller.plant_model(problem).plant
+    if model.parameter.elements != plant.parameter.elements:
+        yield (
+            f"{type(controller).__name__} has a model with other parameters than the problem's, and states are believed by the "
+            "problem's; leave the observer out, or give both the same parameters"
+        )
+
+
+def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """States of the reference, shape (instants, nx), and there dx'/dx and the Jacobian of the measured quantities."""
+    plant = problem.plant
+    x, u, p = plant.symbols()
+    values = values_of(plant, x, u, p)
+    shown = ca.vertcat(*(values[n] for n in names))
+    rate = plant.equations.rate(x, u, p)
+    jacobians = ca.Function("fpirhc_observed", [x, u, p], [ca.jacobian(rate, x), ca.jacobian(shown, x)])
+    states, slopes, seen = [], [], []
+    for state, needed in _points(problem):
+        slope, part = (np.asarray(m.full()) for m in jacobians(state, needed, plant.approximate))
+        if np.isfinite(slope).all() and np.isfinite(part).all():
+            states.append(state)
+            slopes.append(slope)
+            seen.append(part)
+    if not slopes:
+        raise NoAnswer("believed states: the model has no finite Jacobian along the reference")
+    return np.array(states), slopes, seen
+
+
+def _points(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """States and inputs of the model along the reference, or of a simulation where it does not give the states."""
+    plant = problem.plant
+    if plant.equations.known_on_reference:
+        reference, needed = nominal_motion(problem), problem.inputs_before
+        for t in np.linspace(0.0, problem.duration, _INSTANTS):
+            outputs, response = reference(t)
+            state = reference_state(plant, outputs)
+            if len(plant.controlled_names) == len(plant.inputs):
+                needed = np.asarray(plant.equations.inverse(state, response, plant.approximate).full())
+            yield np.asarray(state.full()).ravel(), needed.ravel()
+        return
+    states, inputs = nominal_run(problem.plant, problem.reference, *nominal_start(problem))
+    for k in np.unique(np.linspace(0, states.shape[1] - 1, _INSTANTS).astype(int)):
+        yield states[:, k], inputs[:, k]
