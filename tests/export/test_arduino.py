@@ -24,6 +24,7 @@ def test_an_arduino_library_replays_in_float(tmp_path):
     sketch = (tmp_path / "board" / "examples" / "arm" / "arm.ino").read_text()
     assert "#include <arm.h>" in sketch
     assert "@" not in sketch
+    assert "TOO LONG for a period of" in sketch
     src = tmp_path / "board" / "src"
     (tmp_path / "type.c").write_text(
         '#define Q1 17\n#include "arm.h"\nextern char is_float[sizeof(((arm_command*)0)->Q1) == 4 ? 1 : -1];\n'
@@ -50,21 +51,3 @@ def test_an_arduino_library_replays_in_float(tmp_path):
     )
     assert done.returncode == 0, done.stdout
     assert "2000 cycles" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("name", "title", "said"),
-    [
-        (
-            "two_mass",
-            "CTC+FPI (eq 6)",
-            " ms: TOO LONG. The period is 0.001 s",
-        ),  # 3.1 ms in simavr with the shortest code
-        ("anaesthesia", "CTC+FPI", " ms. The period is 0.0833333 min"),
-        ("leaking_tanks", "RHC+FPI", "A plan takes an Uno a tenth of a second and more. The period is 1 s"),
-    ],
-)
-def test_the_time_of_a_step_stands_beside_the_period(name, title, said, tmp_path):
-    exported(tmp_path / "board", name, title, "arduino")
-    assert said in (tmp_path / "board" / "clock.txt").read_text()
-    assert "TOO LONG for a period of" in (tmp_path / "board" / "examples" / "arm" / "arm.ino").read_text()

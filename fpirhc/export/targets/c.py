@@ -13,11 +13,9 @@ from importlib import resources
 import numpy as np
 
 from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
-from fpirhc.errors import InvalidValue
 from fpirhc.export.device import Device, identifiers, in_comment, literal
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
-from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.clock import LONGEST, MEMORY
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.status import Status
@@ -62,16 +60,6 @@ TARGET = Target("c", "C99 without heap, files and globals: header, controller, l
 def filled(device: Device, file: str, **more: str) -> str:
     """Return a template of this folder with its words between @ filled in."""
     return template(file, {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more})
-
-
-def seconds(device: Device, where: str) -> float:
-    """Return the period in seconds, for a target that runs in real time."""
-    unit = device.problem.plant.time_unit
-    if unit not in SECONDS:
-        raise InvalidValue(
-            f"{where} runs in real time: a period in {', '.join(SECONDS)} was expected, got one in {unit}"
-        )
-    return float(device.problem.period) * SECONDS[unit]
 
 
 def template(file: str, words: Mapping[str, str], package: str = "fpirhc.export.targets") -> str:
@@ -265,7 +253,7 @@ def _setter(device: Device) -> str:
     if not device.bounds:
         return ""
     paths = list(device.bounds)
-    other = [_other_end(path, device) for path in paths]
+    other = [_other_end(path, paths) for path in paths]
     places = [device.settings.slice(PREFIX + path).start for path in paths]
     low, high = (np.array([ends[k] for ends in device.bounds.values()]) for k in (0, 1))
     tables = of_type("\n".join([_table("LOWEST", low), _table("HIGHEST", high)])).replace(OF_TYPE, "")
@@ -289,19 +277,11 @@ int {device.name}_set({device.name}_controller* c, {device.name}_setting setting
 """
 
 
-def _other_end(path: str, device: Device) -> int:
-    """K + 1 for the lower end of an interval whose upper end is setting k, -k - 1 for its upper end, else 0.
-
-    Two numbers are an interval, and no list of gains, where Python's check lets neither pass the other: their bounds say so.
-    """
+def _other_end(path: str, paths: list[str]) -> int:
+    """K + 1 for the lower end of limits whose upper end is setting k, -k - 1 for the upper end, else 0."""
     owner, _, end = path.rpartition(".")
-    paths, (low, high) = list(device.bounds), (f"{owner}.0", f"{owner}.1")
-    if end not in ("0", "1") or low not in paths or high not in paths:
-        return 0
-    numbers = device.stepper.numbers
-    if device.bounds[low][1] > numbers[high] or device.bounds[high][0] < numbers[low]:
-        return 0
-    return paths.index(high) + 1 if path == low else -paths.index(low) - 1
+    other = f"{owner}.{1 - int(end)}" if path.startswith("limits.") and end in ("0", "1") else ""
+    return 0 if other not in paths else (paths.index(other) + 1) * (1 if end == "0" else -1)
 
 
 def _table(name: str, values: np.ndarray) -> str:

@@ -180,23 +180,6 @@ fmi2Status fmi2DoStep(fmi2Component instance, fmi2Real point, fmi2Real length, f
   return take_step(&u->s, point, length) ? fmi2OK : failed(u, fmi2Error, WRONG_STEP);
 }
 
-fmi2Status fmi2GetFMUstate(fmi2Component instance, fmi2FMUstate* state) {
-  if (!*state) *state = malloc(sizeof(cycle_state));
-  if (!*state) return fmi2Error;
-  return memcpy(*state, &((unit*)instance)->s, sizeof(cycle_state)), fmi2OK;
-}
-
-fmi2Status fmi2SetFMUstate(fmi2Component instance, fmi2FMUstate state) {
-  return memcpy(&((unit*)instance)->s, state, sizeof(cycle_state)), fmi2OK;
-}
-
-fmi2Status fmi2FreeFMUstate(fmi2Component instance, fmi2FMUstate* state) {
-  (void)instance;
-  free(*state);
-  *state = 0;
-  return fmi2OK;
-}
-
 /* A state is not written as bytes. */
 fmi2Status fmi2SerializeFMUstate(fmi2Component instance, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
   (void)instance, (void)state, (void)bytes, (void)size;

@@ -11,7 +11,7 @@ import re
 import uuid
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,28 +28,14 @@ from fpirhc.symbolic.open import PREFIX
 
 @dataclass(frozen=True)
 class Variable:
-    """A number that a master sees.
+    """A number that a master sees."""
 
-    Args:
-        name: with derivatives as der(name, n), as FMI spells them.
-        unit: empty where there is none.
-        causality: by which FMI says who writes it.
-        variability: by which FMI says when it changes.
-        start: value at the beginning; None where it is computed.
-        bounds: ends of the interval that is taken; infinite where there is none.
-    """
-
-    name: str
-    unit: str
-    causality: str
-    variability: str = "discrete"
-    start: float | None = None
+    name: str  # with derivatives as der(name, n), as FMI spells them
+    unit: str  # empty where there is none
+    causality: str  # by which FMI says who writes it
+    variability: str = "discrete"  # by which FMI says when it changes
+    start: float | None = None  # None where it is computed
     bounds: tuple[float, float] = (-np.inf, np.inf)
-
-    def attributes(self, number: int) -> dict[str, str]:
-        """Return name, reference, and by whom and when the number is changed."""
-        own = {"causality": self.causality, "variability": self.variability}
-        return {"name": self.name, "valueReference": str(number), **own}
 
     @property
     def facts(self) -> dict[str, str]:
@@ -78,7 +64,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     library = shared_library({**files, **headers})
     if library and library.platform in _FOLDERS:
         contents[f"binaries/{_FOLDERS[library.platform]}/{device.name}{library.ending}"] = library.content
-    return {f"{device.name}.fmu": _archive(contents), "README.md": _page(device, variables, contents)}
+    return {f"{device.name}.fmu": _archive(contents)}
 
 
 TARGET = Target("fmu2", "FMI 2.0 unit for co-simulation", _files)
@@ -158,18 +144,10 @@ def _settings(device: Device) -> dict[str, str]:
 
 
 def _described(device: Device, token: str, variables: list[Variable], files: list[str]) -> str:
-    root = ET.Element(
-        "fmiModelDescription",
-        {
-            "generationTool": "fpirhc",
-            "variableNamingConvention": "structured",
-            "fmiVersion": "2.0",
-            "modelName": device.title,
-            "guid": token,
-        },
-    )
-    facts = {"canHandleVariableCommunicationStepSize": "false", "canGetAndSetFMUstate": "true"}
-    unit = ET.SubElement(root, "CoSimulation", {"modelIdentifier": device.name, **facts})
+    kind = {"fmiVersion": "2.0", "generationTool": "fpirhc", "variableNamingConvention": "structured"}
+    root = ET.Element("fmiModelDescription", {**kind, "modelName": device.title, "guid": token})
+    facts = {"modelIdentifier": device.name, "canHandleVariableCommunicationStepSize": "false"}
+    unit = ET.SubElement(root, "CoSimulation", facts)
     listed = ET.SubElement(unit, "SourceFiles")
     for file in files:
         ET.SubElement(listed, "File", name=file)
@@ -180,7 +158,8 @@ def _described(device: Device, token: str, variables: list[Variable], files: lis
     ET.SubElement(root, "DefaultExperiment", startTime="0", stopTime=end, stepSize=period)
     listed = ET.SubElement(root, "ModelVariables")
     for k, one in enumerate(variables):
-        scalar = ET.SubElement(listed, "ScalarVariable", one.attributes(k))
+        own = {"name": one.name, "valueReference": str(k), "causality": one.causality, "variability": one.variability}
+        scalar = ET.SubElement(listed, "ScalarVariable", own)
         ET.SubElement(scalar, "Integer" if one is STATUS else "Real", one.facts)
     structure = ET.SubElement(root, "ModelStructure")
     for tag in ("Outputs", "InitialUnknowns"):
@@ -212,29 +191,3 @@ def _archive(contents: Mapping[str, str | bytes]) -> bytes:
         for name, content in contents.items():
             archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
-
-
-def _page(device: Device, variables: list[Variable], contents: Iterable[str]) -> str:
-    platforms = sorted(name.split("/")[1] for name in contents if name.startswith("binaries/"))
-    libraries = ", ".join(platforms) or "none: no compiler was found, and a tool must build the sources"
-    rows = [f"| `{one.name}` | {one.unit} | {one.causality} |" for one in variables if one.causality != "local"]
-    unit = device.problem.plant.time_unit
-    return f"""# {device.title}
-
-`{device.name}.fmu` is a unit of FMI 2.0 for co-simulation, with sources. Libraries in it: {libraries}.
-Whoever builds the sources leaves fused multiplications out (gcc and clang: -ffp-contract=off), or the last bits are others.
-
-- A communication step is one period, {float(device.problem.period)!r} {unit}, and begins where the last one ended; others are
-  refused.
-- A command follows from the inputs of its own cycle: set the inputs, get the commands, then take the step. A master that exchanges
-  values after each step alone gives the plant every command one period late; state that dead time in the problem, or let the master
-  pass inputs through.
-- `status` is the number of the cycle's status, 0 where nothing happened; the command is held where a sample could not be used.
-- Settings that are not finite, outside their bounds, or on the wrong side of the other end of their interval are discarded.
-
-| variable | unit | causality |
-|---|---|---|
-{chr(10).join(rows)}
-
-`trace.*` are all signals of the cycle, as local variables.
-"""

@@ -1,4 +1,4 @@
-"""A WebAssembly module with its wrapper in JavaScript, types, and a replay for Node."""
+"""A WebAssembly module with its wrapper in JavaScript and a replay for Node."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 
 from fpirhc.export.binaries import web_module
-from fpirhc.export.device import Device, identifiers
+from fpirhc.export.device import Device
 from fpirhc.export.samples import recorded
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import data_of, filled, layout_of, sources
@@ -24,39 +24,10 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     return {
         f"{name}.wasm": web_module(files),
         f"{name}.mjs": filled(device, "wasm.mjs", layout=text, data=json.dumps(list(structs))),
-        f"{name}.d.ts": _types(device, list(structs)),
         "layout.json": text,
         "samples.bin": recorded(device),
         "replay.mjs": filled(device, "wasm_replay.mjs"),
     }
 
 
-TARGET = Target("wasm", "WebAssembly with a wrapper in JavaScript and types", _files)
-
-
-def _types(device: Device, structs: list[str]) -> str:
-    settings = " | ".join(json.dumps(path) for path in device.bounds) or "never"
-    rows = "\n".join(f"    {name}: Float64Array;" for name in identifiers(structs))
-    return f"""// {device.title}. Made by fpirhc.
-export interface Column {{ name: string; unit: string; start: number; }}
-export const layout: {{
-  name: string; of: string; period: number; time_unit: string;
-  status: Record<string, number>;
-  bounds: Record<string, [number | null, number | null]>;
-  inputs: Column[]; command: Column[]; memory: Column[]; trace: Column[];
-}};
-export type Setting = {settings};
-export class Controller {{
-  readonly inputs: Float64Array;
-  readonly command: Float64Array;
-  readonly memory: Float64Array;
-  readonly trace: Float64Array;
-  readonly data: {{
-{rows}
-  }};
-  step(sample: ArrayLike<number>): number;
-  reset(): void;
-  set(path: Setting, value: number): boolean;
-}}
-export function load(source: BufferSource | Response): Promise<Controller>;
-"""
+TARGET = Target("wasm", "WebAssembly with a wrapper in JavaScript", _files)
