@@ -1,7 +1,5 @@
 """Loops are compiled without optimising: a third of the time, the same bits. Tests of C are as users have it; exports at night."""
 
-from __future__ import annotations
-
 import os
 import signal
 

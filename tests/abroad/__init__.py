@@ -8,8 +8,6 @@ half_rule        Skogestad's dead time and lag, a model without the lag; variant
 own_map          a user's own deformation and a dead time; controller `unpaired`
 """
 
-from __future__ import annotations
-
 import importlib
 from dataclasses import replace
 from pathlib import Path

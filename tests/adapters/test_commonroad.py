@@ -1,7 +1,5 @@
 """A car of CommonRoad behind a model of its heading: the derivative is the package's own, and wrong uses are told."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any
 

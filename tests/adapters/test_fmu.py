@@ -1,7 +1,5 @@
 """A functional mock-up unit, built here from a Python class, behind a model of the same tank."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A body of MuJoCo behind a model of the textbook: the equations are MuJoCo's own, and adaptation pays where the model is wrong."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

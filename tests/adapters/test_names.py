@@ -1,7 +1,5 @@
 """What every adapter does with wrong input: one error that names the adapter, also where its package raises."""
 
-from __future__ import annotations
-
 import inspect
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Machines: cycles by the clock on the wall, which is the test's own, and what a machine is left with when a run ends."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import signal

@@ -1,7 +1,5 @@
 """A quadrotor of RotorPy behind a point mass: what it carries and the wind act, and wrong uses are told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The Temperature Control Lab behind two energy balances: its twin, and the board with a clock of the test's own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

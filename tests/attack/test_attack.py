@@ -1,7 +1,5 @@
 """A machine survives what sensors, actuators, clocks and disks do: a share of the attacks here, all of them with `-m slow`."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """Certificates of limits: no plant of the box leaves what they state, and the laws of the proof hold in the loop."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise

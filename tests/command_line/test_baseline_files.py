@@ -1,7 +1,5 @@
 """Baselines: what bands are made of, what a baseline file may be, which problems are checked, and the pytest plugin."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

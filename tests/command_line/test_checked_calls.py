@@ -1,7 +1,5 @@
 """A wrong argument of a function is one error that names all of them, before anything runs, with what to write instead."""
 
-from __future__ import annotations
-
 import inspect
 import pickle
 from collections.abc import Callable

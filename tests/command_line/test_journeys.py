@@ -1,7 +1,5 @@
 """The command line as it is used: a table of journeys with exit codes and first lines, and what all commands share."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

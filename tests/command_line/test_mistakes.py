@@ -4,8 +4,6 @@ Each case changes one place of a correct file. What stands in a message is what 
 there, and what to write instead. `test_wrong_files` has the mistakes of people who come from other tools.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any

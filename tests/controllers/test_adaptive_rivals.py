@@ -1,7 +1,5 @@
 """Controllers that learn: the classical rules, what projection and a deformation add, and learning behind dead time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace

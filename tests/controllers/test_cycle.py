@@ -1,7 +1,5 @@
 """One cycle of a controller by value: loops written out in numpy, commands at their limits, and automatic settings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A gain beyond the limit of its iteration is refused, built in or given while the loop runs, unless it is asked for."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

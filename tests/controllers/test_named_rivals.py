@@ -1,7 +1,5 @@
 """Rivals by their names: the published equations as runs, and where they are the fixed-point iteration command by command."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Limits of rates are kept in the command of every controller, as limits of inputs are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Rivals: each law does what its textbook says, fits or is refused before a run, and is one step in C as in CasADi."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

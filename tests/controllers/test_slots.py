@@ -1,7 +1,5 @@
 """Time slots: stability of schedules, relative orders, continuity at switches, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any

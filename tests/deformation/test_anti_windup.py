@@ -1,7 +1,5 @@
 """A step of 2 m with a weak actuator: a clipped command is stored as the request it means, and the integral stays out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

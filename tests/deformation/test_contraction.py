@@ -1,7 +1,5 @@
 """Contraction as a run shows it: which gains are refused and with what advice, and the predicted and the measured factor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

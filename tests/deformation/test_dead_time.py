@@ -1,7 +1,5 @@
 """Dead time: where loops lose their stability, and what pairing, prediction and an estimate give back."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

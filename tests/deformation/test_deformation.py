@@ -1,7 +1,5 @@
 """Laws of the deformation maps: fixed point, gains, convergence and its limits."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from decimal import Decimal, getcontext

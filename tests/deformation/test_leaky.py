@@ -1,7 +1,5 @@
 """Leaky pairing: stable for every dead time within the uncertainty, by the theorem, by the map itself, and on a plant."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

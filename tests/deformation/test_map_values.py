@@ -1,7 +1,5 @@
 """Every fact of the maps by value, from the published formulas and not from the code's forms of them."""
 
-from __future__ import annotations
-
 import math
 
 import casadi as ca

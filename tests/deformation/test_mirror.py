@@ -1,7 +1,5 @@
 """The mirror: the model's response seen as the plant's is, behind estimators, quanta, dead time, and an actuator's lag."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

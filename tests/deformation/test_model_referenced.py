@@ -1,7 +1,5 @@
 """The model-referenced form: an exact model is left alone; an estimate and incremental inversion are its cases; its worth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The null test: with the approximate model as plant there is nothing to adapt."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

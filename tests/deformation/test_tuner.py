@@ -1,7 +1,5 @@
 """A tuner finds its gain on line, follows jumps of the plant's, and survives noise; a denoiser in place of a low-pass."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

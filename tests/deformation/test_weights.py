@@ -1,7 +1,5 @@
 """A gain matrix: what it does to coupled responses, what is refused, and that every part of a review knows it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

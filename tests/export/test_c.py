@@ -1,7 +1,5 @@
 """Controllers as C99: the replay of recorded cycles with faults is the stepper bit by bit, and a device checks what it is told."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The lab: a page has the numbers of the one loop, and a slider that would need Python is left out with its reason."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Random settings, samples, faults and instances: what leaves Python answers as the stepper, in double bit by bit."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator, Sequence
 from functools import cache

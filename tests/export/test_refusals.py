@@ -1,7 +1,5 @@
 """What `fpirhc export` refuses, and what it says: the whole message of each, with what to do instead."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

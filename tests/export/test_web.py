@@ -1,7 +1,5 @@
 """Controllers as WebAssembly: the commands of Python, and a wrapper that checks what it is told."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Small problems with baselines that several tests share: a mass with a wrong model, with a horizon and with noise."""
 
-from __future__ import annotations
-
 LINE = '''"""A mass on a line with a wrong gain."""
 import casadi as ca
 import fpirhc as fp

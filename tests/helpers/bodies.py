@@ -1,7 +1,5 @@
 """Bodies with known answers: q'' = Lambda lag(u(t - d T)) - .5 v - 2 sin(q) + sin(1.3 t + k); the model is q'' = u."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -1,7 +1,5 @@
 """A linear plant along a sine, its realities - behind a lag, behind a slow sensor, outside - and controllers of it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Shipped problems with another deformation or an exact model, for several tests."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Controllers that leave Python by `fpirhc export`, beside the stepper that they are to answer as."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A solver that fails: an optimiser of a user's own whose Function raises as CasADi's solvers do."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The extended Kalman filter of the books in numpy, with Jacobians by the complex step, beside which observers are tested."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -3,8 +3,6 @@
 And any problem in another form: its coordinates as outputs.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

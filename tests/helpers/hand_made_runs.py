@@ -1,7 +1,5 @@
 """Runs that are made by hand, on a plant with one coordinate [m] and one input [N]."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 

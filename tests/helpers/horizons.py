@@ -1,7 +1,5 @@
 """Optimal control problems that are posed by hand, and plans rolled out stage by stage."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Deformations alone: one scalar iteration with its memory, and how fast it goes when its pairs are late."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -7,8 +7,6 @@ least squares, and the residual is the largest entry of
     gamma (g - sum z_i sign_i dw_i/dU) / (half range),      gamma = (half range)^2 / C.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import casadi as ca

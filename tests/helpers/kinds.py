@@ -1,7 +1,5 @@
 """The shipped problems as parameters of a law: one of each kind, and all of them in the slow lane."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Pages of `fpirhc export --to lab`: the data in them, and the runs of Python that they are to equal."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

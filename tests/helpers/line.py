@@ -1,7 +1,5 @@
 """The text of a problem file that several tests write: a mass on a line, y'' = b u - k y, with a wrong gain."""
 
-from __future__ import annotations
-
 _PLANT = '''"""A mass on a line with a wrong gain."""
 import casadi as ca
 import fpirhc as fp

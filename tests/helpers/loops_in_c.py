@@ -1,7 +1,5 @@
 """Horizons on which the loops in C are compared with the graphs that define them, call by call and number by number."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass

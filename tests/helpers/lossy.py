@@ -1,7 +1,5 @@
 """A stepper and its plant in a loop whose samples are lost, or whose cycles the caller misses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from typing import Any
 

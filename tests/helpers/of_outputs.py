@@ -1,7 +1,5 @@
 """Plants whose outputs are expressions of their states: the hand of an arm, and a depth that a Hill curve makes of a level."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

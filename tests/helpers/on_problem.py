@@ -1,7 +1,5 @@
 """The shipped examples of controllers, each with the problem that it is tried on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

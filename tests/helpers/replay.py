@@ -1,7 +1,5 @@
 """A run given again to a Stepper, sample by sample: what a controller on a machine would have commanded."""
 
-from __future__ import annotations
-
 import numpy as np
 
 import fpirhc as fp

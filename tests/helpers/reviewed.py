@@ -1,7 +1,5 @@
 """Small plants of which a review is asked, and the answers about a mass whose model is too heavy, by their keys."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

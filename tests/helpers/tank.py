@@ -1,7 +1,5 @@
 """A tank that moves by itself whenever the clock of its cycles waits, for tests of field buses."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import fpirhc as fp

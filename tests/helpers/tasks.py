@@ -1,7 +1,5 @@
 """The shipped problems as attributes, `tasks.two_mass`: each is loaded once in a process, and not before a test reads it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache

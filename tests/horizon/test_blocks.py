@@ -1,7 +1,5 @@
 """Move blocking, and the terminal weight of costs on rates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

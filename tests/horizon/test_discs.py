@@ -1,7 +1,5 @@
 """Three discs on a shaft with two lagging motors (the oscillating masses of do-mpc's examples), planned every tenth cycle."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

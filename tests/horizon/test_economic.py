@@ -6,8 +6,6 @@ Automatic Control 56(3), 2011, example V-B: A -> B of first order in a stirred t
 distance from it, which makes it optimal for the dynamic problem too.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.horizons import horizon_of

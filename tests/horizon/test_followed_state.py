@@ -1,7 +1,5 @@
 """Deviations of inputs on plants with outputs: allowed where all states follow from the outputs, refused by name elsewhere."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """The horizon: auxiliary function, adjoint gradient, costs and their mistakes."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What cannot be kept is named with its reason: a double integrator |u| <= 1 m/s2, whose best braking is known by hand."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

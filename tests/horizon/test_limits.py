@@ -1,7 +1,5 @@
 """Limits of states, rates, paths and the horizon's end: the same plans as an independent solver, and names in every complaint."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

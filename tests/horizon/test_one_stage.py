@@ -1,7 +1,5 @@
 """Horizons of one stage, down to one state and one input: every optimiser finds the optimum, which is a clipped quadratic's."""
 
-from __future__ import annotations
-
 from math import factorial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plans that follow one another sooner than a stage, and stages of several lengths: `Horizon(replan=..., lengths=...)`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

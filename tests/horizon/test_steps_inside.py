@@ -1,7 +1,5 @@
 """Limits of a map hold at every step of a stage: an oscillator whose stage is a whole period hides its swing from the nodes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plans that keep a margin from limits of states."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

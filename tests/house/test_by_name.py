@@ -1,7 +1,5 @@
 """Whatever has names as keys and a user reaches: a name that is not there is one clear error with the nearest valid one."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass, replace

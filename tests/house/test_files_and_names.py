@@ -1,7 +1,5 @@
 """What meets the world around: files that are written, names of letters, runs that are not finite."""
 
-from __future__ import annotations
-
 import os
 import stat
 from dataclasses import replace

@@ -4,8 +4,6 @@ The first assertions of a test say what the library does. Where one of them fail
 superfluous; where a later one fails, the guard does not hold.
 """
 
-from __future__ import annotations
-
 import pickle
 import warnings
 from typing import Any

@@ -1,7 +1,5 @@
 """Families and values: members are found by looking and do not know each other, and values do not change under who holds them."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

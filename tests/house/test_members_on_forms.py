@@ -7,8 +7,6 @@ stands below with the sentence that its user reads; every other refusal is a def
 tried on all forms, and a new form with all members: a third of the pairs at once, a Latin square, the others in the slow lane.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

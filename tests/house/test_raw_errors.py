@@ -1,7 +1,5 @@
 """Calls with values that nobody expected raise an error of the library, which says what is wrong, and no raw one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

@@ -4,8 +4,6 @@ Each of the 41 differs in one thing from a member that keeps all laws. A law tha
 into every comparison.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Learning the model: estimates equal batch formulas, remove offsets, keep bounds, and are refused where they cannot work."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Learners behind dead time and estimators, disturbances seen in the response, and estimates that act in every cycle."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

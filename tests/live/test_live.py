@@ -1,7 +1,5 @@
 """Live settings: one compiled loop for every setting, bit by bit the loop that would be built with the number."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Every number of every member is open and runs as in the loop built with it, or is refused by its path and the place."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

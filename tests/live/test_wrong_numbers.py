@@ -1,7 +1,5 @@
 """Whatever is given as a setting, a set-point or a time is refused and counted, or ends in one clear error; never in a raw one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

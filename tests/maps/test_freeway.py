@@ -3,8 +3,6 @@
 The reference is a run of 900 steps of FilippoAiraldi/sym-metanet (MIT licence, tests/data/freeway/LICENSE), every twentieth row.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

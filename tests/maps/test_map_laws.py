@@ -3,8 +3,6 @@
 References: scipy.signal.cont2discrete; the same controllers on the differential equation; finite sums in numpy.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

@@ -4,8 +4,6 @@ Laws: with an exact model a run is the loop by hand, deadbeat in r steps, and no
 iteration helps, once its pairs are complete; poles in z are the poles of the run.
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

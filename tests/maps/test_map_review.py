@@ -1,7 +1,5 @@
 """Reviews of maps: what is left of a push is the decay of the run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

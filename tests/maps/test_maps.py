@@ -4,8 +4,6 @@ Laws: a run is the loop that is written by hand in numpy; a cycle of several ste
 output is counted in cycles; what does not fit a map is refused by name.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise

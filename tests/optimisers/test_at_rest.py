@@ -1,7 +1,5 @@
 """At rest on the reference the first plan is the feedforward: the optimum of cost zero, wherever the set-point is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import sin, sqrt

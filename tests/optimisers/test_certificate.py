@@ -1,7 +1,5 @@
 """Certificates: the predicted contraction is the measured one, and no bound is ever below the true error."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

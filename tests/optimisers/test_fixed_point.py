@@ -1,7 +1,5 @@
 """Fixed-point iteration in place of the reduced gradient: its laws, against independent solvers and dense algebra."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fixed-point iteration with limits of states: other people's plants, random linear plants, infeasible horizons."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

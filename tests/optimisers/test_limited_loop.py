@@ -1,7 +1,5 @@
 """Loops with limits of states: every call ends where its plan is solved, or says what is the matter within its most iterations."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -3,8 +3,6 @@
 Calls that are cut off after some turns show what each turn does: a pure step, a barrier, a filter, another first plan, a descent.
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -4,8 +4,6 @@ The graph is the definition and runs in the virtual machine. Both do the same op
 operator or a constant that differs shows at once.
 """
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Optimisers: every plan is stationary or says that it is not; all find the same optimum."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

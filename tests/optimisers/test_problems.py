@@ -1,7 +1,5 @@
 """The shipped problems: plans agree with an independent solver, and one iteration per cycle is enough."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Status OK is a promise about the plan that is sent: on an unstable plant a plan that is not solved says so."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The published fixed-point optimiser and its reduced form: what they promise, and why the default is another one."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

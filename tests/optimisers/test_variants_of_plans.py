@@ -1,7 +1,5 @@
 """A run of a variant is a run of the problem that is built with it, also where plans know the exact parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A fixed-point iteration on the target of an inner controller: pairing, stability, limits, and what may stand inside."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -4,8 +4,6 @@ The foreign plant is a heating element: P = u^2 / (R (1 + alpha theta)), C theta
 once and drifts with the temperature theta, which is measured.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -4,8 +4,6 @@ Laws: a plant whose output has the disturbance as an expression of a clock is th
 of y have those of d; a controller holds y, so that h moves the other way.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The three forms of the iteration on outputs, and a rival, are those of loops in numpy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

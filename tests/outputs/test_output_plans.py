@@ -1,7 +1,5 @@
 """Plans that start where the model has the measured outputs keep the limits of the measured state."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -4,8 +4,6 @@ Laws: a plant that is written by its states is the plant; an output by expressio
 outputs, and not those of a wrong model, are what a controller follows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Plants with outputs behind dead time: outputs are predicted with the state, and keep their distance from the model's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -4,8 +4,6 @@ Laws: the filter is a recursion that is written here; a disturbance of a respons
 it; parameters are found from the response of an output.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Signals from outside beside outputs: allowed where no output needs a derivative of a signal that nobody states."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Reviews of plants with outputs: what is left of a push is the decay of a small deviation of the run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

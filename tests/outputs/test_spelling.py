@@ -6,8 +6,6 @@ of the command, u_k = u_{k-1} + (d_k - f_k) / beta^, it is the same one there. T
 Runge-Kutta's formula is the same in both.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Twins of plants with outputs: a model-referenced form behind estimators and dead time of outputs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Integrators: order of convergence, and agreement with CVODES."""
 
-from __future__ import annotations
-
 import itertools
 
 import casadi as ca

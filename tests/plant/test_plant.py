@@ -1,7 +1,5 @@
 """Laws and mistakes of plants."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -4,8 +4,6 @@ The shares are numpy's pseudo-inverse of the weighted effects, every other share
 of a textbook: computed torque in numpy on a plant that SciPy integrates, whose thrusters get their commands one by one.
 """
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp

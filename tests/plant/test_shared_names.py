@@ -1,7 +1,5 @@
 """A coordinate and an input may have one name, as a joint and its motor do: nothing but the name differs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

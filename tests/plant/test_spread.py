@@ -1,7 +1,5 @@
 """What a mismatch of P percent means, with a spread and without one: studies draw from the range that reviews cover."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

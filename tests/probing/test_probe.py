@@ -3,8 +3,6 @@
 Most bodies answer against their model: then nothing is chosen, and the estimates alone cost a moment.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

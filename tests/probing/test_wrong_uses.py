@@ -1,7 +1,5 @@
 """Wrong uses of an external plant and of a probe, as a newcomer makes them, each with its whole message."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The plants of tests/abroad are those of their sources: published trajectories and rest points."""
 
-from __future__ import annotations
-
 import abroad
 import numpy as np
 import pytest

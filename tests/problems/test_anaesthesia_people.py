@@ -3,8 +3,6 @@
 References: Eleveld et al., Br. J. Anaesth. 120, 2018, for its reference individual; scipy for the compartments.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from runpy import run_path

@@ -4,8 +4,6 @@ References: the run of two days and the states at rest of jxx123/simglucose, com
 `test_pictures`.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from functools import cache

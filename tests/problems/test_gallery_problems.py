@@ -5,8 +5,6 @@ steady sliding and at break-away as printed in 1995; the rated thrust of the P22
 their logarithm; SciPy's stiff integrators.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The quadrotor of AdaptiveQuadBench: its equations, its trials and its rivals against what others computed and published."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from pathlib import Path

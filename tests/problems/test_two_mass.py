@@ -4,8 +4,6 @@ Reference numbers: the nominal motion (2.2, 5.4) + 0.3 (sin 2t, sin 3t) m with r
 computed independently with numpy and scipy from the corrected equations.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Dead time and lag that it states are known and not simulated. A run ends by name where its plant leaves its physical range.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

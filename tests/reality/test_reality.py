@@ -1,7 +1,5 @@
 """A reality that is not the model: what moves, what the controller is given, and what "exact" then means."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Realities and foreign bodies of a model with outputs: they have these by name, and states of their own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A signal acts in every step of what moves with the value in its middle; one that changes within such a step is named."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

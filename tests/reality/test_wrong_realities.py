@@ -1,7 +1,5 @@
 """What is wrong with a reality, or with a body outside, is said where the problem is made: what, where, what was expected."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

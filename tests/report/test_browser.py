@@ -3,8 +3,6 @@
 Every test is skipped, with the reason, where there is no browser.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Pictures that a problem wants: what they draw is what the runs hold, and a mistake in one spoils neither file nor report."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

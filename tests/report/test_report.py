@@ -1,7 +1,5 @@
 """The report: one file, safe, complete, or not there."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

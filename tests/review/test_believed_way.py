@@ -1,7 +1,5 @@
 """The null test of a form that believes a lag or a dead time: its right model has them, too."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

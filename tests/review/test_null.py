@@ -1,7 +1,5 @@
 """The null test of a review: with its own model as the plant a controller with adaptation must not do worse than without."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A prediction by a model that lacks a force: its error in closed form, and what the review says of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

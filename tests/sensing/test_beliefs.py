@@ -3,8 +3,6 @@
 Of plants with coordinates, with outputs and of maps. Every observer keeps the public laws.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

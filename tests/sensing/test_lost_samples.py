@@ -3,8 +3,6 @@
 A missed call is a lost sample, and what a gap does to the commands is bounded by what interpolated samples would do.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The batch reactor 2A -> B of Haseltine and Rawlings, Ind. Eng. Chem. Res. 44(8), 2005, which starts at a wrong guess."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Honest sensing: what noise, quanta, lost samples and estimators do to the loop, and what is refused before a run."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What is wrong with sensing is said where it is stated: what, where, what was expected, and how to mend it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

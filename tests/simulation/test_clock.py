@@ -3,8 +3,6 @@
 Late steps are counted and told; the clock of these tests is a list.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from itertools import chain

@@ -4,8 +4,6 @@ The plant is a tank below whose bottom the model has no flow, h' = (u - s sqrt(h
 the model's response to it is none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache

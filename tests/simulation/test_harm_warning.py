@@ -1,7 +1,5 @@
 """A stepper of a controller that does better without its adaptation warns once; who ignores the warning pays nothing."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The closed loop: laws of adaptation, clipping, finiteness, disturbances, and running in several ways."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

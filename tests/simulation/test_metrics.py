@@ -1,7 +1,5 @@
 """Metrics and figures of merit by value: every number that a user reads, on runs that were made by hand."""
 
-from __future__ import annotations
-
 import math
 import pickle
 from dataclasses import replace

@@ -4,8 +4,6 @@ The laws of controllers say so of every controller on two masses between springs
 them remembers a bad sample or a poisoned memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

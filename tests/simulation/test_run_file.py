@@ -1,7 +1,5 @@
 """Saved runs: written at once or not at all, and read with a schema whatever the file holds."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -3,8 +3,6 @@
 The samples reach the controller, because no range is stated here; with `Sensor(range=...)` they are skipped.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The step as a CasADi Function: what a user's own loop and code generation from it do is what the stepper does, bit by bit."""
 
-from __future__ import annotations
-
 import subprocess
 from functools import cache
 from pathlib import Path

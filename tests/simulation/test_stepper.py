@@ -3,8 +3,6 @@
 Nothing in a call is shared, lost or left locked.
 """
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from functools import cache

@@ -11,8 +11,6 @@ user's own equations, a root finder inverts them, and the tracking law and the m
 tasks are ours.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import comb, pi

@@ -1,7 +1,5 @@
 """Ctrl-C in a solver and in a step is an interruption, and no fault of theirs."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Where controllers fail: limits that theory gives exactly, and what is said of them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Rows of a study are kept: killed processes, clusters and an interruption end in the rows of one calm process."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -4,8 +4,6 @@ The laws: the row of a drawn plant, a named case or a cell of a grid is the run 
 with any number of processes, it is the same one.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

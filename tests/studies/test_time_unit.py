@@ -1,7 +1,5 @@
 """A plant whose time is in days says days: signals, metrics, pages, terminals, figures, studies and messages."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tuning: the same budget and cost for all, never worse than before, and the same whether it is disturbed or not."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Layouts and blocks of a user's own: names to places and back, and what is wrong with them."""
 
-from __future__ import annotations
-
 import sys
 
 import casadi as ca

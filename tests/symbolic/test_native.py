@@ -1,7 +1,5 @@
 """Compiled loops: the same numbers, a cache that is never wrong, and a fallback that says why."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat

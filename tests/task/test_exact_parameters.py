@@ -1,7 +1,5 @@
 """A problem with other exact parameters is the one that is built anew with them, whatever of the first one it shares."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The input before the first cycle is a setting of the problem."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """Signals from outside: known and previewed, unknown, believed; a room that is heated against the weather."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

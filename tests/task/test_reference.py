@@ -1,7 +1,5 @@
 """References and disturbances: derivatives by differentiation, tables by splines, and what acts at which time."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

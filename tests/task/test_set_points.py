@@ -1,7 +1,5 @@
 """Set-points: the filter is exact, every controller follows it as a trajectory, and a run may have others without another build."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

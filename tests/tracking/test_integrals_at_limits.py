@@ -1,7 +1,5 @@
 """What an integral does while a limit acts: it goes no further in, comes back out, and follows its own coordinate alone."""
 
-from __future__ import annotations
-
 import pytest
 
 import fpirhc as fp

@@ -1,7 +1,5 @@
 """Tracking laws: gains, decay, bumpless start and digital limit; of fractional order Mittag-Leffler decay, weights and memory."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -2,8 +2,6 @@
 
 # ruff: noqa: ARG002 - arguments are those of the contract
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import casadi as ca

@@ -1,7 +1,5 @@
 """The law that each wrong member breaks, and a part of the sentence about it."""
 
-from __future__ import annotations
-
 from wrong import controllers, maps, observers, optimisers
 
 CONTROLLERS = {

@@ -1,7 +1,5 @@
 """Attacks on files that are read again: a reader refuses one with a flipped bit by name, or gives exactly what was written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Random command lines, run in this process: an exit code as documented, words for a mistake, and no traceback."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

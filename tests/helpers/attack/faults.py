@@ -1,7 +1,5 @@
 """Faults of a loop as values: what happens to the sample, the command, the memory or the plant, and in which cycles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

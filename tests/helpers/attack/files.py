@@ -1,7 +1,5 @@
 """Attacks on the cache of compiled libraries: flipped bits, and processes that are killed while they compile."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

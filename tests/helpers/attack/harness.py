@@ -1,7 +1,5 @@
 """Drives a stepper and its plant through a fault, and says what came of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 

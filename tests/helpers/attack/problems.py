@@ -1,7 +1,5 @@
 """The small problem of the attacks on files, processes and command lines."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 A planted library is a valid one with a fitting checksum, of a model with other numbers, so that one that runs shows itself.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
