@@ -27,7 +27,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import live_signals, offset_limits, shifted_reference, stage_data
+from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -39,7 +39,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.open import PREFIX, expressed, is_open, nominal, numbers, open_numbers, smallest
+from fpirhc.symbolic.open import expressed, nominal, numbers, open_numbers, require_closed
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem
 
@@ -117,22 +117,13 @@ class RecedingHorizon(Controller):
 _PLANS: Latest[Block] = Latest(8)  # controllers that differ in their deformation alone plan alike
 
 
-def _optimal_control(
-    problem: Problem, optimiser: Optimiser, moving: Mapping[str, ca.SX] | None = None
-) -> OptimalControl:
-    """The horizon; live numbers that move its reference are among its settings, as those that the optimiser reads."""
-    moving = open_numbers(problem.reference) if moving is None else moving
+def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
+    """The horizon; open numbers of cost and limits are among its settings."""
+    require_closed("the code of the optimiser", optimiser)
     assert problem.horizon is not None
     assert problem.cost is not None
-    ahead, read = previewed_values(problem.plant, problem.signals), {**_read_from_data(optimiser, problem), **moving}
-    limits, start = problem.limits, problem.start_state
-    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start, read)
-
-
-def _read_from_data(optimiser: Optimiser, problem: Problem) -> dict[str, ca.SX]:
-    """Live numbers of the optimiser that its code reads from the data of the stages, and limits whose size it reads there."""
-    limits = (problem.limits.inputs,) if optimiser.sized else ()
-    return open_numbers(*(getattr(optimiser, name) for name in optimiser.in_data), *limits)
+    ahead, limits, start = previewed_values(problem.plant, problem.signals), problem.limits, problem.start_state
+    return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
 
 
 def _due_block(cycles: int) -> Block:
@@ -174,7 +165,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     assert problem.cost is not None
     optimiser, restarts = controller.optimiser, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
-    count = live_signals(ocp.settings).size
+    count = len(ocp.settings)
     data_of = _stage_data(problem, count)
     preview = preview_of(problem)
     running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
@@ -187,7 +178,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     def step(s: Signals) -> dict[str, Value]:
         own = own_values(problem, s)
         motion = () if preview is None else preview(s.time, *own)
-        data = running_data(s.time, *motion, s.parameters, *_live_rows(problem, optimiser, ocp, s))
+        data = running_data(s.time, *motion, s.parameters, *_open_rows(problem, ocp, s))
         for seen in measured_signals(plant)[1:] if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=controller.planner.feeds_back(plant))
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
@@ -223,11 +214,11 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     return Block("plan", _plan_reads(problem, room), Layout(writes), step, own, opaque=True)
 
 
-def _stage_data(problem: Problem, live: int, *, previewed: bool = False) -> ca.Function:
+def _stage_data(problem: Problem, settings: int, *, previewed: bool = False) -> ca.Function:
     assert problem.horizon is not None
     assert problem.cost is not None
     ahead = previewed_values(problem.plant, problem.signals)
-    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, live, ahead
+    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, settings, ahead
     return stage_data(*arguments, previewed=previewed)
 
 
@@ -243,23 +234,16 @@ def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
     return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *own))
 
 
-def _live_rows(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, s: Signals) -> list[Expression]:
-    """The open settings, and the size of the smallest input, at the end of a stage's data; nothing without any."""
+def _open_rows(problem: Problem, ocp: OptimalControl, s: Signals) -> list[Expression]:
+    """The open settings at the end of a stage's data; nothing without any."""
     if not ocp.settings:
         return []
-    live = open_numbers(problem.cost, problem.limits, problem.reference) | _read_from_data(optimiser, problem)
-    declared = {one.name: getattr(s, one.name) for one in own_signals(problem)}
-    rows = [declared.get(PREFIX + path, expressed(live[path], s.parameters)) for path in ocp.settings]
-    halves = [0.5 * (high - low) for low, high in zip(*problem.limits.input_ends(problem.plant), strict=True)]
-    limited = np.isfinite(ocp.input_upper - ocp.input_lower)
-    sizes = [
-        half if one and is_open(half) else own for half, one, own in zip(halves, limited, ocp.input_sizes, strict=True)
-    ]
-    return [expression(ca.vertcat(*rows, expressed(smallest(sizes), s.parameters)))]
+    numbers = open_numbers(problem.cost, problem.limits)
+    return [expression(ca.vertcat(*(expressed(numbers[path], s.parameters) for path in ocp.settings)))]
 
 
 def _minus(ends: Sequence[float], shift: Expression) -> Expression:
-    """Limits, which may be live, minus a column."""
+    """Limits, which may be open, minus a column."""
     return numbers(ends, shift) - shift
 
 

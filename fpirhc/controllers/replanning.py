@@ -214,10 +214,10 @@ def built_first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalContr
 def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
     """Return the optimiser's memory before the run.
 
-    `data_of`: Function (time, parameters, live numbers) -> data of the horizon.
+    `data_of`: Function (time, parameters, settings) -> data of the horizon.
     """
     first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
-    live = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None
+    settings = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None
     arguments = (0.0, problem.plant.approximate)
-    table = data_of(*arguments) if live is None else data_of(*arguments, live)
+    table = data_of(*arguments) if settings is None else data_of(*arguments, settings)
     return optimiser.first_memory(ocp, first, np.asarray(table.full()))

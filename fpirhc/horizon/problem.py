@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.symbolic.layout import Layout, Signal
-from fpirhc.symbolic.open import PREFIX, Number
 
 GAP = 1e-9  # half width of the bounds of what the end must meet, in sizes of the state
 _LEAST = 1e-3  # of what inputs move a state by: a smaller spread of the reference is no measure of it
@@ -108,22 +107,12 @@ class OptimalControl:
         return steepest_curvature(self.along, self.scale)
 
     @property
-    def input_sizes(self) -> np.ndarray:
-        """Half the range of every input, shape (nu,); one without limits counts with its size along the reference."""
-        return sizes_of_inputs(self.input_lower, self.input_upper, self.nodes[1])
-
-    @property
     def input_size(self) -> float:
-        """The smallest of these."""
-        return float(self.input_sizes.min())
-
-    def place_of(self, number: ca.SX) -> int:
-        """Return the place of a live setting in the data of every stage."""
-        return self.data.slice("settings").start + self.settings.index(number.name().removeprefix(PREFIX))
-
-    def number_in(self, number: Number, data: ca.MX) -> ca.MX | float:
-        """Return a number of an optimiser as its expressions use it: itself, or an entry of the stages' data where it is live."""
-        return data[self.place_of(number), 0] if isinstance(number, ca.SX) else float(number)
+        """Half the smallest range of an input; one without limits counts with its size along the reference."""
+        half = 0.5 * (self.input_upper - self.input_lower)
+        usable = np.isfinite(half) & (half > 0)
+        sizes = half if usable.all() else np.where(usable, half, sizes_along(self.nodes[1]))
+        return float(sizes.min())
 
     @property
     def equations(self) -> np.ndarray:
@@ -255,13 +244,6 @@ def expand_along(
     final = np.asarray(functions["final"](states[:, stages], data[:, stages]).full())
     a, b, q, s, r = (np.array([stage[k] for stage in derivatives]) for k in range(5))
     return _ReferenceExpansion(a, b, q, s, r, final)
-
-
-def sizes_of_inputs(lower: np.ndarray, upper: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Return half the range of every input (nu,), from its bounds; without any its size along the reference (nu, N)."""
-    half = 0.5 * (upper - lower)
-    usable = np.isfinite(half) & (half > 0)
-    return np.asarray(half if usable.all() else np.where(usable, half, sizes_along(along)))
 
 
 def sizes_along(states: np.ndarray, moved: np.ndarray | float = 1.0) -> np.ndarray:

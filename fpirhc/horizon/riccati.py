@@ -14,7 +14,6 @@ import numpy as np
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.symbolic.expression import TINY, is_finite, kind
-from fpirhc.symbolic.open import Number, is_open
 
 _SCALAR_CODE = 1000  # multiplications of one stage up to which scalar code is faster than matrix calls
 BOX_PIVOT = 1e-12  # relative size below which a pivot is replaced: the direction then still descends
@@ -26,8 +25,8 @@ def rounds(inputs: int) -> int:
     return 2 * inputs if inputs > 1 else 1
 
 
-def backward_sweep(ocp: OptimalControl, damping: Number) -> ca.Function:
-    """Function (stage columns, P_N, p_N, [damped]) -> (v (nu, N), K (nu, ns N), Q_uu (nu, nu N), fall).
+def backward_sweep(ocp: OptimalControl, damping: float) -> ca.Function:
+    """Function (stage columns, P_N, p_N) -> (v (nu, N), K (nu, ns N), Q_uu (nu, nu N), fall).
 
     v is in [lower - u, upper - u], and fall is what the sweep promises to lower the cost by.
 
@@ -39,7 +38,6 @@ def backward_sweep(ocp: OptimalControl, damping: Number) -> ca.Function:
     p <- Q_s + Q_us'v + K'(Q_u + Q_uu v). Without active bounds v, rolled out through the linear model with K, is -M^-1 g with M the
     Hessian of the quadratic model: a preconditioner that couples all stages, at the cost of N small factorisations.
 
-    Where the damping is open the last argument is what the damping adds to the curvature of the inputs, mu / D, shape (nu,).
     The stage columns, each stacked over the stages, are A, B, l_s, l_u, Q, S, R, U, lower, upper.
     """
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
@@ -49,23 +47,21 @@ def backward_sweep(ocp: OptimalControl, damping: Number) -> ca.Function:
     value, slope = ca.MX.sym("P", ns, ns), ca.MX.sym("p", ns)
     sweep = _stage(ocp, damping).mapaccum("fpirhc_riccati_stages", n, 2)
     reversed_stages = [in_reverse(column, n) for column in stacked]
-    damped = [ca.MX.sym("damped", nu)] if is_open(damping) else []
-    _, _, moves, gains, curved, falls = sweep(value, slope, *reversed_stages, *(ca.repmat(d, 1, n) for d in damped))
+    _, _, moves, gains, curved, falls = sweep(value, slope, *reversed_stages)
     results = [in_reverse(moves, n), in_reverse(gains, n), in_reverse(curved, n), ca.sum2(falls)]
-    names = [*shapes, "P", "p", *(["damped"] if damped else [])]
-    return ca.Function("fpirhc_riccati", [*stacked, value, slope, *damped], results, names, ["v", "K", "Q_uu", "fall"])
+    names = [*shapes, "P", "p"]
+    return ca.Function("fpirhc_riccati", [*stacked, value, slope], results, names, ["v", "K", "Q_uu", "fall"])
 
 
-def _stage(ocp: OptimalControl, damping: Number) -> ca.Function:
-    """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper, [damped]) -> (P, p, v, K, Q_uu, fall)."""
+def _stage(ocp: OptimalControl, damping: float) -> ca.Function:
+    """Function (P, p, A, B, l_s, l_u, Q, S, R, u, lower, upper) -> (P, p, v, K, Q_uu, fall)."""
     ns, nu = ocp.state.size, ocp.input.size
     sym = kind(opaque=ns * ns * (ns + nu) > _SCALAR_CODE).sym
     value, slope = sym("P", ns, ns), sym("p", ns)
     a, b, by_state, by_input = sym("A", ns, ns), sym("B", ns, nu), sym("ls", ns), sym("lu", nu)
     q, s, r = sym("Q", ns, ns), sym("S", nu, ns), sym("R", nu, nu)
     u, lower, upper = sym("u", nu), sym("lower", nu), sym("upper", nu)
-    live = [sym("damped", nu)] if is_open(damping) else []
-    added = ca.diag(live[0]) if live else ca.DM(np.diag(float(damping) / ocp.scale))
+    added = ca.DM(np.diag(damping / ocp.scale))
     value_a = ca.mtimes(value, a)
     damped = r + ca.mtimes(b.T, ca.mtimes(value, b)) + added
     coupled = s + ca.mtimes(b.T, value_a)
@@ -75,7 +71,7 @@ def _stage(ocp: OptimalControl, damping: Number) -> ca.Function:
     next_slope = by_state + ca.mtimes(a.T, slope) + ca.mtimes(coupled.T, move)
     next_slope += ca.mtimes(gain.T, input_slope + ca.mtimes(damped, move))
     fall = -0.5 * ca.dot(input_slope, move)
-    arguments = [value, slope, a, b, by_state, by_input, q, s, r, u, lower, upper, *live]
+    arguments = [value, slope, a, b, by_state, by_input, q, s, r, u, lower, upper]
     results = [0.5 * (next_value + next_value.T), next_slope, move, gain, damped, fall]
     return ca.Function("fpirhc_riccati_stage", arguments, results)
 

@@ -1,6 +1,6 @@
 """The data of the stages of one horizon: time, reference, feedforward, parameters, and what else its stages read.
 
-Where cost or limits have open numbers, the data of every stage end with the settings and the size of the smallest input.
+Where cost or limits have open numbers, the data of every stage end with these settings.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.symbolic.open import PREFIX
 from fpirhc.task.reference import Reference
-
-SIZE = "input_size"
 
 
 def data_layout(plant: Plant, horizon: Horizon) -> Layout:
@@ -61,14 +59,14 @@ def stage_data(
     reference: Reference,
     horizon: Horizon,
     cost: Cost,
-    live: int = 0,
+    settings: int = 0,
     signals: ca.Function | None = None,
     *,
     previewed: bool = False,
 ) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1), along the nominal motion.
 
-    With `live` rows of settings and what follows from them, (time, parameters, these rows) -> data that end with them. With
+    With `settings` rows of open numbers, (time, parameters, these rows) -> data that end with them. With
     `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where the reference is
     `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
@@ -81,20 +79,20 @@ def stage_data(
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
-    # The live rows come out of the same call where they follow these rows: joining tables would copy both.
+    # These rows come out of the same call where they follow these rows: joining tables would copy both.
     plain = not (horizon.blocks or horizon.terminal or horizon.measured) and not hastened(horizon)
-    joined = bool(live) and plain
-    rows = [matrix.sym("live", live)] if joined else []
+    joined = bool(settings) and plain
+    rows = [matrix.sym("settings", settings)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
     one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows, *([half] if horizon.lengths else [])], [stage])
     start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
     columns = dict(zip(("states", "responses"), motion, strict=False))
     tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]
-    settings = [ca.MX.sym("live", live)] if live else []
+    given = [ca.MX.sym("settings", settings)] if settings else []
     nodes = horizon.stages + 1
     times = start + ca.DM(horizon.nodes).T
     halves = [ca.DM(0.5 * np.append(np.diff(horizon.nodes), horizon.last)).T] if horizon.lengths else []
-    repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(settings if joined else ()))]
+    repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(given if joined else ()))]
     table = one.map(nodes)(times, *tables, *repeated, *halves)
     if horizon.blocks:
         free = np.zeros((1, nodes))
@@ -111,10 +109,10 @@ def stage_data(
         last[0, nodes - 2] = 1.0
         targets = table[data_layout(plant, horizon).slice("reference"), :][:, after]
         table = ca.vertcat(table, last, targets)
-    if live and not joined:
-        table = ca.vertcat(table, ca.repmat(settings[0], 1, nodes))
-    names = ["t", *columns, "p", *(["live"] if live else [])]
-    return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *settings], [table], names, ["data"])
+    if settings and not joined:
+        table = ca.vertcat(table, ca.repmat(given[0], 1, nodes))
+    names = ["t", *columns, "p", *(["settings"] if settings else [])]
+    return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *given], [table], names, ["data"])
 
 
 def shifted_reference(plant: Plant, layout: Layout, nodes: int, *, corrected: bool) -> ca.Function:
@@ -165,13 +163,13 @@ def settings_in(expressions: Iterable[Expression], known: Expression) -> list[ca
     return [s for s in symbols if s.name().startswith(PREFIX)]
 
 
-def live_signals(paths: tuple[str, ...]) -> Layout:
+def setting_rows(paths: tuple[str, ...]) -> Layout:
     """Return the signals at the end of a stage's data; none without settings."""
     if not paths:
         return Layout()
-    return Layout((Signal("settings", paths), scalar(SIZE)))
+    return Layout((Signal("settings", paths),))
 
 
-def live_table(table: np.ndarray, rows: Sequence[float]) -> np.ndarray:
-    """Return the data of all stages with the rows of the settings and of the size."""
+def with_rows(table: np.ndarray, rows: Sequence[float]) -> np.ndarray:
+    """Return the data of all stages with the rows of the settings."""
     return np.vstack([table, np.repeat(np.array([rows]).T, table.shape[1], axis=1)])

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import casadi as ca
 import numpy as np
@@ -28,8 +27,8 @@ from fpirhc.horizon.constraint_states import (
 from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
-from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along, sizes_of_inputs
-from fpirhc.horizon.stage_data import data_layout, hastened, live_signals, live_table, settings_in, stage_data
+from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along
+from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, settings_in, stage_data, with_rows
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
 from fpirhc.plant.motion import outside_of, sampling
@@ -52,19 +51,17 @@ def transcribe(
     limits: Limits,
     signals: ca.Function | None = None,
     start: np.ndarray | None = None,
-    others: Mapping[str, ca.SX] = MappingProxyType({}),
 ) -> OptimalControl:
     """Return the standard form of one horizon; it is the same one for the same objects, and for plants with other exact parameters.
 
     Args:
         start: first state, shape (nx,), from which states without a reference are simulated to expand the cost along the reference;
             None: zero.
-        others: live settings by path that the optimiser reads from the data of the stages beside those of cost and limits.
     """
     same = plant.equations, reference, cost, limits, signals  # the approximate parameters are those of the equations
     first = None if start is None else np.asarray(start, dtype=float).tobytes()
-    arguments = plant, reference, horizon, cost, limits, signals, start, others
-    return _LATEST.of((*same, *others.values()), (first, horizon, *others), lambda: _transcribed(*arguments))
+    arguments = plant, reference, horizon, cost, limits, signals, start
+    return _LATEST.of(same, (first, horizon), lambda: _transcribed(*arguments))
 
 
 def _transcribed(
@@ -75,7 +72,6 @@ def _transcribed(
     limits: Limits,
     signals: ca.Function | None,
     start: np.ndarray | None,
-    others: Mapping[str, ca.SX],
 ) -> OptimalControl:
     nominal(cost).check(plant)
     limits.check(plant)
@@ -86,23 +82,22 @@ def _transcribed(
             name: (limits.states[name][0] + m, limits.states[name][1] - m) for name, m in horizon.margins.items()
         }
         limits = replace(limits, states={**limits.states, **inside_by})
-    same, live = (plant.equations, reference, cost, whole, *others.values()), list(others.values())
+    same = plant.equations, reference, cost, whole
 
     def expressed() -> tuple[_Stage, tuple[ca.Function, ...]]:
-        stage = _stage_expressions(plant, reference, horizon, cost, limits, live)
+        stage = _stage_expressions(plant, reference, horizon, cost, limits)
         return stage, _stage_functions(stage)
 
-    stage, functions_of_stage = _STAGES.of(same, (horizon, *others), expressed)
+    stage, functions_of_stage = _STAGES.of(same, (horizon,), expressed)
     binding, free = stage.binding, stage.before.numel()
     dynamics, stage_cost, terminal_cost, soft_end = functions_of_stage
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
     bounds = limits.input_bounds(plant)
-    values = {path: number_of(number) for path, number in {**open_numbers(cost, limits), **others}.items()}
+    values = {path: number_of(number) for path, number in open_numbers(cost, limits).items()}
     if settings:
-        size = float(sizes_of_inputs(*bounds, nodes[1]).min())
-        nodes = (*nodes[:2], live_table(nodes[2], [*(values[path] for path in settings), size]))
+        nodes = (*nodes[:2], with_rows(nodes[2], [values[path] for path in settings]))
     _check_finite_limits(dynamics, binding, nodes)
     _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
     functions: dict[object, ca.Function] = {}
@@ -115,7 +110,7 @@ def _transcribed(
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant, horizon) + live_signals(settings),
+        data=data_layout(plant, horizon) + setting_rows(settings),
         dynamics=dynamics,
         stage_cost=stage_cost,
         terminal_cost=terminal_cost,
@@ -147,7 +142,7 @@ def _transcribed(
 class _Stage:
     """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state.
 
-    theta ends with the symbols of open `settings` and of the size of the smallest input (see `live_signals`).
+    theta ends with the symbols of open `settings` (see `setting_rows`).
     """
 
     x: Expression
@@ -167,9 +162,7 @@ class _Stage:
 _STAGES: Latest[tuple[_Stage, tuple[ca.Function, ...]]] = Latest(8)  # whatever signals they meet
 
 
-def _stage_expressions(
-    plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits, others: Sequence[Expression]
-) -> _Stage:
+def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
     layout = data_layout(plant, horizon)
     keeps_input = (
         cost.uses_rate
@@ -209,9 +202,9 @@ def _stage_expressions(
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
     _check_entries(plant, keeps_input, written)
-    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding), *others], theta)
+    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding)], theta)
     if settings:
-        theta = ca.vertcat(theta, *settings, ca.SX.sym("size"))
+        theta = ca.vertcat(theta, *settings)
 
     return _Stage(
         x, before, u, applied, theta, x_next, terms, final, soft_end, binding, settings, horizon.step * length

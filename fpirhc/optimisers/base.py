@@ -41,16 +41,6 @@ class Optimiser(Checked, ABC):
         return ""
 
     @property
-    def in_data(self) -> tuple[str, ...]:
-        """Fields whose numbers may be live, because its code reads them from the data of the stages."""
-        return ()
-
-    @property
-    def sized(self) -> bool:
-        """Whether its tolerance follows from the size of the inputs, which its code reads from the data where settings are live."""
-        return getattr(self, "tolerance", 0.0) is None
-
-    @property
     def near_plan(self) -> Optimiser:
         """The optimiser as it improves a plan that it has solved and remembers, without what looks for other plans.
 

@@ -64,8 +64,6 @@ class FixedPoint(Optimiser):
     most_iterations: Count = 100
     second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
-    in_data = "tolerance", "damping", "map"
-
     @property
     def near_plan(self) -> Optimiser:
         return replace(self, second_start=False) if self.second_start else self
@@ -131,8 +129,7 @@ class FixedPoint(Optimiser):
 
     def _plain(self, ocp: OptimalControl, *, converging: bool) -> PlainSettings:
         hessian = self.hessian or GaussNewton()
-        tolerance = None if self.sized and ocp.settings else self._tolerance(ocp)
-        return PlainSettings(tolerance, self.map, hessian, self.damping, self.iterations or 0, converging)
+        return PlainSettings(self._tolerance(ocp), self.map, hessian, self.damping, self.iterations or 0, converging)
 
     def _tolerance(self, ocp: OptimalControl) -> float:
         return CLOSE * ocp.input_size if self.tolerance is None else self.tolerance

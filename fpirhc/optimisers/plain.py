@@ -12,7 +12,6 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
-from fpirhc.horizon.stage_data import SIZE
 from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import (
     LAST,
@@ -32,7 +31,6 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
 from fpirhc.symbolic.native import Native
-from fpirhc.symbolic.open import Number
 
 MOST = 100  # iterations of one converging call
 CAP = 50  # the same of one in a loop
@@ -45,16 +43,12 @@ _TEXTS = ("kernels", "fixed_point", "entry")
 class PlainSettings:
     """Settings of one Function."""
 
-    tolerance: Number | None  # of the stationarity, in the unit of the inputs; None: `CLOSE` times the size in the data
+    tolerance: float  # of the stationarity, in the unit of the inputs
     map: Deformation  # the deformation that makes the next plan
     hessian: HessianModel  # second derivatives of the quadratic model
-    damping: Number  # added to the curvature of the inputs, in units of it
+    damping: float  # added to the curvature of the inputs, in units of it
     iterations: int  # of one call that does not converge; 0: it ends where the plan is solved, after at most `CAP`
     converging: bool  # whether a call goes on until the tolerance is met
-
-    def tolerance_in(self, ocp: OptimalControl, data: ca.MX) -> ca.MX | float:
-        """Return the tolerance as the expressions use it."""
-        return CLOSE * data[ocp.data.slice(SIZE), 0] if self.tolerance is None else ocp.number_in(self.tolerance, data)
 
     @property
     def most(self) -> int:
@@ -131,7 +125,7 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[st
         **split_stage(ocp),
         "hessian": hessian_stage(ocp, settings.hessian),
         "end": hessian_end(ocp),
-        "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages, ocp),
+        "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
@@ -171,16 +165,10 @@ def _metric(ocp: OptimalControl) -> dict[str, object]:
     return {"SCALE": f"{{{scale}}}", "FIRST_GAMMA": repr(first_gamma(ocp))}
 
 
-def _number(ocp: OptimalControl, number: Number) -> str:
-    """A number of the code, or its place in the data of the first stage where it is live."""
-    return f"data[{ocp.place_of(number)}]" if isinstance(number, ca.SX) else repr(float(number))
-
-
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
-    own = settings.tolerance
     return {
-        "TOLERANCE": f"({CLOSE!r} * data[{ocp.data.slice(SIZE).start}])" if own is None else _number(ocp, own),
-        "DAMPING": _number(ocp, settings.damping),
+        "TOLERANCE": repr(float(settings.tolerance)),
+        "DAMPING": repr(float(settings.damping)),
         "SHARE": line_search.SHARE,
         "ARMIJO": line_search.ARMIJO,
         "SHORTER": line_search.SHORTER,
@@ -267,7 +255,7 @@ def _converged(
     count, plain, ended = counts = [ca.MX.sym(name) for name in ("count", "plain", "ended")]
     tried, plan = search.tried(symbols, arguments)
     looked = search.looked(tried, plan, arguments)
-    tolerance = settings.tolerance_in(ocp, arguments.data)
+    tolerance = settings.tolerance
     residual = stationarity(ocp, looked.inputs, looked.slope, arguments.lower, arguments.upper)
     solved = ca.logic_and(
         looked.value < line_search.UNTRIED, ca.logic_and(residual <= tolerance, looked.sent <= tolerance)
@@ -315,7 +303,7 @@ def _results(
     finite = ca.logic_and(posed, evaluated)
     residual = stationarity(ocp, anchor.inputs, anchor.slope, arguments.lower, arguments.upper)
     empty = ca.mmax(arguments.lower - arguments.upper) > 0
-    tolerance = settings.tolerance_in(ocp, arguments.data)
+    tolerance = settings.tolerance
     status = status_of(finite, ca.fmax(residual, anchor.sent), 0, tolerance)
     status = ca.if_else(empty, int(Status.INFEASIBLE), status)
     numbers = ca.if_else(finite, ca.vertcat(anchor.value, residual), ca.MX.zeros(2))

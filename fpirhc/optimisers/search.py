@@ -13,10 +13,8 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import backward_sweep, box_policy, in_reverse
-from fpirhc.horizon.stage_data import settings_in
 from fpirhc.optimisers.base import clip, sane
 from fpirhc.symbolic.expression import FINITE, TINY, is_finite
-from fpirhc.symbolic.open import PREFIX, Number, is_open
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is required
 ARMIJO = 1e-2  # share of the first-order decrease that is required of a short step
@@ -76,7 +74,7 @@ def first_gamma(ocp: OptimalControl) -> float:
 class Search:
     """Builds the expressions of the iteration."""
 
-    def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: Number) -> None:
+    def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> None:
         self._ocp = ocp
         self._expand, self._try = _expansion(ocp), _trial(ocp)
         self._judge = _judgement(ocp)
@@ -161,7 +159,7 @@ def _expansion(ocp: OptimalControl) -> ca.Function:
     return ca.Function("fpirhc_expansion", [states, inputs, costs, data, *stacked], results)
 
 
-def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: Number) -> ca.Function:
+def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> ca.Function:
     """Function (U, X, A, B, l_s, l_u, costates, data, lower, upper) -> (v deformed, K, Q_uu, largest move, promised fall)."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
     inputs, states = ca.MX.sym("U", nu, n), ca.MX.sym("X", ns, n + 1)
@@ -171,12 +169,8 @@ def _direction(ocp: OptimalControl, hessian: HessianModel, map: Deformation, dam
     hessians = hessian_stage(ocp, hessian).map(n)(states[:, :n], inputs, data[:, :n], costates)
     _, slope, value = hessian_end(ocp)(states[:, n], data[:, n])
     bounds = ca.repmat(lower, 1, n), ca.repmat(upper, 1, n)
-    damped = [ocp.number_in(damping, data) / ca.DM(ocp.scale)] if is_open(damping) else []
-    move, gains, curved, fall = backward_sweep(ocp, damping)(
-        *stacked, *hessians, inputs, *bounds, value, slope, *damped
-    )
-    deform = deformed_move(map, nu * n, ocp)
-    deformed = deform(*(ca.vec(move), data[:, 0])[: deform.n_in()])
+    move, gains, curved, fall = backward_sweep(ocp, damping)(*stacked, *hessians, inputs, *bounds, value, slope)
+    deformed = deformed_move(map, nu * n)(ca.vec(move))
     results = [ca.reshape(deformed, nu, n), gains, curved, ca.norm_inf(ca.vec(move)), fall]
     return ca.Function("fpirhc_direction", [inputs, states, *stacked, costates, data, lower, upper], results)
 
@@ -203,17 +197,11 @@ def _look(ocp: OptimalControl) -> ca.Function:
     return ca.Function("fpirhc_look", [inputs, states, *stacked, data, lower, upper], [ca.mmax(moves), ca.sum2(falls)])
 
 
-def deformed_move(map: Deformation, size: int, ocp: OptimalControl | None = None) -> ca.Function:
-    """Function v -> G(0, -v, 0): the deformed feedforward; (v, data of a stage) where settings of the map are live."""
+def deformed_move(map: Deformation, size: int) -> ca.Function:
+    """Function v -> G(0, -v, 0): the deformed feedforward."""
     column = ca.SX.sym("v", size)
     deformed, _ = map.step(ca.SX.zeros(size), -column, ca.SX.zeros(size), {})
-    symbols = settings_in([deformed], column)
-    if not symbols or ocp is None:
-        return ca.Function("fpirhc_deformed_move", [column], [ca.densify(deformed)])
-    theta, first = ca.SX.sym("theta", ocp.data.size), ocp.data.slice("settings").start
-    entries = [theta[first + ocp.settings.index(s.name().removeprefix(PREFIX))] for s in symbols]
-    (deformed,) = ca.substitute([deformed], symbols, entries)
-    return ca.Function("fpirhc_deformed_move", [column, theta], [ca.densify(deformed)])
+    return ca.Function("fpirhc_deformed_move", [column], [ca.densify(deformed)])
 
 
 def _stage_shapes(ns: int, nu: int) -> tuple[tuple[int, int], ...]:

@@ -99,7 +99,7 @@ class Fractional(IntegralLaw):
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
         reads, writes = law_signals(plant)
-        require_closed("the weights of its memory", self)
+        require_closed("the weight of its past", self)
         column = ca.DM(self._row(cycles, period))
 
         def step(s: Signals) -> dict[str, Expression]:

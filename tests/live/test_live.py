@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,23 +71,6 @@ def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
     record: Any = changed.settings["live"]
     assert [time for time, _ in record] == [0.0, 0.124]
     assert record[1][1]["deformation.gain"] == -0.9
-
-
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["VM", "C"])
-def test_tolerance_and_damping_of_the_plans_are_data(compiled):
-    """They stand in the data of the stages, so one compiled plan serves all of them."""
-    short, controller = replace(brief(), duration=0.05), cast(Any, by_plan())
-    damped = replace(controller, optimiser=replace(controller.optimiser, damping=0.1))
-    paths = ["optimiser.tolerance", "optimiser.damping"]
-    ready = fp.simulator(short, damped, compiled=compiled, live=paths)
-    plain = ready.run(seed=0)
-    numbers = {"optimiser.tolerance": 0.5, "optimiser.damping": 0.5}
-    for settings in ({}, dict([*numbers.items()][:1]), numbers):
-        changed, anew = ready.run(seed=0, settings=settings), rebuilt(ready, settings, compiled=compiled)
-        # The first plan is that of the build, solved to its tolerance.
-        assert np.abs(changed["command"] - anew["command"]).max() <= 1e-2 * np.abs(anew["command"]).max(), settings
-        assert np.array_equal(changed["status"], anew["status"])
-        assert np.array_equal(changed["status"], plain["status"]) == (not settings)  # a loose tolerance is met
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])

@@ -168,7 +168,7 @@ def test_what_cannot_be_live_is_refused_by_name(name, path, error, words):
 
 def test_numbers_are_checked_at_every_change():
     """Unknown names, numbers outside a setting's range, infinite limits and gains that diverge."""
-    live = ["deformation.gain", "cost.states.q1", "limits.inputs.Q1.1", "optimiser.tolerance"]
+    live = ["deformation.gain", "cost.states.q1", "limits.inputs.Q1.1"]
     ready = fp.simulator(aimed(), tasks.two_mass.controllers["RHC+FPI"], live=live, compiled=False)
     cases: tuple[tuple[dict[str, Any], type[Exception], str], ...] = (
         ({"deformation.gian": 1.0}, InvalidName, "deformation.gain"),
