@@ -509,10 +509,14 @@ def export(
 
     chosen, folder = select(task, [controller])[controller], out or Path("results", task.name, to)
     if to == "lab":
-        from fpirhc.export.lab.lab import lab_of, write_lab
+        from fpirhc.export.lab.lab import write_lab
 
+        if live:
+            raise typer.BadParameter(
+                "--live: a lab has sliders of parameters, gains and limits of inputs, and no others"
+            )
         page = _folder(folder) / f"{task.name}-lab.html"
-        write_lab(lab_of(task, problem, [controller], live or ()), page)
+        write_lab(task, problem, {controller: chosen}, page)
         print(f"wrote {page}")
         return
     if to not in targets():

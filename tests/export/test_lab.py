@@ -65,28 +65,25 @@ def test_a_page_has_the_numbers_of_the_loop(name, tmp_path):
     python = run(name, CASES[name], moved, loop["live"])
     assert one["cycles"] == python.cycles
     same_curves(data, one["columns"], python)
-    assert (data["motion"] is not None) == (name in ("two_mass", "crane_slots"))
-    assert (one["factors"] is not None) == (name != "crane_slots")
     problem = fp.load_problem(name).problem
-    counted = np.reshape(python["error"], (python.cycles, -1))
+    shown = data["charts"][0]["column"].partition(".")[0]
+    counted = np.reshape(python[shown], (python.cycles, -1))
     counted = counted[int(np.ceil(problem.measure_from / problem.period - 1e-9)) :]
     assert np.allclose(one["squares"], (counted**2).sum(axis=0), rtol=1e-9, atol=0)
 
 
-def test_a_slider_that_needs_python_is_left_out_and_says_why(tmp_path):
-    """Python computes the step of a reference model from its rate; a zero has no scale; bounds are kept."""
-    page, data = exported(tmp_path, "mrac_pendulum", "Lyapunov MRAC")
+def test_a_page_has_sliders_of_parameters_gains_and_limits(tmp_path):
+    """A zero has none, as it says no range; every other one is within its bounds. The page runs its own scripts alone."""
+    page, data = exported(tmp_path, "noisy_motor", "RHC+FPI")
     sliders = {s["path"]: s for s in data["sliders"]}
-    assert len(sliders) > 5
-    assert data["without"]["approximate.f"] == "it is zero: nothing says how far a slider would go"
-    assert not {*sliders} & {*data["without"]}
+    assert {"exact.coulomb", "deformation.map.gain"} <= {*sliders}
+    assert "approximate.coulomb" not in sliders
     assert all(s["low"] <= s["value"] <= s["high"] for s in sliders.values())
     text = page.read_text(encoding="utf-8")
     policy = text.partition('content="')[2].partition('"')[0]
     assert "default-src 'none'" in policy
     assert "'wasm-unsafe-eval'; worker-src blob:;" in policy
-    assert text.count("</script>") == 4
-    assert "the step of the reference model is computed from it" in data["without"]["rate"]
+    assert text.count("</script>") == 3
 
 
 PROBLEM = """from dataclasses import replace
@@ -112,7 +109,7 @@ def test_what_has_no_lab(tmp_path, monkeypatch, capsys):
     Path("lossy.py").write_text(PROBLEM + lossy)
     refused = {
         "lossy.py RHC": "without the driver that runs missing cycles afterwards",
-        "own.py RHC --live deformation.gian": "no controller of the lab can have 'deformation.gian' live",
+        "own.py RHC --live deformation.gain": "a lab has sliders of parameters, gains and limits of inputs, and no others",
         "far.py RHC": "a plant outside Python's equations has none",
     }
     for words, said in refused.items():

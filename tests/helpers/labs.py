@@ -11,10 +11,9 @@ import fpirhc as fp
 from fpirhc.__main__ import main
 
 
-def exported(folder: Path, of: str, controller: str, live: tuple[str, ...] = ()) -> tuple[Path, Any]:
+def exported(folder: Path, of: str, controller: str) -> tuple[Path, Any]:
     """The page of a controller, and its data."""
-    words = ["export", of, controller, "--to", "lab", "--out", str(folder)]
-    assert main([*words, *(("--live", *live) if live else ())]) == 0
+    assert main(["export", of, controller, "--to", "lab", "--out", str(folder)]) == 0
     [page] = folder.glob("*-lab.html")
     text = page.read_text(encoding="utf-8")
     begin = text.index("const DATA=") + len("const DATA=")

@@ -37,32 +37,23 @@ function set(k, value, run = true) {
 // The worker: one run at a time.
 const worker = new Worker(URL.createObjectURL(new Blob([DATA.worker], { type: "text/javascript" })));
 let busy = false, waiting = false, sent = 0;
-const times = [];
 worker.onmessage = ({ data }) => {
   busy = false;
   if (data.ready) return changed();
   if (data.error) return say("sentence", "This page cannot run: " + data.error);
-  times.push(performance.now() - began);
-  if (times.length > 50) times.shift();
   window.answers = data.answers; // for who looks with the browser's tools
   window.shownNumber = data.number;
   draw(data.answers);
   if (waiting) changed();
 };
-let began = 0;
 function changed() {
   if (busy) return void (waiting = true);
   busy = true;
   waiting = false;
-  began = performance.now();
   const numbers = DATA.loops.map((_, j) => DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : s.places[j].map((place) => ({ place, value: now[k] })))));
   worker.postMessage({ numbers, number: ++sent });
   remember();
 }
-
-// The mechanism, and the cursor of the charts at its time
-const point = (time) => charts.forEach(({ plot }) => plot.setCursor({ left: plot.valToPos(time, "x"), top: -10 }, false));
-const moving = DATA.motion && play(document.getElementById("motion"), DATA.motion, point, true);
 
 // Charts
 const charts = DATA.charts.map((spec) => {
@@ -76,8 +67,7 @@ const charts = DATA.charts.map((spec) => {
   const axis = { stroke: ink, grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 } };
   const plot = new uPlot(
     { width: box.clientWidth || 400, height: 200, series: [{ label: "t [" + DATA.timeUnit + "]" }, ...lines], scales: { x: { time: false } },
-      axes: [{ ...axis, label: "t [" + DATA.timeUnit + "]", size: 30, labelSize: 18 }, { ...axis, ...AXIS_OF_VALUES }], cursor: { sync: { key: "time" } },
-      hooks: { setCursor: [(u) => u.cursor.left >= 0 && moving?.follow(u.posToVal(u.cursor.left, "x"))] } },
+      axes: [{ ...axis, label: "t [" + DATA.timeUnit + "]", size: 30, labelSize: 18 }, { ...axis, ...AXIS_OF_VALUES }], cursor: { sync: { key: "time" } } },
     [[], ...lines.map(() => [])], box);
   return { spec, box, plot };
 });
@@ -92,53 +82,20 @@ function draw(answers) {
     if (spec.aims !== null) series.push(longest.columns[spec.aims]);
     plot.setData([longest.columns[0], ...series]);
   }
-  moving?.load(answers.map((one, k) => ({ name: DATA.loops[k].name, color: colors[k], step: DATA.motion.step, width: one.frameWidth, numbers: one.frames })));
   say("sentence", verdict(answers));
-  say("factors", answers.map(contraction).filter(Boolean).join(". "));
-  const sorted = [...times].sort((a, b) => a - b), worst = sorted[Math.ceil(0.95 * sorted.length) - 1];
-  say("rate", answers.map((a, k) => DATA.loops[k].name + " " + a.took.toFixed(0) + " ms").join(", ") +
-    " for " + DATA.cycles + " cycles; from move to picture " + sorted[(sorted.length - 1) >> 1].toFixed(0) + " ms (95 %: " + worst.toFixed(0) + " ms)");
 }
 
 // rms errors from the time on from which errors count
 function verdict(answers) {
-  const first = Math.ceil(DATA.measured / DATA.period - 1e-9), counted = DATA.cycles - first;
-  const specs = DATA.charts.filter((c) => c.error !== undefined);
-  const texts = answers.map((one, k) => {
-    if (one.cycles < DATA.cycles) return DATA.loops[k].name + " stops at " + short(one.cycles * DATA.period) + " " + DATA.timeUnit;
-    return DATA.loops[k].name + " " + specs.map((c) => quantity(Math.sqrt(one.squares[c.error] / counted), c.unit)).join(", ");
-  });
-  const errors = answers.map((one) => specs.map((c) => (one.cycles < DATA.cycles ? NaN : Math.sqrt(one.squares[c.error] / counted))));
-  if (answers.length === 2 && errors.flat().every((e) => e > 0)) {
-    const [plain, other] = errors, less = plain.map((e, k) => e >= other[k]);
-    const word = less.every((yes) => yes) ? " lowers" : less.some((yes) => yes) ? " changes" : " raises";
-    const how = (k) => (less[k] ? short(+(plain[k] / other[k]).toPrecision(3)) + " times less)" : short(+(other[k] / plain[k]).toPrecision(3)) + " times as much)");
-    return DATA.loops[1].name + word + " the rms error of " +
-      specs.map((c, k) => c.title.slice(9) + " from " + short(plain[k]) + " to " + quantity(other[k], c.unit) + " (" + how(k)).join(", ") + " against " + DATA.loops[0].name;
-  }
+  const counted = DATA.cycles - Math.ceil(DATA.measured / DATA.period - 1e-9), specs = DATA.charts.filter((c) => c.error !== undefined);
+  const texts = answers.map((one, k) => DATA.loops[k].name + (one.cycles < DATA.cycles ? " stops at " + short(one.cycles * DATA.period) + " " + DATA.timeUnit :
+    " " + specs.map((c) => quantity(Math.sqrt(one.squares[c.error] / counted), c.unit)).join(", ")));
   return "rms error of " + specs.map((c) => c.title.slice(9)).join(", ") + ": " + texts.join("; ");
 }
 
-// The contraction factor of the cycles that are looked at, one for every frame
-function contraction({ factors }, k) {
-  if (!factors) return "";
-  const largest = factors.reduce((a, b) => Math.max(a, b), 0), growing = factors.filter((one) => one >= 1).length / factors.length;
-  const said = growing ? "1 or more in " + short(100 * growing) + " % of " : "below 1 in each of ";
-  return "Contraction factor of " + DATA.loops[k].name + ": at most " + short(largest) + ", " + said + factors.length + " cycles of the run";
-}
-
-// The address, once the sliders rest: a browser keeps every address that it has shown, and some refuse a hundred in half a minute.
-let resting = 0;
-function link(moved) {
-  clearTimeout(resting);
-  const parts = moved.map(([p, v]) => encodeURIComponent(p) + "=" + v);
-  resting = setTimeout(() => history.replaceState(null, "", parts.length ? "#" + parts.join("&") : location.pathname + location.search), 250);
-}
-
-// The address, and the same in Python
+// The same in Python
 function remember() {
   const moved = DATA.sliders.flatMap((s, k) => (now[k] === s.value ? [] : [[s.path, now[k]]]));
-  link(moved);
   const among = (test) => moved.filter(([p]) => test(p));
   const sides = /^(exact|approximate)\.(.*)/;
   const listed = (list) => "{" + list.map(([p, v]) => `"${p}": ${v}`).join(", ") + "}";
@@ -173,14 +130,6 @@ DATA.loops.forEach((loop, k) => {
   label.append(box, swatch, loop.name);
   document.getElementById("controllers").append(label);
 });
-const reasons = Object.entries(DATA.without);
-document.getElementById("without").hidden = !reasons.length;
-for (const [path, why] of reasons) {
-  const item = document.createElement("li");
-  item.textContent = path + ": " + why;
-  document.querySelector("#without ul").append(item);
-}
-const linked = new Map(location.hash.slice(1).split("&").filter(Boolean).map((one) => one.split("=").map(decodeURIComponent)));
-DATA.sliders.forEach((s, k) => set(k, Number.isFinite(+(linked.get(s.path) ?? NaN)) ? +linked.get(s.path) : s.value, false));
+DATA.sliders.forEach((s, k) => set(k, s.value, false));
 busy = true;
 worker.postMessage({ loops: DATA.loops });

@@ -5,7 +5,7 @@
 
 #define EXPORT(name) __attribute__((export_name(name)))
 
-enum { MEMORY = @memory@, TRACE = @trace@, CYCLES = @cycles@, EVERY = @every@, SHOWN = @shown@, ERRORS = @errors@, FIRST = @first@, FRAME = @frame@ };
+enum { MEMORY = @memory@, TRACE = @trace@, CYCLES = @cycles@, EVERY = @every@, SHOWN = @shown@, ERRORS = @errors@, FIRST = @first@ };
 
 static double memory[2][MEMORY], trace[TRACE], kept[(CYCLES / EVERY + 1) * SHOWN], squares[ERRORS];
 static const int PLACES[SHOWN] = {@places@}, ERROR_PLACES[ERRORS] = {@error_places@};
@@ -16,7 +16,6 @@ static double* res[@res@];
 static long long whole_numbers[@iw@];
 static double work[@w@];
 @tables@
-@drawing@
 
 EXPORT("memory_at") void* memory_at(void) { return memory[0]; }
 EXPORT("kept_at") void* kept_at(void) { return kept; }
@@ -38,7 +37,6 @@ EXPORT("run") int run(void) {
       for (j = 0; j < SHOWN; ++j) kept[rows * SHOWN + j] = trace[PLACES[j]];
       ++rows;
     }
-    if (k % FRAME == 0) draw(k / FRAME, memory[k & 1]);
     if (k >= FIRST)
       for (j = 0; j < ERRORS; ++j) squares[j] += trace[ERROR_PLACES[j]] * trace[ERROR_PLACES[j]];
   }
