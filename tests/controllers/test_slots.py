@@ -1,7 +1,6 @@
 """Time slots: stability of schedules, relative orders, continuity at switches, and what is refused."""
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -111,50 +110,6 @@ def test_slots_behind_a_dead_time_switch_without_a_jump():
     assert largest[0] < 1.2 * np.abs(np.diff(ideal["command"][:, 0])).max() < 0.5 * largest[1]
 
 
-def masses_by_states() -> fp.Plant:
-    """The two masses as first-order equations in another order, with extension and sum as states."""
-    plant = SHIPPED.mass_spring_slots.problem.plant
-
-    def rates(x, u, p):
-        low, pull = (x.total - x.between) / 2, p.k2 * x.between
-        return {
-            "w2": (u.F - pull - p.b2 * x.w2) / p.m2,
-            "w1": (pull - p.k1 * low - p.b1 * x.w1) / p.m1,
-            "between": x.w2 - x.w1,
-            "total": x.w2 + x.w1,
-        }
-
-    outputs = {"q1": lambda x, p: (x.total - x.between) / 2, "q2": lambda x, p: (x.total + x.between) / 2}
-    return fp.Plant.of_states(
-        states={"w2": "m/s", "w1": "m/s", "between": "m", "total": "m"},
-        inputs=plant.inputs,
-        parameters=plant.parameters,
-        rates=rates,
-        outputs={name: fp.Output("m", one) for name, one in outputs.items()},
-        controlled=("q2",),
-    )
-
-
-@pytest.mark.parametrize("name", ["slots", "slots+FPI"])
-@pytest.mark.parametrize(
-    "reality",
-    [
-        lambda: fp.Reality(SHIPPED.mass_spring_slots.problem.plant),
-        lambda: fp.Reality(masses_by_states(), start=dict.fromkeys(("w2", "w1", "between", "total"), 0.0)),
-    ],
-    ids=["same", "by states"],
-)
-def test_slots_read_their_responses_from_a_reality(name, reality):
-    """A reality that is the plant itself, or its equations in other states, is the plant: over a switch, with a wrong model."""
-    problem = replace(SHIPPED.mass_spring_slots.problem, duration=1.5, measure_from=0.0)
-    plain = run(problem, SHIPPED.mass_spring_slots.controllers[name])
-    real = run(replace(problem, reality=reality()), SHIPPED.mass_spring_slots.controllers[name])
-    assert len(switches(real)) == 1
-    for signal in ("state", "command", "realised", "deformed"):
-        scale = np.abs(plain[signal]).max()
-        np.testing.assert_allclose(real[signal] / scale, plain[signal] / scale, atol=1e-9, err_msg=signal)
-
-
 # Switches
 
 
@@ -211,32 +166,6 @@ def test_a_deformation_starts_afresh_with_every_slot():
         assert active[first] == 1
         assert active[last] > 1.5
         assert (other[first : last + 1] == 1).all()
-
-
-def test_an_integral_starts_afresh_with_every_slot():
-    """Bumpless: it begins where it cancels the feedback of error and rate, whatever it was at the end of the slot before."""
-    slots, problem = (
-        SHIPPED.two_tanks_slots.controllers["slots"],
-        replace(SHIPPED.two_tanks_slots.problem, duration=480.0, measure_from=0.0),
-    )
-    result = run(problem, replace(slots, blend=0.0))
-    p = dict(zip(problem.plant.parameter.elements, problem.plant.approximate, strict=True))
-    of_integral, of_error, of_rate = fp.Exponential(rate=0.1).gains(2)
-
-    def feedback(cycle: int) -> float:
-        h1, h2 = result["state"][cycle]
-        rate = (p["c1"] * np.sqrt(h1) - p["c2"] * np.sqrt(h2)) / p["A2"]
-        return of_error * result["error.h2"][cycle] - of_rate * rate
-
-    lower = [(round(a / result.period), round(b / result.period)) for a, b, slot in result.spans() if slot == 0]
-    assert len(lower) == 4
-    for (_, ended), (first, _) in pairwise(lower):
-        begun = -feedback(first) / of_integral
-        # With blend = 0 the law is joined in the second cycle; by then one cycle's error was added.
-        used = (result["desired.h2"][first + 1] - feedback(first + 1)) / of_integral
-        assert used == pytest.approx(begun + result.period * result["error.h2"][first], rel=1e-9)
-        before = (result["desired.h2"][ended - 1] - feedback(ended - 1)) / of_integral
-        assert abs(before - begun) > 0.1 * abs(begun)
 
 
 def test_blanked_cycles_keep_the_distance():

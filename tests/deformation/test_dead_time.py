@@ -5,12 +5,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers import tasks
 from helpers.iteration import Scalar, affine, iteration_radius
 from helpers.plants import pendulum
 
 import fpirhc as fp
-from fpirhc.contracts import Controller
 
 DELAYS = (0, 1, 2, 3, 5, 10, 20)
 
@@ -117,54 +115,6 @@ def test_prediction_with_the_exact_model_undoes_the_dead_time():
         np.testing.assert_allclose(measured_log[shift:], free["state"][:-shift], atol=2e-8)
 
 
-late_mass = cache(lambda: replace(tasks.delayed_mass.problem, duration=9.0, measure_from=4.0))
-
-
-def rms_error(dead_time: float, controller: Controller) -> float:
-    problem = replace(late_mass(), dead_time=fp.DeadTime(inputs={"Q": dead_time}))
-    return fp.measure(problem, fp.simulate(problem, controller, seed=0, compiled=None)).rms_error["q"]
-
-
-def controllers(believed: float) -> dict[str, Controller]:
-    """The forms of the deformation, for a believed dead time."""
-    cycles = believed / tasks.delayed_mass.problem.period
-    sigmoid = fp.Sigmoid(gain=-0.5)
-    increment = fp.ComputedTorque(LAW, fp.Increment(sigmoid, cycles=cycles))
-    return {
-        "unpaired": fp.ComputedTorque(LAW, sigmoid),
-        "paired": fp.ComputedTorque(LAW, fp.Paired(sigmoid, cycles=cycles)),
-        "increment, by model": fp.Predicted(increment, inputs=believed),
-        "increment, by desired": fp.Predicted(increment, inputs=believed, by=fp.ByDesired()),
-        "increment, corrected": fp.Predicted(increment, inputs=believed, by=fp.ByModel(residual_time=0.2)),
-    }
-
-
-@pytest.mark.parametrize("product", [0.36, 0.6])
-def test_long_dead_time_needs_prediction(product):
-    """At rate x dead time of 0.36 and 0.6 the increment form with any prediction tracks; without prediction nothing does."""
-    dead_time = product / 6.0
-    errors = {name: rms_error(dead_time, c) for name, c in controllers(dead_time).items()}
-    assert max(e for name, e in errors.items() if "increment" in name) < 0.05
-    assert min(errors["unpaired"], errors["paired"]) > 0.2
-
-
-@pytest.mark.parametrize("share", [0.7, 1.3])
-def test_misestimated_dead_time_degrades_gracefully(share):
-    """30 % too short or too long: a few times the error, and a command as smooth; without a stated uncertainty it chatters."""
-    errors, moves = [], []
-    for believed, uncertainty in ((0.06, 0), (share * 0.06, 18), (share * 0.06, 0)):
-        deformation = fp.Increment(fp.Sigmoid(gain=-0.5), cycles=1e3 * believed, uncertainty=uncertainty)
-        run = fp.simulate(
-            late_mass(), fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=believed), seed=0, compiled=None
-        )
-        late = run.time >= late_mass().measure_from
-        errors.append(fp.measure(late_mass(), run).rms_error["q"])
-        moves.append(np.abs(np.diff(run["command"][late, 0])).mean())
-    assert errors[1] < 4 * errors[0]
-    assert moves[1] < 2 * moves[0]
-    assert moves[2] > 100 * moves[0]
-
-
 def test_commands_on_their_way_at_the_start():
     """In steady motion with the right commands on their way nothing moves; predicted from them, nothing is corrected."""
     tanks = fp.load_problem("delayed_tanks")
@@ -174,19 +124,3 @@ def test_commands_on_their_way_at_the_start():
     run = fp.simulate(resting, tanks.controllers["RHC exact model"], seed=0, compiled=False)
     np.testing.assert_allclose(run["state.h2"], 0.12, atol=1e-4)
     np.testing.assert_allclose(run["command"], 61.4, atol=0.5)
-
-
-@pytest.mark.parametrize("name", ["delayed_mass", "delayed_tanks"])
-def test_shipped_problems_tell_what_helps(name):
-    """With the same prediction FPI lowers the error; a controller that knows nothing of the dead time is the worst."""
-    task = fp.load_problem(name)
-    errors = {
-        c: [
-            *fp.measure(
-                task.problem, fp.simulate(task.problem, task.controllers[c], seed=0, compiled=None)
-            ).rms_error.values()
-        ][-1]
-        for c in ("RHC", "RHC+FPI", "RHC not predicting")
-    }
-    assert errors["RHC+FPI"] < 0.8 * errors["RHC"]
-    assert errors["RHC not predicting"] > 10 * errors["RHC"]

@@ -60,23 +60,8 @@ def form_leak(cycles, uncertainty):
     return fp.Increment(affine(1.0), cycles=cycles, uncertainty=uncertainty).iteration.leak
 
 
-def delayed_rms(true: int, deformation: Deformation) -> float:
-    """Rms error of the delayed mass with computed torque and a prediction that believe 20 cycles of dead time."""
-    dead_time = fp.DeadTime(inputs={"Q": true * tasks.delayed_mass.problem.period})
-    problem = replace(tasks.delayed_mass.problem, dead_time=dead_time, limits=fp.Limits())
-    controller = fp.Predicted(fp.ComputedTorque(LAW, deformation), inputs=0.02)
-    return fp.measure(problem, fp.simulate(problem, controller, seed=0)).rms_error["q"]
-
-
 LAW = fp.Exponential(rate=6.0)
 FASTEST = fp.Sigmoid(gain=-0.5, scale=20.0).with_effective_gain(1 / 1.5)  # the masses' ratio is the largest eigenvalue
-
-
-@pytest.mark.parametrize("form", [fp.Increment, fp.ModelReferenced])
-@pytest.mark.parametrize("true", [14, 19, 21, 26])
-def test_delayed_mass_with_a_wrong_dead_time(form, true):
-    """Told an uncertainty of 30 % the error is 4.5 to 4.8 mm wherever the dead time is; at most 6 are allowed."""
-    assert delayed_rms(true, form(FASTEST, cycles=20, uncertainty=6)) <= 6e-3
 
 
 def unknown_rms(true: int, deformation: Deformation, predicted: float = 0.025) -> float:

@@ -80,17 +80,6 @@ def test_null_at_other_orders(order):
     assert change(problem, fp.ComputedTorque(law), adaptive) <= 1e-9
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
-def test_wrong_model_behind_estimators(estimator):
-    """The twin keeps to a plant that it models wrongly: tracking is ten times better than without adaptation."""
-    problem = replace(tasks.two_mass.problem, sensing=fp.Sensing(estimator=estimator), duration=6.0)
-    none, result = (
-        max(fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(LAW, d), seed=0)).rms_error.values())
-        for d in (fp.Identity(), fp.ModelReferenced(SIGMOID.with_effective_gain(0.4)))
-    )
-    assert result < 0.1 * none
-
-
 def test_gain_that_the_delay_does_not_allow_is_refused():
     """With a model of a third of the plant's gain and a long window; the limit in the message is one that runs."""
     known = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers import tasks
 from helpers.exchange import told, with_exact_model
-from helpers.iteration import Scalar, affine
+from helpers.iteration import affine
 from helpers.kinds import shipped
 
 import fpirhc as fp
@@ -92,33 +92,6 @@ def test_exact_model_is_left_alone(name):
     assert np.abs(run - plain).max() <= AMPLIFIED.get(name, 1e-9) * np.abs(plain).max()
 
 
-def drift_of_trapezoid(period: float) -> float:
-    """Change of the rms error of an exact model by the form on mean responses, with the trapezoid for the model's mean."""
-    pole, errors = 2.0, {}
-    decay = np.exp(-pole * period)
-    for adapts in (False, True):
-        x, u, before, collected, step = 0.0, 0.0, 0.0, [], Scalar(fp.ModelReferenced(affine(0.6)))
-        for k in range(round(6.0 / period)):
-            t = k * period
-            desired = np.cos(t) + 5.0 * (np.sin(t) - x)
-            request = desired
-            if k and adapts:
-                mean, model = (x - before) / period, -0.5 * pole * (x + before) + u
-                request = step(model, mean, desired)
-            collected.append(np.sin(t) - x)
-            u, before = request + pole * x, x
-            x = decay * x + (1 - decay) / pole * u
-        errors[adapts] = np.sqrt(np.mean(np.square(collected[len(collected) // 2 :])))
-    return abs(errors[True] - errors[False])
-
-
-def test_trapezoid_of_the_model_is_of_second_order():
-    """With the mean of the measured response and the trapezoid of the model's, an exact model is changed by O(T^2)."""
-    changes = [drift_of_trapezoid(period) for period in (0.04, 0.02, 0.01)]
-    orders = np.log2(np.array(changes[:-1]) / np.array(changes[1:]))
-    assert np.all(np.abs(orders - 2) < 0.1)
-
-
 # Largest rms error of the coordinates in mm: controller, deformation, what an independent prototype found
 TRACKING = (
     ("CTC", fp.Sigmoid(gain=-2.52, scale=50.0), 0.852),
@@ -137,32 +110,6 @@ def test_two_mass_figures(name, deformation, expected):
     run = fp.simulate(tasks.two_mass.problem, tasks.two_mass.controllers[name].with_deformation(deformation), seed=0)
     errors = fp.measure(tasks.two_mass.problem, run).rms_error
     assert 1e3 * max(errors.values()) == pytest.approx(expected, rel=0.05)
-
-
-MAPS = (
-    fp.Sigmoid(gain=-1.2, scale=50.0),
-    fp.Sigmoid(gain=-1.2, scale=0.5),
-    fp.RFPT(offset=1e5, sign=-1, gain=5e-6),
-    fp.RFPTVector(offset=1e5, sign=-1, gain=5e-6),
-    fp.Rotation(fraction=0.5, radius=1e4),
-    fp.Filtered(fp.Affine(gain=-1.0), pole=0.5),
-    fp.Tuned(fp.Sigmoid(gain=-1.2, scale=50.0), largest_gain=0.9),
-)
-
-
-@pytest.mark.parametrize("map", MAPS, ids=lambda m: repr(m).replace(" ", ""))
-def test_every_map_on_two_coordinates(map):
-    """Saturating maps and wrappers inside, coupled coordinates: the wrong model's error falls to a hundredth of CTC's .35 m."""
-    if isinstance(map, fp.RFPT):
-        problem, law = fp.load_problem("delayed_mass").problem, LAW
-        problem = replace(problem, dead_time=fp.DeadTime())
-    else:
-        problem, law = tasks.two_mass.problem, LAW
-    none, result = (
-        fp.measure(problem, fp.simulate(problem, fp.ComputedTorque(law, d), seed=0)).rms_error
-        for d in (fp.Identity(), fp.ModelReferenced(map))
-    )
-    assert all(result[name] < 0.02 * none[name] for name in none)
 
 
 CASES = (

@@ -10,10 +10,8 @@ import abroad
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.linalg
-from helpers import tasks
 from helpers.filters import extended_filter, runge_kutta
-from helpers.plants import linear, pendulum
+from helpers.plants import pendulum
 from helpers.plants import simulated as run
 from helpers.replay import samples
 
@@ -107,42 +105,6 @@ def test_it_is_the_extended_filter_of_the_books():
     own = covariance(fp.Stepper(problem, TRACK, compiled=False), result, 2)
     np.testing.assert_allclose(own, expected, rtol=1e-10)
     assert np.linalg.eigvalsh(own).min() > 0
-
-
-def test_on_a_linear_plant_it_becomes_the_stationary_filter():
-    """Its covariance goes to the solution of the Riccati equation, from scipy, and its gain to that of a double integrator."""
-    filter = fp.KalmanFilter(measured={"y": 1e-3}, noise={"y": 0.5}, start={"y": 1.0, "y'": 1.0})
-    problem = fp.Problem(
-        plant=linear(1.0, 1.0),
-        reference=fp.Trajectory(lambda t: {"y": 0.3 * ca.sin(t)}),
-        start={"y": 0.0},
-        period=0.01,
-        duration=6.0,
-        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["y"], observer=filter),
-    )
-    result, h = run(problem, TRACK), problem.period
-    a, b, c = np.array([[1, h], [0, 1]]), np.array([[h**2 / 2], [h]]), np.array([[1.0, 0.0]])
-    prior = scipy.linalg.solve_discrete_are(a.T, c.T, 0.25 * b @ b.T, np.array([[1e-6]]))
-    gain = prior @ c.T / (c @ prior @ c.T + 1e-6)
-    own = covariance(fp.Stepper(problem, TRACK, compiled=False), result, 2)
-    np.testing.assert_allclose(own, prior - gain @ c @ prior, rtol=1e-8)
-
-
-def test_its_covariance_is_that_of_its_errors():
-    """With the right model and the stated noise, e' P^-1 e has the mean 2 of chi-squared, within four standard deviations.
-
-    Errors of neighbouring cycles belong together, so 60 runs count with one cycle each. The disturbance is the filter's noise.
-    """
-    problem = swing(ANGLE, duration=0.6, disturbances={"angle": fp.Noise(0.5)})
-    other = replace(problem, sensing=replace(problem.sensing, observer=replace(ANGLE, start={})))
-    stepper = fp.Stepper(other, TRACK, compiled=False)
-    simulator = fp.simulator(other, TRACK, compiled=False)
-    squares = []
-    for seed in range(60):
-        result = simulator.run(seed=seed)
-        error = result["state"][-1] - result["plant_state"][-1]
-        squares.append(error @ np.linalg.solve(covariance(stepper, result, 2), error))
-    assert np.mean(squares) == pytest.approx(2.0, abs=4 * 2 / np.sqrt(60))
 
 
 def test_adaptation_works_on_believed_states():
@@ -335,35 +297,3 @@ def test_a_filter_of_an_output_is_that_of_the_books() -> None:
     states, _ = extended_filter(result, runge_kutta(rate, 1 / 12), lambda x: curve(x[2:], 5.0), start, noise, 0.3)
     np.testing.assert_allclose(result["state"], states, atol=1e-10)
     assert np.abs(result["state"] - result["plant_state"]).max() > 0.3
-
-
-COMPARTMENTS = fp.KalmanFilter(
-    measured={"bis": 0.5},
-    noise={"C1": 0.3, "C2": 0.02, "C3": 0.02, "Ce": 0.1},
-    start={"C1": 0.3, "C2": 0.1, "C3": 0.1, "Ce": 0.3},
-)
-
-
-def test_adaptation_works_with_believed_compartments() -> None:
-    """The bis is measured and the compartments are those of a wrong patient: rms .070 without, .021 with adaptation."""
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["bis"], observer=COMPARTMENTS)
-    problem, controllers = replace(tasks.anaesthesia.problem, sensing=sensing), tasks.anaesthesia.controllers
-    errors = [fp.measure(problem, run(problem, controllers[n])).rms_error["bis"] for n in ("CTC", "CTC+FPI")]
-    assert errors == pytest.approx([0.070, 0.0207], rel=0.015)
-
-
-def test_a_state_that_shows_nowhere_and_stays_is_named() -> None:
-    """Y' = u measured; the state z = the integral of y."""
-    plant = fp.Plant.of_states(
-        states={"y": "m", "z": "m s"},
-        inputs={"u": "m/s"},
-        parameters={},
-        rates=lambda x, u, p: {"y": u.u, "z": x.y},
-        outputs={"y": fp.Output("m", lambda x, p: x.y)},
-    )
-    observer = fp.KalmanFilter(measured={"y": 0.1}, noise={"y": 1.0})
-    sensing = fp.Sensing({}, fp.PositionDifference(), measured=["y"], observer=observer)
-    reference = fp.Trajectory(lambda t: {"y": ca.sin(t)})
-    problem = fp.Problem(plant, reference, {"y": 0.0, "z": 0.0}, period=0.1, duration=2.0, sensing=sensing)
-    with pytest.raises(NotSupported, match="KalmanFilter: z cannot be observed along the reference from y"):
-        run(problem, PLAIN)

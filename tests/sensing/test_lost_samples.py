@@ -139,7 +139,7 @@ def test_a_missed_cycle_is_a_lost_sample(name):
 
 
 @pytest.mark.parametrize("name", LOOPS)
-@pytest.mark.parametrize("gap", [1, 5, 20, 50])
+@pytest.mark.parametrize("gap", [5, 50])
 def test_the_command_comes_as_near_as_with_interpolated_samples(name, gap):
     """At most twice as far from the run without faults as a controller that is given the missing samples afterwards."""
     own, cycles, lost = loop(name, max(gap, 5)), 40 + gap + 60, range(40, 40 + gap)

@@ -1,6 +1,5 @@
 """The closed loop: laws of adaptation, clipping, finiteness, disturbances, and running in several ways."""
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -9,7 +8,6 @@ import pytest
 from helpers.faults import Failing
 from helpers.machine import COMPILER
 from helpers.plants import heavy, linear, swing
-from helpers.tasks import made
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
@@ -40,17 +38,6 @@ def test_adaptation_waits_for_a_valid_pair():
     result = run(swing(), fp.Sigmoid(gain=-0.5, scale=10.0))
     assert result["deformed.angle"][0] == result["desired.angle"][0]
     assert result["deformed.angle"][5] != result["desired.angle"][5]
-
-
-def test_anti_windup_settles_where_windup_would_not():
-    """A step of 2 m with |u| <= 20: the request stays within the reachable set and the plant settles."""
-    problem = line(1.0, 1.3, reference=fp.Trajectory(lambda t: {"y": 2 + 0 * t}), duration=4.0)
-    problem = replace(problem, limits=fp.Limits(inputs={"u": (-20.0, 20.0)}))
-    controller = fp.ComputedTorque(fp.Exponential(6.0, bumpless=False), fp.Sigmoid(gain=-0.5, scale=10.0))
-    result = fp.simulate(problem, controller, seed=0, compiled=False)
-    assert np.abs(result["deformed.y"]).max() <= 26.0 + 1e-9
-    assert -result["error.y"].min() < 1.5
-    assert np.abs(result["error.y"][-200:]).max() < 0.02
 
 
 def test_disturbances_act_by_name():
@@ -147,30 +134,6 @@ def test_a_short_run_is_not_compiled_unless_it_is_asked_for():
     assert chosen.settings["why not compiled"] == "the run is short, and a compiler would take longer"
     ready = fp.simulator(swing(duration=200.0), fp.ComputedTorque(TRACK), compiled=None)
     assert ready.compiled or "short" not in ready.why_not_compiled
-
-
-def test_every_hard_limit_that_is_left_is_noted():
-    """Of a state and of an expression, by their own values; a rate is kept by the command, and what is weighed is no limit."""
-    task = fp.load_problem("van_der_pol")
-    power = fp.PathConstraint(lambda v: v.input.u * v.state["q'"], -20.0, 20.0, "W")
-    hard = replace(
-        task.problem.limits, states={"q'": (-1.0, 1.0)}, rates={"u": (-300.0, 300.0)}, paths={"power": power}
-    )
-    law = fp.ComputedTorque(TRACK)
-
-    def notes(limits: fp.Limits) -> tuple[fp.Run, list[str]]:
-        problem = replace(task.problem, duration=2.0, measure_from=0.0, limits=limits)
-        [entry] = fp.compare(made(problem, {"CTC": law}), seed=0, compiled=False).entries
-        return entry.run, [note for note in entry.notes if "hard limit" in note]
-
-    run, said = notes(hard)
-    speed, force = run["plant_state"][:, 1], np.ravel(run["command"])
-    assert np.abs(np.diff(force)).max() <= 300.0 * run.period * (1 + 1e-9)
-    for name, values in {"q'": speed, "power": force * speed}.items():
-        worst = values[np.argmax(np.abs(values))]
-        assert [note for note in said if note.startswith(f"{name} reaches {worst:.4g} ")], said
-    assert len(said) == 2
-    assert notes(replace(hard, soft={"power": 1.0, "q'": 1.0}))[1] == []
 
 
 # Mistakes at the door

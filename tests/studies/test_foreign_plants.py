@@ -13,7 +13,7 @@ tasks are ours.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import comb, pi
+from math import comb
 from types import SimpleNamespace
 from typing import Any
 
@@ -51,68 +51,6 @@ class ForeignPlant:
 def known(**values: tuple[float, float, str]) -> dict[str, fp.Parameter]:
     """Parameters from (approximate, exact, unit)."""
     return {name: fp.Parameter(*value) for name, value in values.items()}
-
-
-def steering() -> ForeignPlant:
-    """Lateral position of a car by its front wheels (Astrom and Murray, example 3.11; python-control, steering-optimal.py)."""
-
-    def rates(x, u, p):
-        return {"y": p.speed * ca.sin(x.heading), "heading": p.speed / p.wheelbase * ca.tan(u.steer)}
-
-    def chain(x, u, p):
-        climb = p.speed * np.cos(x["heading"])
-        return {"lateral": (x["y"], p.speed * np.sin(x["heading"]), climb * p.speed / p.wheelbase * np.tan(u.steer))}
-
-    plant = fp.Plant.of_states(
-        states={"y": "m", "heading": "rad"},
-        inputs={"steer": "rad"},
-        parameters=known(speed=(8.0, 10.0, "m/s"), wheelbase=(3.5, 3.0, "m")),
-        rates=rates,
-        outputs={"lateral": fp.Output("m", lambda x, p: x.y)},
-    )
-    return ForeignPlant(
-        fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(lambda t: {"lateral": 2 * ca.sin(0.5 * t)}),
-            start={"y": 0.0, "heading": 0.0},
-            period=0.02,
-            duration=10.0,
-            measure_from=4.0,
-            limits=fp.Limits(inputs={"steer": (-0.5, 0.5)}),
-        ),
-        rate=1.5,
-        chain=chain,
-    )
-
-
-def conical_tank() -> ForeignPlant:
-    """Level of a conical tank (D. E. Seborg et al., Process Dynamics and Control, 4th ed. 2016, ch. 2; B. W. Bequette, 1998)."""
-
-    def response(q, u, p):
-        return {"level": (u.inflow - p.valve * ca.sqrt(q.level)) / (pi * (p.slope * q.level) ** 2)}
-
-    plant = fp.Plant(
-        coordinates={"level": "m"},
-        inputs={"inflow": "m^3/min"},
-        order=1,
-        response=response,
-        parameters=known(valve=(0.35, 0.5, "m^2.5/min"), slope=(0.5, 0.4, "1")),
-        ranges={"level": (0.05, 4.0)},
-        time_unit="min",
-    )
-    return ForeignPlant(
-        fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(lambda t: {"level": 1.5 + 0.5 * ca.sin(0.5 * t)}),
-            start={"level": 1.2},
-            period=0.05,
-            duration=30.0,
-            measure_from=5.0,
-            limits=fp.Limits(inputs={"inflow": (0.0, 3.0)}),
-            input_before={"inflow": 0.5},
-        ),
-        rate=1.0,
-    )
 
 
 def magnet() -> ForeignPlant:
@@ -302,9 +240,9 @@ def _moved(one: ForeignPlant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) 
 # --- Beside each other ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("plant", [steering, conical_tank, magnet, stocking])
+@pytest.mark.parametrize("plant", [magnet, stocking])
 def test_errors_and_verdict_are_those_of_an_independent_integration(plant):
-    """An output of a body with states, a level in minutes, a force by the square of its input, and a map of two outputs."""
+    """A force by the square of its input, and a map of two outputs."""
     one = plant()
     comparison = one.compared(plant.__name__)
     late = np.arange(one.problem.cycles) * one.problem.period >= one.problem.measure_from - 1e-9

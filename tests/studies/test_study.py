@@ -4,7 +4,6 @@ The laws: the row of a drawn plant, a named case or a cell of a grid is the run 
 with any number of processes, it is the same one.
 """
 
-import io
 import json
 import math
 from dataclasses import replace
@@ -165,17 +164,6 @@ def test_cases_are_their_problems(task):
     assert table.group.tolist() == ["", "light", "heavy", "heavy", ""]
 
 
-def test_a_table_of_pandas_is_a_mapping(task):
-    """A row is a case; an empty cell is a wrong number, and no number of the problem."""
-    text = "case,group,exact.b,exact.k,seed\nweak,light,0.9,5,3\nstiff,heavy,1.2,8,11\n"
-    cases = fp.Cases(pd.read_csv(io.StringIO(text), index_col="case").to_dict("index"))
-    assert cases.problem("stiff", task.problem).plant.exact.tolist() == [1.2, 8.0]
-    assert (cases.seed("stiff"), cases.group("weak")) == (11, "light")
-    holed = fp.Cases(pd.read_csv(io.StringIO(text.replace("0.9", "")), index_col="case").to_dict("index"))
-    with pytest.raises(InvalidProblem, match=r"case 'weak', 'exact\.b': expected a finite number, got nan"):
-        holed.problem("stiff", task.problem)
-
-
 def test_a_cell_of_a_grid_is_the_run_with_its_numbers(task):
     """Settings of controllers and of the problem, live or built anew; a refused gain is a row, the best cell is told."""
     grid = fp.Grid.parsed(["deformation.gain=-0.8:-0.2:3", "exact.b=0.8:1.6:2:log"], seed=1)
@@ -287,13 +275,6 @@ def test_failures_are_counted_and_worse_than_any_error(task):
     failed = int((found.table.outcome != "finished").sum())
     assert found.summary.failures["CTC"] == failed > 0
     assert any(t == f"CTC fails in {failed} of 5." for t in sentences(found))
-
-
-def test_groups_are_studies_of_their_own(task):
-    everything = fp.study(task, fp.CasesOf(), compiled=False)
-    assert list(everything.groups) == ["light", "heavy"]
-    heavy = fp.study(task, fp.CasesOf(("heavy",)), compiled=False)
-    pd.testing.assert_frame_equal(everything.groups["heavy"], heavy.summary)
 
 
 def test_the_command_of_a_worst_run_makes_it_again(task):

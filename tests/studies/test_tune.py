@@ -143,18 +143,6 @@ def test_other_plants_and_spans_are_another_search(task, tmp_path):
     assert len(costs(tmp_path)) == 6
 
 
-def test_tuning_on_some_cases_leaves_the_others(task, tmp_path):
-    """The cost is the mean over the cases that are named."""
-    cases = fp.Cases(
-        {"light": {"exact.b": 2.0, "group": "some"}, "stiff": {"exact.k": 8.0, "group": "some"}, "far": {}}
-    )
-    task = replace(task, cases=cases)
-    facts = {"trials": 2, "controllers": ["CTC"], "compiled": False, "folder": tmp_path}
-    row = fp.tune(task, variants=fp.CasesOf(("some",)), **facts).table.iloc[0]
-    rows = fp.study(task, fp.CasesOf(("some",)), controllers=["CTC"], compiled=False).table
-    assert row.cost_before == pytest.approx(rows.error.mean(), rel=1e-9)
-
-
 def test_what_cannot_be_tuned_is_said(task, tmp_path, monkeypatch):
     with pytest.raises(InvalidProblem, match="no search space for controller 'CTC exact'"):
         fp.tune(task, trials=1, seed=0, folder=tmp_path, controllers=["CTC exact"])
