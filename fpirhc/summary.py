@@ -6,7 +6,9 @@ Names and reasons come from a user's files, so all of them are escaped for the p
 from __future__ import annotations
 
 import html
+import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -144,6 +146,22 @@ def written_out(value: float, digits: int = 3) -> str:
         mantissa, e, power = text.partition("e")
         return f"{mantissa}e{int(power)}" if e else text
     return f"{float(text):,.15g}".replace(",", " ")
+
+
+def in_words(says: str, numbers: Mapping[str, float], units: Mapping[str, str], **texts: str) -> str:
+    """Return a text of parts behind '|' that are there where their numbers are finite: {a:%} in percent, {a:u} with a unit."""
+
+    class Shown(float):
+        def __format__(self, spec: str) -> str:
+            digits = int(spec) if spec.isdigit() else 3
+            return in_percent(self) if spec == "%" else written_out(float(self), digits) + units.get(spec, "")
+
+    known, parts = texts | {name: Shown(v) for name, v in numbers.items() if math.isfinite(v)}, list[str]()
+    for part in says.split("|"):
+        with suppress(KeyError):
+            parts.append(part.strip().format_map(known))
+    lost = ["a run ends early"] if any(map(math.isinf, numbers.values())) else []
+    return ", ".join([*parts, *lost]).replace(", (", " (")
 
 
 def _escaped(text: str) -> str:

@@ -17,13 +17,18 @@ import numpy as np
 
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.nominal import nominal_run
+from fpirhc.horizon.nominal import filled, nominal_run
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem, nominal_start
 from fpirhc.tracking.base import Tracking
+
+_TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}  # a whole turn by unit
+_NEAR = 0.05  # share of a turn that a jump of whole turns may be off, because the reference moves within a cycle
+_OWN = 0.25  # share of a turn per cycle, up to which an angle moves by itself
 
 
 def stages_of(problem: Problem) -> int:
@@ -85,6 +90,37 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
 
 
 _SAMPLES = 100  # instants at which the reference is looked at
+
+
+def reference(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return nominal outputs (cycles, ny) and responses (cycles, n) at the beginning of every cycle."""
+    times = problem.period * np.arange(problem.cycles)
+    outputs, responses = nominal_motion(problem).map(problem.cycles)(times[None, :])
+    return np.asarray(outputs.full()).T, np.asarray(responses.full()).T
+
+
+def whole_turns(problem: Problem) -> tuple[str, int] | None:
+    """Return the angle whose reference jumps by whole turns most often, and how often; None: no angle is controlled."""
+    outputs, found = reference(problem)[0], list[tuple[str, int]]()
+    for name in problem.plant.controlled_names:
+        signal, place = problem.plant.output, problem.plant.output.elements.index(name)
+        turn = _TURNS.get(signal.entry_units[place])
+        if turn is not None:
+            turns = np.diff(outputs[:, place]) / turn
+            jumps = (np.abs(turns) > _OWN) & (np.abs(turns - np.round(turns)) < _NEAR)
+            found.append((name, int(jumps.sum())))
+    return max(found, key=lambda one: one[1], default=None)
+
+
+def needed_commands(problem: Problem, run: np.ndarray) -> np.ndarray:
+    """Return the inputs that the model needs along the reference, shape (cycles, nu); what has none is where a run's states are."""
+    plant, count = problem.plant, min(problem.cycles, len(run))
+    outputs, responses = (rows[:count] for rows in reference(problem))
+    states = filled(plant, outputs)
+    if run.shape[1] == plant.state.size:
+        states = np.where(np.isfinite(states), states, run[:count])
+    [table] = Evaluator(plant.equations.inverse.map(count))(states, responses, np.tile(plant.approximate, (count, 1)))
+    return table.reshape(count, -1)
 
 
 def largest_response(problem: Problem) -> tuple[float, ...]:

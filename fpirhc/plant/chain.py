@@ -8,8 +8,11 @@ of the cycle: there it is measured.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import NamedTuple
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.errors import NotSupported
 from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression, output_order, structural_order
@@ -136,3 +139,35 @@ def require_rates(plant: Plant, refusal: str) -> None:
     """Raise where the states have no derivatives with respect to time."""
     if plant.step is not None:
         raise NotSupported(refusal)
+
+
+class StateSlopes(NamedTuple):
+    """A (nx, nx), B (nx, nu), C (n, nx), D (n, nu), Y (sum of relative orders, nx), of the controlled coordinates or outputs."""
+
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    y: np.ndarray
+
+
+def state_slopes(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> StateSlopes:
+    """Return the slopes at a point; those of a map are of its divided differences."""
+    return StateSlopes(*(np.asarray(m.full()) for m in _slopes(plant)(state, command, parameters)))
+
+
+@lru_cache(maxsize=8)  # several questions of a review need it
+def _slopes(plant: Plant) -> ca.Function:
+    x, u, p = plant.symbols()
+    rates, responses = plant.equations.rate(x, u, p), plant.equations.controlled_response(x, u, p)
+    shown, orders = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names))), plant.response_orders
+    below = [k for k, e in enumerate(plant.output.elements) if orders.get(e.rstrip("'"), 0)]  # none of order 0
+    chain = ca.vertcat(ca.SX(0, 1), *(shown[k] for k in below))
+    pairs = ((rates, x), (rates, u), (responses, x), (responses, u), (chain, x))
+    return ca.Function("fpirhc_state_slopes", [x, u, p], [ca.densify(ca.jacobian(one, by)) for one, by in pairs])
+
+
+def zero_dynamics(s: StateSlopes) -> float:
+    """Return the largest real part of the rates at which states move while the outputs are held."""
+    free = np.linalg.svd(s.y)[2][np.linalg.matrix_rank(s.y) :].T if len(s.y) else np.eye(len(s.a))
+    return float(np.linalg.eigvals(free.T @ (s.a - s.b @ np.linalg.pinv(s.d) @ s.c) @ free).real.max())

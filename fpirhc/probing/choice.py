@@ -28,8 +28,8 @@ from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import outside
 from fpirhc.plant.plant import Plant
 from fpirhc.probing.identification import Estimates
-from fpirhc.review.experiments import Bench
-from fpirhc.review.questions import Case, Verdict, gain_by_run
+from fpirhc.review.experiments import Bench, Case
+from fpirhc.review.questions import Verdict, gain_by_run
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensor
 from fpirhc.simulation.model_as_plant import ModelAsPlant, behind_actuators, shortened

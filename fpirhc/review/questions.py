@@ -1,40 +1,41 @@
 """The questions of a review: a row for each, with a function that measures something and one sentence for what to do.
 
 The run decides: every answer about a loop is a difference of two runs of its own step, see `experiments`. Numbers have fixed names,
-which `fpirhc review --json` writes; a yes never stands beside a factor that grows.
+which `fpirhc review --json` writes, and a fixed text that says of what they are, their unit and their span.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import cached_property
+from functools import lru_cache
 from itertools import takewhile
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import with_optimiser, without_deformation
-from fpirhc.describe import identity
+from fpirhc.controllers.reference_states import needed_commands, whole_turns
+from fpirhc.deformation.base import own_gain
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.chain import relative_order
-from fpirhc.review.experiments import LATENCY, PLACES, Bench
-from fpirhc.review.points import StateSlopes, needed_commands, state_slopes, whole_turns, zero_dynamics
+from fpirhc.plant.chain import relative_order, zero_dynamics
+from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked
 from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
-from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
-from fpirhc.task.problem import Problem
 
-MORE = 8  # times the optimiser's iterations, with a tenth of its tolerance
 WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size of the task
 ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
 MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing of a loop
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
+SATURATED, UNUSED = 0.2, 0.01  # share of the cycles at a limit; largest command as a share of its limit
+BUSY = 2.0  # times the total variation of commands without adaptation
+
+
+Errors = Mapping[str, float]  # by quantity
 
 
 class Verdict(StrEnum):
@@ -44,74 +45,13 @@ class Verdict(StrEnum):
 
 
 class Fact(NamedTuple):
-    """What was measured: numbers by fixed names, of one quantity where it is about one; `change` in place of the row's sentence."""
+    """What was measured: numbers by fixed names, of one quantity; `change` in place of the row's sentence."""
 
     verdict: Verdict
     numbers: Mapping[str, float]
     of: str = ""
     change: str = ""
-
-
-class NotAsked(FpirhcError):
-    """Why a question has no answer for this loop."""
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """A loop and its experiments; what takes time is run when it is first read."""
-
-    bench: Bench
-    draws: np.ndarray  # exact parameters of the box, shape (draws, np)
-    outside: bool  # whether the plant is somebody else's, so that the model moves in its place
-    known: dict[object, Bench]  # experiments with other loops, which controllers share
-    models: ModelAsPlant
-
-    @property
-    def problem(self) -> Problem:
-        """The problem that is run."""
-        return self.bench.problem
-
-    def other(self, controller: Controller, *, short: bool = False, model: Problem | None = None) -> Bench:
-        """Return the experiments with another controller, or on its model as the plant."""
-        key = (identity(controller), short, id(model)) if short or model else identity(controller)
-        return self.known.setdefault(key, Bench(model or self.problem, controller, short=short))
-
-    @cached_property
-    def plain(self) -> Bench:
-        """The loop without adaptation."""
-        return self.other(without_deformation(self.bench.controller))
-
-    @cached_property
-    def converged(self) -> Bench | None:
-        """The loop whose optimiser takes its time; None where there is nothing to take."""
-        planner = self.bench.controller.planner
-        if planner is None:
-            return None
-        longer: Any = planner.optimiser.longer(MORE)
-        if longer is None:
-            return None
-        if getattr(longer, "tolerance", None):
-            longer = replace(longer, tolerance=longer.tolerance / 10)
-        return self.other(with_optimiser(self.bench.controller, longer), short=True)
-
-    @cached_property
-    def lacks_iterations(self) -> bool:
-        """Whether only the loop with more iterations follows and comes back."""
-        return not self.bench.sound and self.converged is not None and self.converged.sound
-
-    def asks_more(self) -> bool:
-        """Return whether there is a loop to ask more of; raises where its plans have to converge first."""
-        if self.lacks_iterations:
-            raise NotAsked("Not asked before the plans converge.")
-        return self.bench.back.left <= 1 and self.bench.share(self.bench.nominal) <= 1
-
-    def slopes(self, count: int) -> list[StateSlopes]:
-        """Return slopes of the model's plant at states and commands of the run."""
-        run, plant = self.bench.nominal, self.problem.plant
-        if run["plant_state"].shape[1] != plant.state.size or not run.cycles:
-            raise NotAsked("What moves has other states than the model.")
-        at = np.linspace(0, run.cycles - 1, count).astype(int)
-        return [state_slopes(plant, run["plant_state"][k], run["command"][k], plant.exact) for k in at]
+    unit: str = ""  # where it is no unit of a followed quantity or an input
 
 
 @dataclass(frozen=True)
@@ -121,7 +61,8 @@ class Question:
     key: str
     text: str
     ask: Callable[[Case], Fact | None]  # None: the question has no meaning here
-    change: str  # what to do where the answer is not good
+    says: str  # the numbers in words, in parts behind "| " that are there where their numbers are
+    change: str  # what to do where the answer is not good, with what the loop has for it
     of: str = "controller"  # or 'problem', which asks the loop of the first controller, or 'adaptive'
 
 
@@ -131,16 +72,13 @@ def graded(value: float, good: float, bad: float) -> Verdict:
     return Verdict.YES if sign * value <= sign * good else Verdict.CAUTION if sign * value < sign * bad else Verdict.NO
 
 
-# Of the problem
-
-
 def _turns(case: Case) -> Fact | None:
     found = whole_turns(case.problem)
     return found and Fact(Verdict.NO if found[1] else Verdict.YES, {"jumps": found[1]}, found[0])
 
 
 def _posed(case: Case) -> Fact | None:
-    commands = needed_commands(case.problem, case.bench.nominal)
+    commands = needed_commands(case.problem, case.bench.nominal["plant_state"])
     finite = np.isfinite(commands).all(axis=1)
     return Fact(Verdict.YES if finite.all() else Verdict.NO, {"share_finite": finite.mean()}) if len(finite) else None
 
@@ -157,7 +95,7 @@ def _inverse(case: Case) -> Fact:
     columns = [s.d / np.maximum(np.abs(s.d).max(axis=0), 1e-300) for s in case.slopes(41)]
     rows = [d / np.maximum(np.abs(d).max(axis=1, keepdims=True), 1e-300) for d in columns]
     worst = max(float(np.linalg.cond(d)) if np.isfinite(d).all() else math.inf for d in rows)
-    return Fact(graded(worst, 1e6, 1e12), {"condition": worst})
+    return Fact(graded(worst, 1e6, 1e12), {"condition": worst} if math.isfinite(worst) else {})
 
 
 def _ranges(case: Case) -> Fact | None:
@@ -166,24 +104,38 @@ def _ranges(case: Case) -> Fact | None:
     sensing = case.problem.sensing
     shown = sensing.measures(case.problem.plant)
     free = [n for n in shown if n not in sensing.sensors or sensing.sensors[n].range is None]
-    return Fact(Verdict.CAUTION if free else Verdict.YES, {"without": len(free), "of": len(shown)}, ", ".join(free))
-
-
-# Of a loop
-
-
-def _mended(case: Case, fact: Fact) -> Fact:
-    """The answer that more iterations would turn into a yes, told as such."""
-    if fact.verdict == Verdict.YES or not case.lacks_iterations or case.converged is None:
-        return fact
-    return fact._replace(numbers={**fact.numbers, "left_with_more_iterations": case.converged.back.left})
+    numbers = {"without": len(free), "measured": len(shown)}
+    return Fact(Verdict.CAUTION if free else Verdict.YES, numbers, ", ".join(free))
 
 
 def _follows(case: Case) -> Fact:
-    run = case.bench.nominal
-    (name, share), held = case.bench.worst(run), case.bench.held(run)
-    verdict = Verdict.CAUTION if share <= GOOD and held > 0.2 else graded(share, GOOD, BAD)
-    return _mended(case, Fact(verdict, {"error": share, "at_a_limit": held}, name))
+    bench, (name, share) = case.bench, case.bench.worst(case.bench.nominal)
+    numbers = {"rms_error": bench.errors(bench.nominal)[name], "error": share, "size": bench.sizes[name]}
+    return Fact(graded(share, GOOD, BAD), numbers, name)
+
+
+def _saturates(case: Case) -> Fact | None:
+    bench, run, names = case.bench, case.bench.nominal, list(case.problem.plant.inputs)
+    limits = np.array(bench.problem.limits.input_bounds(case.problem.plant))
+    if not run.cycles or not np.isfinite(limits).any():
+        return None
+
+    def of_limit(commands: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(commands == 0, 0.0, commands / np.where(commands < 0, *limits)).max(axis=0))
+
+    largest, held = of_limit(run["command"]), bench.held(run)
+    used = np.where(largest > ROUNDING, largest, np.inf)
+    at = int(bench.at_limits(run).mean(axis=0).argmax() if held > SATURATED else used.argmin())
+    needed = of_limit(needed_commands(case.problem, run["plant_state"]))[at]
+    numbers = {"at_a_limit": held, "largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
+    numbers |= {"needed": needed} if np.isfinite(needed) else {}
+    if held <= SATURATED and used[at] < UNUSED:
+        change = "State the limits that the actuator has: tolerances of plans are shares of them."
+        return Fact(Verdict.CAUTION, numbers, names[at], change)
+    change = "The reference needs less than the limits: mend what else is a no." if needed <= 1 else ""
+    lost = held > MOSTLY and (bench.share(run) > GOOD or 1 < needed < math.inf)
+    return Fact(Verdict.NO if lost else graded(held, SATURATED, math.inf), numbers, names[at], change)
 
 
 def _returns(case: Case) -> Fact:
@@ -196,7 +148,15 @@ def _returns(case: Case) -> Fact:
     lost = back.left >= 1.05 and (far.left >= 1.05 or back.left >= 2)  # else a small cycle about the run
     verdict = Verdict.YES if calm else Verdict.NO if lost else Verdict.CAUTION
     numbers = {"left": back.left, "left_of_ten_times": far.left, "factor": back.factor, "largest_factor": worst}
-    return _mended(case, Fact(verdict, {**numbers, "mean_step": step}))
+    numbers |= _times(math.log(back.factor) / case.problem.period) if back.factor > 0 else {}
+    return Fact(verdict, {**numbers, "mean_step": step})
+
+
+def _times(rate: float) -> dict[str, float]:
+    """The time constant of what shrinks, or the time in which what grows is twice as large."""
+    if rate < 0:
+        return {"time_constant": -1 / rate}
+    return {"doubles_in": math.log(2) / rate} if 0 < rate < math.inf else {}
 
 
 def _plans(case: Case) -> Fact | None:
@@ -244,10 +204,8 @@ def _box(case: Case) -> Fact | None:
         base = bench.run(exact=exact)
         found.append((bench.pushed(PLACES[0], base=base, exact=exact)[0].left, bench.share(base)))
     good, most = float(np.mean([left <= 1 and share <= 1 for left, share in found])), np.max(found, axis=0)
-    verdict = (
-        Verdict.NO if good == 0 else graded(most[0], max(GOOD, bench.back.left), BAD) if good == 1 else Verdict.CAUTION
-    )
-    return Fact(verdict, {"share_that_come_back": good, "left": most[0], "error": most[1]})
+    verdict = graded(most[0], max(GOOD, bench.back.left), BAD) if good == 1 else Verdict.CAUTION if good else Verdict.NO
+    return Fact(verdict, {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]})
 
 
 def _gains(case: Case) -> Fact | None:
@@ -259,7 +217,10 @@ def _gains(case: Case) -> Fact | None:
         return run.left <= 1 and run.steps <= 2 * case.bench.back.steps + 0.01
 
     most, least = (([1.0, *takewhile(bears, side)])[-1] for side in GAINS)
-    return Fact(Verdict.YES if (most, least) == (2.0, 0.5) else Verdict.CAUTION, {"most": most, "least": least})
+    change = "With less gain of the inputs it is lost: only a faster loop bears that." if most == 2 else ""
+    return Fact(
+        Verdict.YES if (most, least) == (2.0, 0.5) else Verdict.CAUTION, {"most": most, "least": least}, "", change
+    )
 
 
 def _latency(case: Case) -> Fact | None:
@@ -281,7 +242,8 @@ def _latency(case: Case) -> Fact | None:
         if left > 1 or harms > WORSE:
             borne = cycles - 1
             break
-    numbers = {"cycles_borne": borne, "error": share, "mean_step": step, "mean_step_without": calm}
+    numbers = {"cycles_borne": borne, "time_borne": borne * case.problem.period, "cycles_tried": cycles}
+    numbers |= {"error": share, "mean_step": step, "mean_step_without": calm}
     numbers |= {n: v for n, v in (("left", left), ("error_without", without)) if v < math.inf}
     return Fact(graded(borne, LATENCY, -1), numbers)
 
@@ -292,8 +254,11 @@ def _left(case: Case) -> Fact | None:
         return None
     worst = max(followed, key=lambda one: float(one.beyond.max()))
     share, most = float((worst.beyond > TOLERANCE).mean()), float(worst.beyond.max())
-    verdict = Verdict.YES if most <= TOLERANCE else Verdict.NO
-    return Fact(verdict, {"beyond": most, "share_of_cycles": share}, worst.name)
+    verdict, at = Verdict.YES if most <= TOLERANCE else Verdict.NO, int(worst.beyond.argmax())
+    excess = max(worst.values[at] - worst.upper, worst.lower - worst.values[at], 0.0)
+    numbers = {"share_of_cycles": share}
+    numbers |= {"excess": excess, "beyond": most, "time_of_it": at * case.problem.period} if most > 0 else {}
+    return Fact(verdict, numbers, worst.name, unit=worst.unit)
 
 
 def _inner(case: Case) -> Fact | None:
@@ -302,31 +267,35 @@ def _inner(case: Case) -> Fact | None:
         return None
     rate, left = max(map(zero_dynamics, case.slopes(9))), bench.back.left
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
+    numbers = {"rate_with_outputs_held": rate, **_times(rate)}
     if rate * problem.duration <= math.log(2):
-        return Fact(Verdict.YES, {"rate_with_outputs_held": rate})
-    return Fact(held, {"rate_with_outputs_held": rate, "left": left})
+        return Fact(Verdict.YES, numbers)
+    return Fact(held, {**numbers, "left": left})
 
 
 def _noise(case: Case) -> Fact | None:
     if not case.problem.sensing.drawn:
         return None
-    noisy, quiet = case.bench.start, case.bench.run(quiet=True)
+    bench, noisy, quiet = case.bench, case.bench.start, case.bench.quiet
     count, (lower, upper) = min(noisy.cycles, quiet.cycles), case.problem.limits.input_bounds(case.problem.plant)
-    steps = np.diff(noisy["command"][:count] - quiet["command"][:count], axis=0)
+    steps = np.diff((noisy["command"][:count] - quiet["command"][:count])[bench.first(count) :], axis=0)
     span = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.ptp(quiet["command"], axis=0), 1e-300))
-    chatter = np.sqrt((steps**2).mean(axis=0)) / span
-    worst = int(chatter.argmax())
-    shares = {"error_without_noise": case.bench.share(quiet), "error": case.bench.share(noisy)}
-    numbers, verdict = {"rms_step": chatter[worst], **shares}, graded(chatter[worst], 0.01, math.inf)
-    return Fact(verdict, numbers, list(case.problem.plant.inputs)[worst])
-
-
-# Of adaptation
+    size = np.sqrt((steps**2).mean(axis=0))
+    worst = int((size / span).argmax())
+    numbers = {"rms_change": size[worst], "rms_step": size[worst] / span[worst], "movement": bench.moves(noisy)[worst]}
+    numbers |= {"movement_without_noise": bench.moves(quiet)[worst], "error": bench.share(noisy)}
+    numbers["error_without_noise"] = bench.share(quiet)
+    adapts, name = bench.built.controller.deformation.adapts, list(case.problem.plant.inputs)[worst]
+    change = gain_by_run(case).change if adapts and _busy(case) else ""
+    return Fact(graded(numbers["rms_step"], 0.01, math.inf), numbers, name, change)
 
 
 def _bias(case: Case) -> Fact | None:
     bench, plain, base = case.bench, case.plain, case.bench.start
-    if not bench.sees_bias or not case.asks_more():
+    shown = (
+        bench.built.loop.reads[PROBE].size > 2 * len(case.problem.plant.inputs) + 1
+    )  # it estimates no response itself
+    if not shown or not case.asks_more():
         return None
     size = float(max(np.ptp(base["plant_realised"], axis=0).max(), 1e-2 * np.abs(base["plant_realised"]).max())) or 1.0
     biased = bench.run(bias=0.01 * size)
@@ -337,60 +306,103 @@ def _bias(case: Case) -> Fact | None:
     name = max(alone, key=lambda n: slopes[n] / max(bench.sizes[n], 1e-300))
     slope = slopes[name]
     even = alone[name] / slope if slope > 1e-12 else math.inf
-    numbers = {"error_per_bias": slope, "bias_that_costs_the_gain": even, "share_of_the_response": even / size}
+    numbers = {"added_by_a_bias": 0.01 * size * slope}
+    numbers |= {"share_of_the_response": even / size} if even <= 10 * size else {}
     if case.problem.sensing.drawn:  # what the sensors have may be a bias
-        right, own, most = bench.share(bench.run(quiet=True)), bench.share(base), plain.share(plain.start)
+        right, own, most = bench.share(bench.quiet), bench.share(base), plain.share(plain.start)
         numbers |= {"error_with_right_sensors": right, "error": own}
         if right < most < own:
             return Fact(Verdict.NO, numbers, name)
     return Fact(graded(even / size, 0.02, 0.0), numbers, name)
 
 
+def _allowed(case: Case) -> np.ndarray:
+    """The total variation that commands may have per unit of time: twice that without adaptation, or once their own range."""
+    quiet = case.bench.quiet["command"][case.bench.first(case.bench.quiet.cycles) :]
+    once = np.ptp(quiet, axis=0) / (len(quiet) * case.problem.period)
+    return np.maximum(BUSY * case.plain.moves(case.plain.start), once)
+
+
+def _busy(case: Case) -> bool:
+    """Whether noise moves a command by more than is allowed."""
+    own, moves = case.bench, case.bench.moves(case.bench.start)
+    most = np.maximum(_allowed(case), WORSE * own.moves(own.quiet)) if case.problem.sensing.drawn else np.inf
+    return bool((moves > most).any())
+
+
+class Try(NamedTuple):
+    """A run with another gain or with a filter, see `_tries`."""
+
+    error: float
+    moves: np.ndarray
+    good: bool
+    calm: bool
+
+
+TODAY, TURNED = (1.0, 0.0), (-1.0, 0.0)  # times the gain, and pole of a filter
+SMALLER, LARGER, FILTERS = [(0.5**k, 0.0) for k in (1, 2, 3, 4)], [(2.0, 0.0), (4.0, 0.0)], [(1.0, 0.8), (1.0, 0.95)]
+SAID = {TODAY: "error", TURNED: "error_turned", SMALLER[0]: "error_at_half", LARGER[0]: "error_at_twice",
+        LARGER[1]: "error_at_four_times"}  # fmt: skip
+
+
+def _tries(case: Case) -> dict[tuple[float, float], Try]:
+    """Runs with other gains and filters: calm is what moves no command by more than is allowed or than today; good what helps."""
+    own, plain, tries, busy = case.bench, case.plain, dict[tuple[float, float], Try](), _busy(case)
+    useful, most, now = min(1.0, WORSE * plain.share(plain.counted) + SLIGHT), _allowed(case), own.moves(own.start)
+    most = most if busy else np.maximum(most, now)
+
+    def tried(way: tuple[float, float]) -> bool:
+        tries[way] = Try(math.inf, np.full(most.shape, math.inf), False, False)
+        with suppress(FpirhcError):  # refused by a schedule of slots
+            bench = own if way == TODAY else case.filtered(way[1]) if way[1] else own.at_gain(way[0])
+            error, moves = bench.share(bench.counted), bench.moves(bench.start)
+            calm = bool((moves <= most).all())
+            good = error <= useful and (calm or bool((moves <= 2 * now).all())) and bench.back.left <= 1
+            tries[way] = Try(error, moves, good, calm)
+        return tries[way].good and (tries[way].calm or not busy)
+
+    if not tried(TODAY):
+        any(map(tried, SMALLER if busy else SMALLER[:2]))
+    any(map(tried, FILTERS)) if busy else all(map(tried, LARGER))
+    if not any(one.good for one in tries.values()):  # is its sign wrong?
+        tried(TURNED)
+    return tries
+
+
+@lru_cache(maxsize=1)  # noise asks it, too
 def gain_by_run(case: Case) -> Fact:
-    """Return errors at other gains of the map; recommended is half of the largest that comes back, or else the best."""
+    """Return errors at other gains and the recommended one: half of the largest that is good, or else the best; always a calm one.
+
+    Where noise moves a command too much with today's gain, it is the best of smaller ones and of filters.
+    """
     case.asks_more()
-    own, good, errors = case.bench, dict[float, bool](), dict[float, float]()
-    useful = min(1.0, WORSE * case.plain.share(case.plain.counted) + SLIGHT)
-    for times in (1.0, 0.5, 2.0, 4.0):
-        if times < 1 and good[1.0]:  # it would only be slower
-            continue
-        try:
-            bench = own if times == 1 else own.at_gain(times)
-            errors[times] = own.share(bench.counted)
-        except FpirhcError:  # refused by a schedule of slots
-            errors[times] = math.inf
-        calm = errors[times] <= useful and (times <= 1 or own.steps(bench.start) <= 2 * own.steps(own.start))
-        good[times] = calm and bench.back.left <= 1
-        if times > 1 and not good[times]:
-            break
-    if not any(good.values()):  # is its sign wrong?
-        errors[-1.0] = own.share(own.at_gain(-1.0).counted)
-        good[-1.0] = errors[-1.0] <= useful
-    fine = [t for t in good if good[t]]
-    most = max(fine, default=math.nan)
-    best = max(most / 2, 1.0) if good[1.0] else min(fine, key=lambda t: errors[t], default=math.nan)
-    names = {
-        1.0: "error",
-        0.5: "error_at_half",
-        2.0: "error_at_twice",
-        4.0: "error_at_four_times",
-        -1.0: "error_turned",
-    }
-    numbers = {names[times]: e for times, e in errors.items()} | ({"recommended_times": best} if fine else {})
-    some = Verdict.NO if fine else Verdict.UNKNOWN
-    grade = (Verdict.YES if most >= 2 else Verdict.CAUTION) if good[1.0] else some
-    return Fact(grade, numbers, change="Turn the sign of the gain." if -1.0 in fine else "")
+    busy, tries, before = _busy(case), _tries(case), case.plain.moves(case.plain.start)
+    good, now, fine = tries[TODAY].good, tries[TODAY].moves, [way for way, one in tries.items() if one.good]
+    largest, calm = max(fine, default=TODAY)[0], [way for way in fine if tries[way].calm]
+    best = min(calm, key=lambda way: tries[way].error, default=TODAY)
+    best = best if busy else max((way for way in calm if 2 * way[0] <= largest), default=best)
+    worst = int((now / np.maximum(before, 1e-300)).argmax())
+    of, numbers = list(case.problem.plant.inputs)[worst], {"movement": now[worst], "movement_without": before[worst]}
+    numbers |= {SAID[way]: one.error for way, one in tries.items() if way in SAID}
+    if not good and not calm:
+        change = "No gain that was tried helps: use another form, or leave the deformation out."
+        return Fact(Verdict.UNKNOWN, numbers, of, change)
+    (times, pole), (name, value) = best, own_gain(case.bench.controller.deformation)
+    numbers |= {"recommended_times": times, "recommended_gain": times * value}
+    change = "No smaller gain and no filter that was tried makes the command calm: {sensor}." if busy else ""
+    if best != TODAY:
+        numbers |= {"error_recommended": tries[best].error, "movement_recommended": tries[best].moves[worst]}
+        told = f"Set the {name} to {times * value:.4g}."
+        change = f"Filter the error of the map: Filtered(map, pole={pole:g})." if pole else told
+    return Fact(graded(largest, 2.0, 0.0) if good else Verdict.NO, numbers, of, change)
 
 
-def _added(
-    case: Case, without: Mapping[str, float], adapted: Mapping[str, float], slight: float | None = None
-) -> tuple[str, dict[str, float], float]:
+def _added(case: Case, without: Errors, adapted: Errors, slight: float = 0.0) -> tuple[str, dict[str, float], float]:
     """The quantity that is made worse with most added, its errors, and how many times; `slight` is a share of the task."""
     sizes = {n: s for n, s in case.plain.sizes.items() if s and n in adapted}
     added = {n: math.inf if adapted[n] == math.inf else (adapted[n] - without[n]) / s for n, s in sizes.items()}
-    if slight is None:
-        most = (max((e[n] / s for n, s in sizes.items()), default=0.0) for e in (without, adapted))
-        slight = MINOR * min(most)
+    most = (max((e[n] / s for n, s in sizes.items()), default=0.0) for e in (without, adapted))
+    slight = slight or MINOR * min(most)
     counted = [n for n, share in added.items() if share > slight and adapted[n] > ROUNDING * sizes[n]]
     times = {n: adapted[n] / max(without[n], 1e-300) for n in counted}
     name = max(added, key=lambda n: (times.get(n, 0.0) > WORSE, added[n]), default=next(iter(adapted)))
@@ -406,10 +418,11 @@ def _model(case: Case) -> Fact:
         raise NotAsked("The command stands at a limit: run it where commands are free.")
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
     name, numbers, harms = _added(case, without, adapted, SLIGHT)
-    # More than it may cure.
+    # more than it may cure
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
     no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
-    return Fact(Verdict.NO if no else Verdict.CAUTION if harms > WORSE else Verdict.YES, numbers, name)
+    verdict = Verdict.NO if no else Verdict.CAUTION if harms > WORSE else Verdict.YES
+    return Fact(verdict, numbers, name)
 
 
 def _pays(case: Case) -> Fact:
@@ -425,37 +438,70 @@ def _pays(case: Case) -> Fact:
 
 QUESTIONS = (
     Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns,
-             "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error.", "problem"),
-    Question("posed", "Has the reference finite commands?", _posed,
+             "jumps of {of} in {whole}: {jumps}", "The angle jumps by a whole turn: unwrap it (an angle that goes on), or "
+             "weigh 1 - cos of its error.", "problem"),
+    Question("posed", "Has the reference finite commands?", _posed, "finite in {share_finite:%} of the cycles of {whole}",
              "Give it the derivatives that the plant's order needs, away from singular states.", "problem"),
     Question("orders", "Are the relative orders those of the plant?", _orders,
+             "the input acts on derivative {order} of {of}, stated {stated}",
              "Write the response as the derivative that the input acts on.", "problem"),
     Question("inverse", "Can the response be inverted where it goes?", _inverse,
+             "largest condition number of the scaled input matrix in {whole}: {condition}",
              "Keep the plant away from states where inputs lose their effect.", "problem"),
-    Question("ranges", "Is it stated what working sensors show?", _ranges,
+    Question("ranges", "Is it stated what working sensors show?", _ranges, "{without} of {measured} quantities are without| {of}",
              "State it, so that a failed sensor is not believed: Sensor(range=(lower, upper)).", "problem"),
-    Question("plans", "Are its plans good enough?", _plans,
+    Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of the plans of {whole} did not converge"
+             "| relative rms error {error:%} ({start})| {error_with_more_iterations:%} with 8 times the iterations",
              "Give the optimiser more iterations, or a smaller tolerance, before anything else."),
-    Question("gain", "Is the gain admissible?", gain_by_run, "Use the recommended gain; without one, another form.", "adaptive"),
+    Question("gain", "Is the gain admissible?", gain_by_run, "relative rms error {error:%} ({tried})"
+             "| {error_recommended:%} as recommended| {error_at_half:%} at half of the gain| {error_at_twice:%} at twice"
+             "| {error_at_four_times:%} at four times| {error_turned:%} with the other sign| recommended gain {recommended_gain:4}"
+             "| total variation of {of} {movement:r} ({start})| {movement_recommended:r} as recommended"
+             "| {movement_without:r} without adaptation",
+             "There is no reserve: twice this gain is lost.", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows,
-             "Mend the loop without adaptation first: horizon, weights, limits, period."),
-    Question("returns", "Does it come back from a push?", _returns,
-             "Lower the rate of the tracking law, shorten the period, or state the dead time."),
-    Question("horizon", "Is the horizon long enough?", _horizon, "Lengthen it, or weigh its end (LQRTerminal)."),
-    Question("box", "Does it come back all over the box?", _box, "Narrow the box of the parameters, or lower the gain."),
+             "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}",
+             "Mend the loop without adaptation first: {settings}, limits, period."),
+    Question("input_limits", "Do the input limits fit the task?", _saturates,
+             "a command at a limit in {at_a_limit:%} of the cycles of {whole}"
+             "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| the reference needs {needed:%} of it",
+             "Slow the reference, or widen the limits: it needs more than they allow."),
+    Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
+             "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:4} per cycle"
+             "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:4}"
+             "| commands change by {mean_step:%} of their range a cycle", "{slower}, shorten the period, or state the dead time."),
+    Question("horizon", "Is the horizon long enough?", _horizon,
+             "relative rms error {error:%} ({half})| {error_with_twice_the_horizon:%} with twice the stages",
+             "Lengthen it, or weigh its end (LQRTerminal)."),
+    Question("box", "Does it come back for every plant in the range of the parameters?", _box,
+             "{share_that_come_back:%} of {plants} plants| in the worst case {left:%} of a push left after {pushed}"
+             "| relative rms error {error:%} ({start})", "Narrow the range of the parameters, or {slower}."),
     Question("input_gain", "Does it bear half and twice the gain of the inputs?", _gains,
-             "Change the rate or the gain: the nearer of the two limits is too near."),
-    Question("latency", "Does it bear three cycles of latency?", _latency,
-             "Measure the latency and state it: Problem(dead_time=...)."),
+             "it comes back at {least} to {most} times their gain", "{slower}: with more gain of the inputs it is lost."),
+    Question("latency", "Does it bear three cycles of latency?", _latency, "{cycles_borne} of 3 ({time_borne} {time})"
+             "| with {cycles_tried} cycles: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
+             "| commands change by {mean_step:%} of their range per cycle| {mean_step_without:%} without latency"
+             "| {left:%} of a push left after {pushed}", "Measure the latency and state it: Problem(dead_time=...)."),
     Question("limits", "Do states, rates and paths keep their limits?", _left,
+             "beyond a limit in {share_of_cycles:%} of the cycles of {whole}"
+             "| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}",
              "Commands keep intervals of inputs and rates: slow the reference, or leave room."),
-    Question("inner", "Do states without a task stay?", _inner, "Weigh them in the cost, or control another output."),
-    Question("noise", "Is the chatter from noise small?", _noise, "Lower the gain, or filter its error: Filtered(map, pole=...)."),
+    Question("inner", "Are the zero dynamics stable?", _inner, "largest real part {rate_with_outputs_held} 1/{time}"
+             "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| {left:%} of a push left after {pushed}",
+             "States without a task go off: weigh them in the cost, or control another output."),
+    Question("noise", "Is the chatter from noise small?", _noise,
+             "noise changes {of} by {rms_change:u} rms per cycle, {rms_step:%} of its range ({start})"
+             "| total variation {movement:r}| {movement_without_noise:r} without noise"
+             "| relative rms error {error:%}| {error_without_noise:%} without noise", "{quieter}."),
     Question("bias", "Does it bear a bias of the measured response?", _bias,
-             "Calibrate the sensor: a bias moves the plant.", "adaptive"),
-    Question("model", "Does adaptation leave a right model alone?", _model,
+             "a bias of 1 % of the response's range adds {added_by_a_bias:u} to the error of {of} ({late})"
+             "| one of {share_of_the_response:%} costs what adaptation gains| relative rms error {error:%} ({start})"
+             "| {error_with_right_sensors:%} with right sensors", "Calibrate the sensor: a bias moves the plant.", "adaptive"),
+    Question("model", "Does adaptation leave a right model alone?", _model, "model as the plant, without noise and disturbances: "
+             "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it| ({counted})",
              "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
-    Question("pays", "Does adaptation lower the error?", _pays,
-             "Leave it out, or compare gains: fpirhc study --over deformation.gain=...", "adaptive"),
+    Question("pays", "Does adaptation lower the error?", _pays, "rms error of {of} {error_without:u} without adaptation"
+             "| {error_with:u} with it| ({counted})| relative rms error {share_without:%} without| {share_with:%} with it"
+             "| divided by {divided_by}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...", "adaptive"),
 )  # fmt: skip
 ROOTS = ("turns", "posed", "plans", "gain")  # whose no is the cause of the others: their sentence stands there too

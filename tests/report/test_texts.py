@@ -79,7 +79,7 @@ def words_of(page: str) -> Words:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("COLUMNS", "400")
     Path("line.py").write_text(line_text(PLANNED, more=MORE), encoding="utf-8")
     return tmp_path
 
@@ -87,7 +87,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def number(found: re.Match[str]) -> str:
     """Two digits; what is rounding has none."""
     value = float(found[0])
-    return f"{value:.2g}" if abs(value) > 1e-6 or value == 0 else "ROUNDING"
+    return f"{float(f'{value:.2g}'):g}" if abs(value) > 1e-6 or value == 0 else "ROUNDING"
 
 
 def same_on_every_machine(text: str) -> str:

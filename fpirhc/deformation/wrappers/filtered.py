@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from fpirhc.deformation.base import Deformation, Iteration, Wrapper, memory_of_map
+from fpirhc.deformation.base import Deformation, Iteration, Wrapper, memory_of_map, with_inner
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -40,6 +40,12 @@ class Filtered(Wrapper):
         error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
         next_request, next_memory = self.map.step(request, desired + error, desired, inner)
         return next_request, {"filter_error": error, **next_memory}
+
+
+def with_filter(deformation: Deformation, pole: float) -> Deformation:
+    """Return a deformation whose innermost map is filtered."""
+    inner = deformation.inner
+    return Filtered(deformation, pole) if inner is None else with_inner(deformation, with_filter(inner, pole))
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
