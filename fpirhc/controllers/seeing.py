@@ -1,11 +1,11 @@
-"""What a controller sees: from the raw measurements to state, outputs and response; what sensors show at the start.
+"""What a controller sees: from the raw measurements to state, outputs and response.
 
 A controller is refused states that cannot be right: where no measurement corrects an error, and it stays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 
@@ -22,14 +22,11 @@ from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import members, response_names, slowest, unobservable, values_of
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem, nominal_start
-
-_SHOWN: Latest[np.ndarray] = Latest(8)
 
 
 def given_states(problem: Problem) -> tuple[Signal, ...]:
@@ -43,7 +40,7 @@ def raw_signal(problem: Problem) -> Signal | None:
     if not problem.sensing.estimates:
         return None
     late = problem.dead_time.measurement_wait(problem.period)
-    return problem.sensing.raw(problem.plant, first_shown(problem), late)
+    return problem.sensing.raw(problem.plant, problem.first_shown, late)
 
 
 def sensor_ranges(problem: Problem) -> dict[str, Interval]:
@@ -69,7 +66,7 @@ def seeing_blocks(problem: Problem) -> tuple[list[Block], list[Delay]]:
     raw, plant, sensing = raw_signal(problem), problem.plant, problem.sensing
     if raw is None:
         return [], []
-    start, names = first_estimates(problem)[0], sensing.estimator.measures(plant)
+    start, names = problem.first_output, sensing.estimator.measures(plant)
     if sensing.observer is not None:
         commanded = Delay(stated_path(problem).last, plant.input.name)
         return with_steps_ahead(plant, believe_block(problem, raw, start)), [commanded]
@@ -77,35 +74,6 @@ def seeing_blocks(problem: Problem) -> tuple[list[Block], list[Delay]]:
     select = Block("select", Layout((raw,)), Layout((needed,)), lambda s: {"_needed": getattr(s, raw.name)[places]})
     chosen, seen = ([], raw) if sensing.measured is None else ([select], needed)
     return [*chosen, *with_steps_ahead(plant, sensing.estimator.block(plant, problem.period, start, seen))], []
-
-
-def first_estimates(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Return state, or outputs, and response that sensors without noise show at the start, shapes (nx,) and (n,)."""
-    followed = problem.plant.output.elements
-    first = _first(problem, followed)
-    return np.array([first[e] for e in followed]), _first_values(problem, response_names(problem.plant))
-
-
-def first_shown(problem: Problem) -> dict[str, float]:
-    """Return what sensors without noise show at the start, by name of everything that a sensor may show."""
-    plant, (motion, response) = problem.plant, first_estimates(problem)
-    names = (*plant.output.elements, *response_names(plant))
-    shown = dict(zip(names, map(float, np.concatenate([motion, response])), strict=True))
-    return _first(problem, plant.state.elements) | shown
-
-
-def _first(problem: Problem, quantities: Sequence[str]) -> dict[str, float]:
-    """First values of the plant that moves, by name in the model; the model's states where it does not have them."""
-    shown = problem.truth.shown(quantities)
-    states = dict(zip(problem.plant.state.elements, map(float, problem.start_state), strict=True))
-    return states | dict(zip(shown, map(float, _first_values(problem, shown)), strict=True))
-
-
-def _first_values(problem: Problem, quantities: Sequence[str]) -> np.ndarray:
-    """Measured quantities at the start, of the plant that moves."""
-    at = problem.real_start, problem.inputs_before, problem.real_parameters, np.zeros(len(problem.real_plant.names))
-    known = problem.truth.function(quantities, seen=True)
-    return _SHOWN.of((problem,), (tuple(quantities),), lambda: np.asarray(known(*at).full()).ravel())
 
 
 def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:

@@ -19,7 +19,7 @@ from fpirhc.controllers.base import Response, error_signal, like, rename
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
-from fpirhc.controllers.seeing import first_estimates, first_shown, sensor_ranges
+from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
@@ -368,20 +368,23 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     Sensors are those of the outputs where the plant has some; its state then comes with the dead time alone.
     """
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
-    first, resting = first_estimates(problem)
+    first = problem.first_output
     starts = (problem.start_state, first)[-len(measured_signals(plant)) :]
     states_pass = sensing.observer is None  # a believed state is the controller's own
     states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
     if not sensing.ideal:
         others = states[:-1]
-        all_shown = first_shown(problem)
-        sensors = [*_late_states(others, late), *sensing.blocks(plant, all_shown, late, (*shown[0], shown[1]))]
+        sensors = [
+            *_late_states(others, late),
+            *sensing.blocks(plant, problem.first_shown, late, (*shown[0], shown[1])),
+        ]
         if sensing.estimates:
             return sensors
-        raw = sensing.raw(plant, all_shown, late)
+        raw = sensing.raw(plant, problem.first_shown, late)
         return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
     assert late is not None
-    realised = replace(shown[1], name="realised", start=tuple(map(float, resting)))
+    resting = tuple(problem.first_shown[name] for name in response_names(plant))
+    realised = replace(shown[1], name="realised", start=resting)
     return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
 
 

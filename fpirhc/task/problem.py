@@ -24,6 +24,7 @@ from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import disturbed, followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
+from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import behind_equals, line, number, table
 from fpirhc.symbolic.evaluate import Latest
@@ -382,6 +383,22 @@ class Problem(Checked):
             return self.start_state
         function, calm = self.truth.function(self.plant.output.elements), np.zeros(len(self.real_plant.names))
         return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
+
+    @cached_property
+    def first_shown(self) -> Mapping[str, float]:
+        """What sensors without noise show at the start, by name; of states that what moves does not have, the model's value."""
+        plant, truth = self.plant, self.truth
+        motion = truth.shown((*plant.state.elements, *plant.output.elements))
+        names = tuple(dict.fromkeys((*motion, *response_names(plant))))
+        at = self.real_start, self.inputs_before, self.real_parameters, np.zeros(len(self.real_plant.names))
+        values = np.asarray(truth.function(names, seen=True)(*at).full()).ravel()
+        believed = dict(zip(plant.state.elements, map(float, self.start_state), strict=True))
+        return believed | dict(zip(names, map(float, values), strict=True))
+
+    @property
+    def first_output(self) -> np.ndarray:
+        """What sensors without noise show of the outputs, or of the state, at the start."""
+        return np.array([self.first_shown[e] for e in self.plant.output.elements])
 
     @property
     def response_delay(self) -> float:
