@@ -130,28 +130,14 @@ def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Queue
 
     `target`: the delayed signal; its start value fills the queues.
     """
-    lengths = [wait.length - 1 for wait in waits]
-    start = target.start_vector()
-    queues = Signal(
-        f"{name}_queue",
-        tuple(f"{e}@{k}" for e, n in zip(source.elements, lengths, strict=True) for k in range(1, n + 1)),
-        start=tuple(float(v) for v, n in zip(start, lengths, strict=True) for _ in range(n)),
-    )
-    ends = [0]
-    for n in lengths:
-        ends.append(ends[-1] + n)
+    queue, kept = Queue(tuple(cycles for wait in waits for cycles in every(wait.cycles))), f"{name}_queue"
+    memory = queue.memory(kept, source.elements, tuple(map(float, target.start_vector())))
 
     def step(s: Signals) -> dict[str, Expression]:
-        now, queue = getattr(s, source.name), getattr(s, queues.name)
-        delayed, queues_next = [], []
-        for k, (wait, n) in enumerate(zip(waits, lengths, strict=True)):
-            past = ca.vertcat(now[k], queue[ends[k] : ends[k + 1]])
-            delayed.append(wait.delayed(past, 1))
-            if n:  # CasADi's [:0] of one entry is that entry
-                queues_next.append(past[:n])
-        return {target.name: ca.vertcat(*delayed), f"{queues.name}_next": ca.vertcat(*queues_next)}
+        arrived, later = queue.arrived(s, kept, getattr(s, source.name))
+        return {target.name: arrived, **later}
 
-    return Block(name, Layout((source,)), Layout((target,)), step, Layout((queues,)))
+    return Block(name, Layout((source,)), Layout((target,)), step, Layout(memory))
 
 
 MOST = 1000  # cycles of dead time; the memory has a fixed size
