@@ -20,9 +20,9 @@ from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.motion import time_signal
 from fpirhc.simulation.path import (
+    Mover,
     acting_blocks,
     disturbance_signals,
-    loses,
     lost_blocks,
     moving,
     outside_blocks,
@@ -52,18 +52,19 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
     built = build(problem, controller)
-    mover, lost, inner = moving(problem), lost_blocks(problem), compose_with_sensing(built)
-    ranges, samples = sensor_ranges(problem), known_samples(problem) if loses(problem) else 0
+    mover, inner = moving(problem), compose_with_sensing(built)
+    lost, ranges = lost_blocks(mover), sensor_ranges(problem)
+    samples = known_samples(problem) if lost or ranges else 0
     acting = Gate(problem, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = disturbance_signals(problem)
-    seeing = sensing_blocks(problem, built.response, predicts="state_ahead" in acting.inner.trace)
+    seeing = sensing_blocks(mover, built.response, predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
-    clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(problem, disturbed)
-    around = [clock, *outside_blocks(problem, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
+    clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(mover, disturbed)
+    around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
     constants = live.held(around) if live is not None else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
-    return compose("loop", reads, around, [*_plant_delays(problem, built.model), *constants], outputs=mover.sent)
+    return compose("loop", reads, around, [*_plant_delays(mover, built.model), *constants], outputs=mover.sent)
 
 
 def start_memory(
@@ -75,11 +76,11 @@ def start_memory(
         problem: the problem of the loop, or one that differs from it in the exact parameters only.
         numbers: of all live settings, by path; None: those of the build.
     """
-    remembered = []
+    remembered, mover = [], moving(problem)
     if not problem.sees_plant:
-        sensing = sensing_blocks(problem, given_response(problem, controller), predicts=False)
+        sensing = sensing_blocks(mover, given_response(problem, controller), predicts=False)
         remembered += [s for block in sensing for s in block.memory.signals]
-    remembered += [delay.now for delay in _plant_delays(problem, controller.plant_model(problem))]
+    remembered += [delay.now for delay in _plant_delays(mover, controller.plant_model(problem))]
     starts = {s.name: s.start_vector() for s in remembered}
     if numbers:
         live = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
@@ -109,13 +110,10 @@ def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.
     return {INNER: start}
 
 
-def _plant_delays(problem: Problem, model: PlantModel) -> list[Delay]:
+def _plant_delays(mover: Mover, model: PlantModel) -> list[Delay]:
     """What moves carries from cycle to cycle, and the parameters that the model has during a run."""
     values, parameter = tuple(map(float, model.parameters(model.plant))), model.plant.parameter
-    return [
-        *moving(problem).delays,
-        Delay(Signal("parameters", parameter.elements, parameter.units, values), "parameters"),
-    ]
+    return [*mover.delays, Delay(Signal("parameters", parameter.elements, parameter.units, values), "parameters")]
 
 
 def _clock_block(time: Signal, period: float) -> Block:

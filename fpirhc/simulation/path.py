@@ -45,35 +45,30 @@ _LOST_QUEUE = "lost_samples_queue"
 _PAST, _FULL = "_outputs_past", "_outputs_known"
 
 
-def sensing_blocks(problem: Problem, other: Response | None, *, predicts: bool) -> list[Block]:
+def sensing_blocks(mover: Mover, other: Response | None, *, predicts: bool) -> list[Block]:
     """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
-    plant, response = problem.plant, other or true_response(problem)
+    problem, plant = mover.problem, mover.problem.plant
+    response = other or Response(plant.response_signal("realised"), problem.truth.function(response_names(plant)))
     if problem.sees_plant:
-        sense = [moving(problem).sense(measured_signals(plant), response)]
+        sense = [mover.sense(measured_signals(plant), response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
-    true, shown = _true_blocks(problem, response)
-    if predicts and not moving(problem).shows_truth and all(map(problem.moves.shows, problem.judged_names)):
+    true, shown = _true_blocks(mover, response)
+    if predicts and not mover.shows_truth and all(map(problem.moves.shows, problem.judged_names)):
         true = [*true, _truth_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
     if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
         return true  # with coordinates measured in place of others
     return [*true, *_late_blocks(problem, shown)]
 
 
-def acting_blocks(problem: Problem, disturbed: tuple[Signal, ...]) -> list[Block]:
+def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
-    mover, plant, late = moving(problem), problem.plant, problem.dead_time.simulated
+    problem, plant, late = mover.problem, mover.problem.plant, mover.problem.dead_time.simulated
     queued = [name for name in plant.inputs if name in late.queued]
     if not queued:
         return [mover.advance(disturbed, plant.input)]
     waits = [late.wait(name, problem.period) if name in queued else Queue(0.0) for name in plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
     return [delay_block("send_command", plant.input, arriving, waits), mover.advance(disturbed, arriving)]
-
-
-def true_response(problem: Problem) -> Response:
-    """The response of what the controller controls, of the plant that moves."""
-    plant = problem.plant
-    return Response(plant.response_signal("realised"), problem.truth.function(response_names(plant)))
 
 
 def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
@@ -343,10 +338,9 @@ class Body(Mover):
         return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)
 
 
-def _true_blocks(problem: Problem, response: Response) -> tuple[list[Block], Shown]:
+def _true_blocks(mover: Mover, response: Response) -> tuple[list[Block], Shown]:
     """Blocks of the true motion, response and error; and the signals that sensors see."""
-    mover = moving(problem)
-    motion = mover.motion
+    problem, motion = mover.problem, mover.motion
     hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response.signal, "_seen")
     if not mover.shows_truth:
         return [mover.sense(hidden[0], Response(hidden[1], response.function))], hidden
@@ -392,17 +386,18 @@ def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
     """Return how many cycles one call of the loop runs: one where samples may be lost, and the caller replays them."""
     mover = moving(problem)
     many = mover.cycles_of_call if compiled else mover.cycles_interpreted
-    return 1 if loses(problem) else many
+    return 1 if loses(mover) else many
 
 
-def loses(problem: Problem) -> bool:
+def loses(mover: Mover) -> bool:
     """Return whether samples may be lost, or lie outside the range of their sensor."""
-    return bool(lost_blocks(problem) or sensor_ranges(problem))
+    return bool(lost_blocks(mover) or sensor_ranges(mover.problem))
 
 
-def lost_blocks(problem: Problem) -> list[Block]:
+def lost_blocks(mover: Mover) -> list[Block]:
     """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
-    drawn, held = problem.sensing.drawn, [one for one in moving(problem).reads if one.name == _HELD]
+    problem = mover.problem
+    drawn, held = problem.sensing.drawn, [one for one in mover.reads if one.name == _HELD]
     if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
         return []
     late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
@@ -513,11 +508,11 @@ def _difference(samples: Sequence[Expression], order: int) -> Expression:
 _REAL_NOW = "_exact_now"
 
 
-def outside_blocks(problem: Problem, known: PlantModel) -> list[Block]:
+def outside_blocks(mover: Mover, known: PlantModel) -> list[Block]:
     """Return blocks that write the real parameters of this cycle, 'signals' and 'signals_told'; none without signals."""
-    real, model = problem.real_plant, known.plant
+    problem, real, model = mover.problem, mover.problem.real_plant, known.plant
     blocks = []
-    if moving(problem).parameters == _REAL_NOW:
+    if mover.parameters == _REAL_NOW:
         values = real_values(real, problem.signals)
         assert values is not None
         ends = Mover.parameters, _REAL_NOW

@@ -27,7 +27,7 @@ from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.path import loses
+from fpirhc.simulation.path import loses, moving
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -131,7 +131,7 @@ def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: P
     problem.require_equations(
         "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
     )
-    if loses(problem):
+    if loses(moving(problem)):
         raise NotSupported(
             "a page steps its loop without the driver that runs missing cycles afterwards; leave dropout and range out of sensors"
         )
