@@ -1,8 +1,4 @@
-"""Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it, and without a traceback.
-
-Each case changes one place of a correct file. What stands in a message is what a user needs: the line of the change, what is wrong
-there, and what to write instead. `test_wrong_files` has the mistakes of people who come from other tools.
-"""
+"""Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it."""
 
 import math
 from dataclasses import dataclass, field, replace

@@ -139,11 +139,7 @@ NOTHING = (0.02, 0.01, 0.0, 0.0)
 
 
 def test_slotine_li_as_in_the_book():
-    """Slotine and Li (1991), section 9.2, gains and motion, starting from (almost) no knowledge.
-
-    An independent simulation from zero has errors of 3.27 and 1.29 deg in the first second, 0.45 and 0.23 in the last, and
-    estimates (0.17, 0.66, 1.76, 1.33) after 3 s; with the exact parameters 0.017 and 0.006 deg.
-    """
+    """Slotine and Li (1991), section 9.2, gains and motion, starting from (almost) no knowledge."""
     run = fp.simulate(book(NOTHING), BOOK, seed=0, compiled=False)
     degrees = np.degrees(np.abs(run["error"]))
     np.testing.assert_allclose(degrees[:1000].max(axis=0), [3.27, 1.29], rtol=0.03)

@@ -146,12 +146,7 @@ def test_acceleration_feedback_has_the_computed_limit(time_constant):
 
 
 def test_force_mrac_believes_in_the_reference_model():
-    """Recalculated and desired force agree 20 times better than deformed and desired; the tracking error falls with it.
-
-    Found before, by a script apart, for an oscillator with m_r = 2 kg and m = 1 kg: max|e| from 0.172 to 0.0030 m,
-    rms(Q^Rec - Q^Des) from 8.1 to 0.13 N while rms(Q^Def - Q^Des) = 9.1 N. Its other parameters and its motion are not known
-    and were chosen here, so 20 % are allowed.
-    """
+    """Recalculated and desired force agree 20 times better than deformed and desired; the tracking error falls with it."""
     values = {"m": (2.0, 1.0, "kg"), "b": (1.0, 0.5, "N s/m"), "k": (10.0, 20.0, "N/m"), "c": (1.0, 3.0, "N/m^3")}
     plant = fp.Plant(
         {"q": "m"},

@@ -73,10 +73,7 @@ ELSEWHERE = "map", "late", "late curve", "encoder", "believed", "outside"  # whe
 @pytest.mark.parametrize("name", ELSEWHERE)
 @pytest.mark.parametrize("deformation", MAPS, ids=["plain", "referenced"])
 def test_one_slot_is_computed_torque_where_responses_are_measured(name, deformation):
-    """On maps, late, behind estimators, of a body outside: the plain form to rounding.
-
-    The model-referenced one begins with the difference of model and plant at the start, and ends in the same motion.
-    """
+    """On maps, late, behind estimators, of a body outside: the plain form to rounding."""
     problem, law = replace(FORMS[name][0], horizon=None, cost=None, duration=1.6), fp.Exponential(rate=6.0)
     slots = fp.Slotted([fp.Slot("y", law, deformation)], fp.Periodic({"y": 0.5}), blend=0.1)
     if deformation.mirror.share and name in ("encoder", "believed"):

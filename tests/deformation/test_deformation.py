@@ -121,10 +121,7 @@ LIMIT_GAINS = (-4.2, -4.3, -4.9)  # unit plant: sector limit 4.2315, linear limi
 
 @pytest.mark.parametrize("gain", LIMIT_GAINS)
 def test_sector_and_linear_limit(gain: float) -> None:
-    """Between the sector and the linear limit large errors end in a bounded 2-cycle, small ones die out.
-
-    Local analysis cannot see the 2-cycle. Below the sector limit errors of any size die out.
-    """
+    """Between the sector and the linear limit large errors end in a bounded 2-cycle, small ones die out."""
     sigmoid, plant = fp.Sigmoid(gain=gain, scale=1.0), np.eye(1)
     small = np.abs(iterate(sigmoid, plant, np.array([1e-3]), 3000)[-1, 0])
     large = iterate(sigmoid, plant, np.array([5.0]), 3000)[-2:, 0]

@@ -1,7 +1,4 @@
-"""A library folder of the Arduino IDE: its sources compute in float, and a step's time is told beside the period.
-
-The IDE, a board and their compiler are not here: the sources are built and replayed with the compiler of this machine.
-"""
+"""A library folder of the Arduino IDE: its sources compute in float, and a step's time is told beside the period."""
 
 from __future__ import annotations
 
@@ -15,10 +12,7 @@ CASE = ("two_mass", "CTC+FPI (eq 6)")
 
 @pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 def test_an_arduino_library_replays_in_float(tmp_path):
-    """No warning, commands to a thousandth of those in double with faults among the samples; header and sketch have one name.
-
-    A number may be called as a macro of Arduino's headers.
-    """
+    """No warning, commands to a thousandth of those in double with faults among the samples; header and sketch have one name."""
     exported(tmp_path / "board", *CASE, "arduino"), exported(tmp_path / "c", *CASE)
     assert "includes=arm.h" in (tmp_path / "board" / "library.properties").read_text().splitlines()
     sketch = (tmp_path / "board" / "examples" / "arm" / "arm.ino").read_text()

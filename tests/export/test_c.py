@@ -208,10 +208,7 @@ int main(void) {
 @pytest.mark.parametrize("real", ["double", "float"])
 @pytest.mark.parametrize("name", slow_but(["torque", "outputs"], "outputs"))
 def test_what_is_no_number_passes_no_gate_in_either_type(name, real, tmp_path):
-    """Every input, NaN and both infinities: a skipped cycle with the last command and a memory of numbers.
-
-    In float a limit of 1e300 would be infinite, and an infinite concentration would pass.
-    """
+    """Every input, NaN and both infinities: a skipped cycle with the last command and a memory of numbers."""
     device = of_case(name, tmp_path)
     rows = np.tile([row["start"] for row in device.layout["inputs"]], (6, 1)).astype(float)
     start = device.problem.start_state

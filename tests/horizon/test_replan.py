@@ -43,11 +43,7 @@ def planning(optimiser=CONVERGED, deformation=None):
 
 
 def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=PERIOD, lengths=(1.0,) * STAGES):
-    """First input of the horizon that begins at this time, by a program of its own and IPOPT.
-
-    The first change of the input takes the time between two plans; every other one takes the stage before. Its cost is the integral
-    of the squared rate, in units in which a change from stage to stage costs its weight.
-    """
+    """First input of the horizon that begins at this time, by a program of its own and IPOPT."""
     p = problem.plant.approximate
     rate_of = problem.plant.equations.rate
     opti = ca.Opti()

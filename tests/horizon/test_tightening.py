@@ -50,10 +50,7 @@ def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
 
 @pytest.mark.parametrize("weights", [{"rate": {"F": 1.0}}, {}])
 def test_the_rate_of_a_plan_counts_from_the_command_without_its_shift(weights):
-    """A constant force that the model lacks: with the shift in its rate, a plan would pay for it for ever and stay off.
-
-    Without a weight of the rate the error is that of the horizon alone, and the same.
-    """
+    """A constant force that the model lacks: with the shift in its rate, a plan would pay for it for ever and stay off."""
     plant = fp.Plant(
         coordinates={"q": "m"},
         inputs={"F": "N"},

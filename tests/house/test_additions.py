@@ -1,7 +1,4 @@
-"""A package of somebody else adds one member of each kind, one file each, and everything works with them.
-
-The members are the examples of docs/extending.md: what a reader pastes into a file. Nothing of fpirhc is edited.
-"""
+"""A package of somebody else adds one member of each kind, one file each, and everything works with them."""
 
 from __future__ import annotations
 

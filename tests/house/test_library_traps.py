@@ -1,8 +1,4 @@
-"""Traps of the libraries below fpirhc: what they do wrong without saying so, and that a guard here catches it.
-
-The first assertions of a test say what the library does. Where one of them fails after an upgrade, the guard may have become
-superfluous; where a later one fails, the guard does not hold.
-"""
+"""Traps of the libraries below fpirhc: what they do wrong without saying so, and that a guard here catches it."""
 
 import pickle
 import warnings

@@ -1,8 +1,4 @@
-"""A wrong member of a family is caught by the public laws, with the law that it breaks; the right one beside it is not.
-
-Each of the 41 differs in one thing from a member that keeps all laws. A law that does not know a reason to refuse it would let it
-into every comparison.
-"""
+"""A wrong member of a family is caught by the public laws, with the law that it breaks; the right one beside it is not."""
 
 from dataclasses import replace
 from typing import Any

@@ -127,10 +127,7 @@ def test_a_response_shows_its_disturbance_at_once():
 
 
 def test_the_response_alone_is_a_low_pass_of_the_model_error():
-    """Measured alone, with the states nearly exact, w^ <- w^ + L (f - f^ - w^) with the stationary L of a random walk.
-
-    L = (sqrt(q^2 + 4 q r) + q) / (sqrt(q^2 + 4 q r) + q + 2 r), the scalar Riccati equation by hand.
-    """
+    """Measured alone, with the states nearly exact, w^ <- w^ + L (f - f^ - w^) with the stationary L of a random walk."""
     problem = spring(
         plant=pendulum(),
         reference=fp.Trajectory(lambda t: {"angle": 0.3 * ca.sin(t)}),

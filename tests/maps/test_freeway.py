@@ -103,10 +103,7 @@ def by_hand(state: np.ndarray, rate: float, demands: tuple[float, float]) -> np.
 
 @pytest.mark.parametrize("which", slow_but(("ipopt", "shipped", "one start"), "shipped"))
 def test_an_economic_plan_is_the_published_run(which: str) -> None:
-    """The rates of 17 minutes and the time spent after 96 steps of sym-metanet's metering, which IPOPT solves there.
-
-    IPOPT here, and the shipped plan from two starts, have them. From the last plan alone another minimum is found in minute 6.
-    """
+    """The rates of 17 minutes and the time spent after 96 steps of sym-metanet's metering, which IPOPT solves there."""
     shipped, rates = (
         task("freeway_economic"),
         np.loadtxt(DATA.with_name("metering.csv"), delimiter=",", skiprows=1)[:, 1],

@@ -1,7 +1,4 @@
-"""Maps beside what is known of them: exact discretisations of linear plants, the limit of short steps, and plans by hand.
-
-References: scipy.signal.cont2discrete; the same controllers on the differential equation; finite sums in numpy.
-"""
+"""Maps beside what is known of them: exact discretisations of linear plants, the limit of short steps, and plans by hand."""
 
 from dataclasses import replace
 from functools import cache

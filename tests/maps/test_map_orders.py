@@ -1,8 +1,4 @@
-"""Relative orders above one in the steps of a map: what is measured, what the model must predict, and when a pair is complete.
-
-Laws: with an exact model a run is the loop by hand, deadbeat in r steps, and no deformation arises; with a wrong model the
-iteration helps, once its pairs are complete; poles in z are the poles of the run.
-"""
+"""Relative orders above one in the steps of a map: what is measured, what the model must predict, and when a pair is complete."""
 
 from itertools import pairwise
 from typing import Any

@@ -1,8 +1,4 @@
-"""Maps x+ = f(x, u, p): plants that step, and have no differential equation.
-
-Laws: a run is the loop that is written by hand in numpy; a cycle of several steps is the map applied as often; the order of an
-output is counted in cycles; what does not fit a map is refused by name.
-"""
+"""Maps x+ = f(x, u, p): plants that step, and have no differential equation."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -144,10 +144,7 @@ def test_overflowing_models_are_told_and_survived():
 
 
 def test_a_plan_is_begun_anew_where_no_input_leaves_the_model():
-    """Y' = u - 2 sqrt(y) from 0.2 m: without inflow the plan is empty in 0.45 s, and no number comes back from there.
-
-    A remembered plan without inflow is NON_FINITE once; the next call begins in the middle of the limits and is solved.
-    """
+    """Y' = u - 2 sqrt(y) from 0.2 m: without inflow the plan is empty in 0.45 s, and no number comes back from there."""
     plant = fp.Plant(
         coordinates={"y": "m"},
         inputs={"u": "m/s"},

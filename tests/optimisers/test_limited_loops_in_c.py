@@ -1,7 +1,4 @@
-"""The loops in C with limits of states are the composed graph: plan, numbers and memory, after a few turns and at the end.
-
-Calls that are cut off after some turns show what each turn does: a pure step, a barrier, a filter, another first plan, a descent.
-"""
+"""The loops in C with limits of states are the composed graph: plan, numbers and memory, after a few turns and at the end."""
 
 import sys
 
@@ -48,10 +45,7 @@ SEEN = {
 
 @pytest.mark.parametrize("turns", sorted({*SEEN, 2, 4, 5, 6, 7, 9, 12, 16}))
 def test_calls_that_are_cut_off_after_every_turn(turns):
-    """From nothing and from what was remembered of a state nearby, of one far away, and of one outside its limits.
-
-    What differs in a turn is seen before later ones have made up for it.
-    """
+    """From nothing and from what was remembered of a state nearby, of one far away, and of one outside its limits."""
     both, random, statuses = loops(turns), np.random.default_rng(0), set()
     for size in (0.1, 0.4, 0.7, 1.0, 1.5, 2.5):
         memory = np.zeros(both.size)

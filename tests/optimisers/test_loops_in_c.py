@@ -1,8 +1,4 @@
-"""The loops in C are the composed graph: the same plan, numbers and memory, whatever they are called with.
-
-The graph is the definition and runs in the virtual machine. Both do the same operations in nearly the same order, so that an
-operator or a constant that differs shows at once.
-"""
+"""The loops in C are the composed graph: the same plan, numbers and memory, whatever they are called with."""
 
 import sys
 

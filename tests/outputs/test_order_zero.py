@@ -1,8 +1,4 @@
-"""Outputs of order 0: the command moves them at once, and an iteration on targets makes up for a wrong static map.
-
-The foreign plant is a heating element: P = u^2 / (R (1 + alpha theta)), C theta' = P - G theta. Its power follows the voltage u at
-once and drifts with the temperature theta, which is measured.
-"""
+"""Outputs of order 0: the command moves them at once, and an iteration on targets makes up for a wrong static map."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,8 +1,4 @@
-"""Disturbances of outputs: y = h(x, p) + d(t) is what is measured, judged and followed.
-
-Laws: a plant whose output has the disturbance as an expression of a clock is the same task; d moves no state by itself; derivatives
-of y have those of d; a controller holds y, so that h moves the other way.
-"""
+"""Disturbances of outputs: y = h(x, p) + d(t) is what is measured, judged and followed."""
 
 from dataclasses import replace
 from typing import Any

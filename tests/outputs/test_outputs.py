@@ -1,8 +1,4 @@
-"""Outputs y = h(x, p): what follows a reference may be an expression of the state.
-
-Laws: a plant that is written by its states is the plant; an output by expression is the plant whose coordinate it is; the measured
-outputs, and not those of a wrong model, are what a controller follows.
-"""
+"""Outputs y = h(x, p): what follows a reference may be an expression of the state."""
 
 from collections.abc import Callable
 from dataclasses import replace

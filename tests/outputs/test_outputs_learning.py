@@ -1,8 +1,4 @@
-"""Learners on plants with outputs: offset-free control, disturbances of outputs and responses, learned parameters.
-
-Laws: the filter is a recursion that is written here; a disturbance of a response is what a deformation corrects, and no plan has
-it; parameters are found from the response of an output.
-"""
+"""Learners on plants with outputs: offset-free control, disturbances of outputs and responses, learned parameters."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,10 +1,4 @@
-"""A plant is the same plant, whether it is written in (y, y', ..., y^(r-1)) or by its states with the output y.
-
-The model is wrong in both, and computes other derivatives of its output at the measured state. The plan starts where it has the
-measured ones, so plan and plant move as they do in the coordinates. The inverse stays at the measured state; with the increment
-of the command, u_k = u_{k-1} + (d_k - f_k) / beta^, it is the same one there. The outputs are linear in the states, so that
-Runge-Kutta's formula is the same in both.
-"""
+"""A plant is the same plant, whether it is written in (y, y', ..., y^(r-1)) or by its states with the output y."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

@@ -1,8 +1,4 @@
-"""More inputs than outputs, as docs/plants.md writes them: efforts that the equations share out by a weighted right inverse.
-
-The shares are numpy's pseudo-inverse of the weighted effects, every other share of the same effect is dearer, and the loop is that
-of a textbook: computed torque in numpy on a plant that SciPy integrates, whose thrusters get their commands one by one.
-"""
+"""More inputs than outputs, as docs/plants.md writes them: efforts that the equations share out by a weighted right inverse."""
 
 import casadi as ca
 import numpy as np

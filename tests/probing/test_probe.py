@@ -1,7 +1,4 @@
-"""A probe of bodies whose gain, dead time, lag and noise are known.
-
-Most bodies answer against their model: then nothing is chosen, and the estimates alone cost a moment.
-"""
+"""A probe of bodies whose gain, dead time, lag and noise are known."""
 
 import csv
 from dataclasses import replace

@@ -1,7 +1,4 @@
-"""A foreign reality: an object outside, called once per cycle; what it may do wrong, and what a run then keeps.
-
-Dead time and lag that it states are known and not simulated. A run ends by name where its plant leaves its physical range.
-"""
+"""A foreign reality: an object outside, called once per cycle; what it may do wrong, and what a run then keeps."""
 
 import math
 import re

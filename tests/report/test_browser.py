@@ -1,7 +1,4 @@
-"""Reports in a real browser: nothing overlaps, nothing is cut without a hint, nothing is fetched, nothing is complained about.
-
-Every test is skipped, with the reason, where there is no browser.
-"""
+"""Reports in a real browser: nothing overlaps, nothing is cut without a hint, nothing is fetched, nothing is complained about."""
 
 import os
 import shutil

@@ -1,7 +1,4 @@
-"""Believed states: what no sensor shows, by the model and by Kalman's filter of the books; what cannot be known is named.
-
-Of plants with coordinates, with outputs and of maps. Every observer keeps the public laws.
-"""
+"""Believed states: what no sensor shows, by the model and by Kalman's filter of the books; what cannot be known is named."""
 
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,4 @@
-"""One gate, one behaviour: a run with lost samples, or samples out of range, is its replay through a Stepper, bit by bit.
-
-A missed call is a lost sample, and what a gap does to the commands is bounded by what interpolated samples would do.
-"""
+"""One gate, one behaviour: a run with lost samples, or samples out of range, is its replay through a Stepper, bit by bit."""
 
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,4 @@
-"""The time of a step follows that of the step before: what cannot is skipped with a status; a clock that was set is believed.
-
-Late steps are counted and told; the clock of these tests is a list.
-"""
+"""The time of a step follows that of the step before: what cannot is skipped with a status; a clock that was set is believed."""
 
 from dataclasses import replace
 from functools import cache

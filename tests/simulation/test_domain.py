@@ -1,8 +1,4 @@
-"""A finite sample outside the model's domain is a skipped tick: the command is held, every memory stays, the status says so.
-
-The plant is a tank below whose bottom the model has no flow, h' = (u - s sqrt(h)) / A: a level measured as -2 mm is a number, and
-the model's response to it is none.
-"""
+"""A finite sample outside the model's domain is a skipped tick: the command is held, every memory stays, the status says so."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,8 +1,4 @@
-"""One symbolic step: the loop and a Stepper, in the virtual machine and in C, give the same commands for the same measurements.
-
-The laws of controllers say so of every controller on two masses between springs; here every kind of problem does, and none of
-them remembers a bad sample or a poisoned memory.
-"""
+"""One symbolic step: the loop and a Stepper, in the virtual machine and in C, give the same commands for the same measurements."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,4 @@
-"""An absurd but finite sample does not stay in integrals, filters and queues: the run returns to the undisturbed one.
-
-The samples reach the controller, because no range is stated here; with `Sensor(range=...)` they are skipped.
-"""
+"""An absurd but finite sample does not stay in integrals, filters and queues: the run returns to the undisturbed one."""
 
 from dataclasses import replace
 

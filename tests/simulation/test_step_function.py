@@ -52,10 +52,7 @@ def same(one: np.ndarray, other: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_loop_of_ones_own_is_the_stepper_bit_by_bit(name):
-    """Command, memory and every signal, with faults, where no missing cycles are run afterwards.
-
-    Start values stand for parameters, settings and set-points.
-    """
+    """Command, memory and every signal, with faults, where no missing cycles are run afterwards."""
     stepper, rows = case(name)
     own = memory = stepper.start()
     for k, row in enumerate(rows):

@@ -1,7 +1,4 @@
-"""A controller against a machine: what a call takes and gives, misuse, threads, solvers that fail, and what is wrong but finite.
-
-Nothing in a call is shared, lost or left locked.
-"""
+"""A controller against a machine: what a call takes and gives, misuse, threads, solvers that fail, and what is wrong but finite."""
 
 import threading
 from dataclasses import replace

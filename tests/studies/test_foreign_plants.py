@@ -83,10 +83,7 @@ def magnet() -> ForeignPlant:
 
 
 def stocking() -> ForeignPlant:
-    """Adult and young fish by fishing and by setting out young ones, a map (Beverton and Holt 1957; stages as in H. Caswell 2001).
-
-    A+ = s A + m J - q A e,  J+ = b A / (1 + A / K) + u.
-    """
+    """Adult and young fish, caught and set out: a map (Beverton and Holt 1957; stages as in H. Caswell 2001)."""
 
     def following(x, u, p):
         return {

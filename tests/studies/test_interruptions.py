@@ -33,10 +33,7 @@ def interrupted_once(begun: Callable[[], object], *, every: float = 0.05) -> Ite
 
 
 def test_an_interruption_inside_a_solver_is_an_interruption():
-    """IPOPT catches it and goes on, and CasADi reports it as a SystemError, which would be taken for a fault of the program.
-
-    The run is interrupted after its first report, and no machine solves the rest of its 100 000 plans before the next tick.
-    """
+    """IPOPT catches it and goes on, and CasADi reports it as a SystemError, which would be taken for a fault of the program."""
     long = replace(tasks.two_mass.problem, duration=500.0)
     reports: list[int] = []
 

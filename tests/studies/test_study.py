@@ -1,8 +1,4 @@
-"""Studies: a variant is a problem, its row is a run, and what is said of the table follows from the table.
-
-The laws: the row of a drawn plant, a named case or a cell of a grid is the run of its problem, bit by bit; whoever takes part, and
-with any number of processes, it is the same one.
-"""
+"""Studies: a variant is a problem, its row is a run, and what is said of the table follows from the table."""
 
 import json
 import math

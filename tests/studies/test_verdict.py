@@ -1,8 +1,4 @@
-"""The verdict: outcomes and ratios of errors that are played exactly, flags, remarks, and plants of others.
-
-A played controller moves two integrators so that its errors are given functions of time; its model is exact, so its deformation
-does nothing, and what is compared is what was written into the table.
-"""
+"""The verdict: outcomes and ratios of errors that are played exactly, flags, remarks, and plants of others."""
 
 from __future__ import annotations
 

@@ -68,10 +68,7 @@ LONG = ("RHC, absolute effort", "RHC+FPI, absolute effort", "RHC, stiff", "RHC+F
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(name):
-    """The same motion as a trajectory: only rounding differs.
-
-    A plan adds nothing of its own, because its scale and first plan follow from the nominal motion, which is the same.
-    """
+    """The same motion as a trajectory: only rounding differs."""
     task, (aims, order) = getattr(tasks, name), SHIPPED[name]
     problem = task.problem
     starts = {c: float(problem.start.get(c, 0.0)) for c in problem.plant.names}

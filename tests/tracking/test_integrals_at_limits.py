@@ -46,10 +46,7 @@ def last(problem: fp.Problem, controller: Controller, signal: str) -> float:
     ids=["exponential", "shift polynomial", "slot", "PID", "gains"],
 )
 def test_the_error_takes_an_integral_out_of_a_limit(controller):
-    """A bumpless start from far above loads the integral with heat; the falling error then asks for more than there is, too late.
-
-    Frozen there, the heater would stand at full power, and 1 K, for ever.
-    """
+    """A bumpless start from far above loads the integral with heat; frozen there, 1 K would stay for ever."""
     assert last(heater(3.0, 0.5), controller, "state.x") == pytest.approx(0.5, abs=1e-3)
 
 
