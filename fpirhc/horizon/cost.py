@@ -21,7 +21,7 @@ from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
-from fpirhc.symbolic.open import require_closed
+from fpirhc.symbolic.open import require_closed, stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +135,8 @@ class Quadratic(Cost):
     def tracked(self) -> Mapping[str, float]:
         """The weights of `states` or `outputs`; those of `terminal` for what only the end of the horizon weighs."""
         at_end = self.terminal if isinstance(self.terminal, Mapping) else {}
-        weights = {**at_end, **{n: w for n, w in self._errors.items() if w > 0}}
-        return {n: w for n, w in weights.items() if w > 0}
+        own = {n: w for n, w in self._errors.items() if not stays(w, 0)}
+        return {n: w for n, w in {**at_end, **own}.items() if not stays(w, 0)}
 
     @property
     def uses_rate(self) -> bool:

@@ -28,7 +28,6 @@ from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import behind_equals, line, number, table
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.open import nominal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
@@ -189,7 +188,7 @@ class Problem(Checked):
         """Coordinates whose errors are logged and measured."""
         if self.judged is not None:
             return tuple(self.judged)
-        weighed = (nominal(self.cost).tracked if self.cost is not None else None) or {}  # weights may be live
+        weighed = (self.cost.tracked if self.cost is not None else None) or {}
         controlled = self.plant.controlled_names
         return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self._shows(n)))
 
@@ -514,7 +513,7 @@ _GAINS: Latest[ca.Function] = Latest(4)
 
 def _check_reference(problem: Problem) -> None:
     """Raise where the reference is wrong, or not finite at the first or the last instant."""
-    function, plant = nominal(problem.reference).function(problem.plant), problem.plant
+    function, plant = problem.reference.function(problem.plant), problem.plant
     names = [*plant.output.elements, *(f"{c}{chr(39) * order}" for c, order in plant.chains.items())]
     for t in (0.0, problem.duration):
         values = np.concatenate([np.asarray(part.full()).ravel() for part in function(t)])

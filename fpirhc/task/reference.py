@@ -24,8 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Expression, Signal, scalar
-from fpirhc.symbolic.open import PREFIX, nominal, number_of, open_numbers
+from fpirhc.symbolic.layout import Expression, Signal
 
 Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
 
@@ -128,11 +127,11 @@ class Trajectory(Reference):
 
     Args:
         motion: function of the time in seconds that returns {coordinate: expression}.
-        scale: s; how far the motion goes from its first point. It may be live.
+        scale: s; how far the motion goes from its first point.
     """
 
     motion: Callable[[Expression], Mapping[str, Expression]]
-    scale: Finite = field(default=1.0, kw_only=True, metadata={"setting": "where given"})
+    scale: Finite = field(default=1.0, kw_only=True, metadata={"setting": "where given", "structure": True})
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
         def of(time: Expression) -> dict[str, Expression]:
@@ -142,65 +141,11 @@ class Trajectory(Reference):
                 for name, value in named.items()
             }
 
-        scale = nominal(self.scale)
-        if scale == 1:
+        if self.scale == 1:
             return of(t)
         still = ca.SX.sym("t")
         first = {name: ca.substitute(value, still, 0) for name, value in of(still).items()}
-        return {name: first[name] + scale * (value - first[name]) for name, value in of(t).items()}
-
-    def _function(self, plant: Plant) -> ca.Function:
-        if nominal(self.scale) == 1:
-            return super()._function(plant)
-        t = ca.SX.sym("t")
-        results = self._scaled(plant)(t, nominal(self.scale))
-        return ca.Function("fpirhc_reference", [t], list(results), ["t"], ["state", "response"])
-
-    def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        """The scale where it is live."""
-        del plant, stages
-        return tuple(
-            scalar(PREFIX + path, start=number_of(number))
-            for path, number in open_numbers({"scale": self.scale}).items()
-        )
-
-    def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
-        if not self.own(plant, stages):
-            return super().motion_now(plant, stages, ahead)
-        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
-        results = self._scaled(plant)(t + ahead, scale)
-        return ca.Function("fpirhc_reference_now", [t, scale], list(results), ["t", "scale"], ["state", "response"])
-
-    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
-        live = self.own(plant, stages)
-        return self._derivatives(plant, coordinate, order) if live else super().chain(plant, stages, coordinate, order)
-
-    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
-        if not self.own(plant, 0):
-            return None
-        t, scale, scaled = ca.SX.sym("t"), ca.SX.sym("scale"), self._scaled(plant)
-        columns = [scaled(t + float(time), scale) for time in nodes]
-        tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
-        return ca.Function("fpirhc_reference_preview", [t, scale], tables, ["t", "scale"], ["states", "responses"])
-
-    def _scaled(self, plant: Plant) -> ca.Function:
-        """Function (t, scale) -> (state, response)."""
-        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
-        function = Trajectory(self.motion).function(plant)
-        first, now = function(ca.SX(0)), function(t)
-        orders = [e.count("'") for e in plant.output.elements], list(plant.chains.values())
-        results = []
-        for one, begun, order in zip(now, first, orders, strict=True):
-            place = begun * ca.DM([float(k == 0) for k in order])  # derivatives count from zero
-            results.append(ca.densify(place + scale * (one - place)))
-        return ca.Function("fpirhc_reference_scaled", [t, scale], results)
-
-    def _derivatives(self, plant: Plant, coordinate: str, order: int) -> ca.Function:
-        """Function (t, scale) -> the coordinate's value and its derivatives up to `order`."""
-        t, scale = ca.SX.sym("t"), ca.SX.sym("scale")
-        values = Trajectory(self.motion).chain(plant, 0, coordinate, order)
-        place = ca.vertcat(values(ca.SX(0))[0], ca.SX.zeros(order))
-        return ca.Function("fpirhc_reference_chain", [t, scale], [ca.densify(place + scale * (values(t) - place))])
+        return {name: first[name] + self.scale * (value - first[name]) for name, value in of(t).items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,11 +24,11 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import exp, nominal, open_numbers, power
+from fpirhc.symbolic.open import exp, power
 from fpirhc.task.reference import Reference, Steps, pairs
 
 _GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
-_OWN = "_reference_own"  # the filters' state, what is given, and a live rate
+_OWN = "_reference_own"  # the filters' state, what is given
 FILTER = "reference_filter"  # remembered: the filters' state
 
 
@@ -38,10 +38,10 @@ class FilterBank:
 
     With z = (y, y', ..., y^(m-1)), b = (1, 0, ..., 0) and w held, z(t + h) = w b + Phi(h) (z(t) - w b) with Phi(h) =
     e^(-a h) sum_{k<m} (h N)^k / k!; N = A + a I, A the companion matrix of (s + a)^m, is nilpotent. Products and sums round alike
-    for numbers, live numbers and expressions. Source: Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998, 4.3.3.
+    for numbers and expressions. Source: Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998, 4.3.3.
 
     Args:
-        rate: of all filters; it may be live.
+        rate: of all filters.
         nodes: number of set-points that are given per coordinate: one, or one per node of a horizon.
     """
 
@@ -64,19 +64,13 @@ class FilterBank:
         return Signal(_GIVEN, (*names, *later), units * self.nodes)
 
     @property
-    def _open(self) -> list[ca.SX]:
-        """The rate where it is live: it passes through Functions as an entry of the own signal."""
-        return list(open_numbers(self.rate).values())
-
-    @property
     def own(self) -> Signal:
-        """The signal from which the motion follows: the filters' state, the set-points, and the rate where it is live."""
-        rates = ("rate",) * len(self._open)
-        return Signal(_OWN, (*self.elements, *(f"{_GIVEN}.{name}" for name in self.given.elements), *rates))
+        """The signal from which the motion follows: the filters' state, and the set-points."""
+        return Signal(_OWN, (*self.elements, *(f"{_GIVEN}.{name}" for name in self.given.elements)))
 
     def gathered(self, s: Signals) -> Expression:
         """Return the own signal inside a step."""
-        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN), *self._open)
+        return ca.vertcat(getattr(s, FILTER), getattr(s, _GIVEN))
 
     def advanced(self, s: Signals, period: float) -> Expression:
         """Return the filters' state one cycle later inside a step, with the set-points held."""
@@ -89,31 +83,33 @@ class FilterBank:
     def motion(self, ahead: float) -> ca.Function:
         """Function (t, own signal) -> (state, response), now or after some time with the set-points held."""
         own = ca.SX.sym("own", self.own.size)
-        z, points, rate = self._parts(own)
+        z, points = self._parts(own)
         if ahead:
-            phis = [transition(rate, ahead, order) for order in self.orders.values()]
+            phis = [transition(self.rate, ahead, order) for order in self.orders.values()]
             z = [_after_motion(phi, z[k], points[k, 0]) for k, phi in enumerate(phis)]
-        state, response = arranged(self.plant, self._chains(z, points[:, 0], rate))
+        state, response = arranged(self.plant, self._chains(z, points[:, 0]))
         results = [ca.densify(state), ca.densify(response)]
         return ca.Function("fpirhc_reference_now", [ca.SX.sym("t"), own], results, ["t", "own"], ["state", "response"])
 
     def chain(self, coordinate: str, order: int) -> ca.Function:
         """Function (t, own signal) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,)."""
         own = ca.SX.sym("own", self.own.size)
-        z, points, rate = self._parts(own)
-        whole = self._chains(z, points[:, 0], rate)[list(self.orders).index(coordinate)]
+        z, points = self._parts(own)
+        whole = self._chains(z, points[:, 0])[list(self.orders).index(coordinate)]
         return ca.Function("fpirhc_reference_chain", [ca.SX.sym("t"), own], [ca.densify(whole[: order + 1])])
 
     def preview(self, times: np.ndarray) -> ca.Function:
         """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)): free motion, every node's set-points held."""
         own = ca.SX.sym("own", self.own.size)
-        z, points, rate = self._parts(own)
+        z, points = self._parts(own)
         lengths = np.round(np.diff(times) / times[1], 12)  # equal stages are equal to the last bit
-        phis = {n: [transition(rate, times[1] * n, order) for order in self.orders.values()] for n in lengths.tolist()}
+        phis = {
+            n: [transition(self.rate, times[1] * n, order) for order in self.orders.values()] for n in lengths.tolist()
+        }
         columns = []
         for node in range(len(times)):
             held = points[:, min(node, self.nodes - 1)]
-            columns.append(arranged(self.plant, self._chains(z, held, rate)))
+            columns.append(arranged(self.plant, self._chains(z, held)))
             stage = phis[lengths[min(node, len(lengths) - 1)]]
             z = [_after_motion(phi, z[k], held[k]) for k, phi in enumerate(stage)]
         tables = [ca.densify(ca.horzcat(*parts)) for parts in zip(*columns, strict=True)]
@@ -123,17 +119,16 @@ class FilterBank:
     def _split(self, column: Expression) -> list[Expression]:
         return ca.vertsplit(column, [0, *np.cumsum(list(self.orders.values())).tolist()])
 
-    def _parts(self, own: Expression) -> tuple[list[Expression], Expression, _Entry]:
-        """State of every filter, set-points (n, nodes), and rate, of the own signal."""
-        size, count = len(self.elements), self.given.size
-        points = ca.reshape(own[size : size + count], len(self.orders), self.nodes)
-        rates: list[_Entry] = [own[size + count] for _ in self._open]
-        return self._split(own[:size]), points, (rates or [self.rate])[0]
+    def _parts(self, own: Expression) -> tuple[list[Expression], Expression]:
+        """State of every filter, and set-points (n, nodes), of the own signal."""
+        size = len(self.elements)
+        points = ca.reshape(own[size:], len(self.orders), self.nodes)
+        return self._split(own[:size]), points
 
-    def _chains(self, z: Sequence[Expression], held: Expression, rate: _Entry) -> list[Expression]:
+    def _chains(self, z: Sequence[Expression], held: Expression) -> list[Expression]:
         """(y, y', ..., y^(m)) of every coordinate; of a map the divided differences."""
         orders = enumerate(self.orders.values())
-        return [chain_of(self.plant, rate, z[k], held[k], order) for k, order in orders]
+        return [chain_of(self.plant, self.rate, z[k], held[k], order) for k, order in orders]
 
 
 def arranged(plant: Plant, chains: Sequence[Expression]) -> tuple[Expression, Expression]:
@@ -144,7 +139,7 @@ def arranged(plant: Plant, chains: Sequence[Expression]) -> tuple[Expression, Ex
     return ca.vertcat(*state), ca.vertcat(*response)
 
 
-_Entry = float | Expression  # a number, a live number or an expression
+_Entry = float | Expression
 
 
 def transition(rate: _Entry, time: _Entry, order: int) -> list[list[_Entry]]:
@@ -242,7 +237,7 @@ class Setpoint(Reference):
     """
 
     values: Mapping[str, Steps]
-    rate: Positive
+    rate: Positive = field(metadata={"structure": True})
     order: Count | None = None
     start: Mapping[str, float] = field(default_factory=dict)
     announced: bool = False
@@ -343,8 +338,7 @@ class Setpoint(Reference):
 
     def _jump(self, plant: Plant, order: int) -> float:
         """Jump of the response at a set-point that changes by one."""
-        rate = nominal(self.rate)
-        return float(ca.evalf(chain_of(plant, rate, ca.SX.zeros(order), ca.SX(1.0), order))[-1])
+        return float(ca.evalf(chain_of(plant, self.rate, ca.SX.zeros(order), ca.SX(1.0), order))[-1])
 
     def _bank(self, plant: Plant, stages: int) -> FilterBank:
         return FilterBank(plant, self._orders(plant), self.rate, stages + 1 if self.announced else 1)
@@ -365,7 +359,7 @@ class Setpoint(Reference):
 
     def _along_values(self, plant: Plant, name: str, order: int, t: Expression) -> Expression:
         """(y, y', ..., y^(m)) of one coordinate along `values`: a sum of step responses."""
-        rate, rest = nominal(self.rate), self._rest(name)
+        rate, rest = self.rate, self._rest(name)
         z, held = [expression(ca.SX(rest)), *[expression(ca.SX(0))] * (order - 1)], expression(ca.SX(rest))
         for time, change in self._changes(name):
             phi = transition(rate, ca.fmax(t - time, 0), order)

@@ -156,6 +156,7 @@ LIVE = [
     ("RHC+FPI", "deformation", InvalidValue, "go on with one of"),
     ("CTC", "cost.states.q1", NotSupported, "does not use it"),
     ("CTC", "referense.rate", InvalidName, "reference"),
+    ("CTC", "reference.rate", NotSupported, "what the loop is made of"),
 ]
 
 

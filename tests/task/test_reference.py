@@ -1,7 +1,5 @@
 """References and disturbances: derivatives by differentiation, tables by splines, and what acts at which time."""
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -28,26 +26,6 @@ def test_a_scale_goes_from_the_first_point():
     np.testing.assert_allclose(np.append(state.full().ravel(), float(response)), wanted, rtol=1e-12)
     np.testing.assert_allclose(scaled.chain(chain(2), 0, "y", 2)(0.3).full().ravel(), wanted, rtol=1e-12)
     np.testing.assert_allclose(float(ca.evalf(scaled.coordinates(ca.SX(0.3))["y"])), wanted[0], rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("name", "title"),
-    [("two_mass", "CTC+FPI (eq 6)"), ("two_mass", "RHC+FPI"), ("fishery", "RHC+FPI"), ("mass_spring_slots", "slots+FPI"),
-     ("delayed_mass", "RHC+FPI"), ("planar_arm", "AID+FPI")],
-)  # fmt: skip
-def test_a_live_scale_is_that_of_a_task_with_it(name, title):
-    """Plans and previews, slots, and controllers behind dead time follow it: to rounding, plans with the build's scale to 1e-3."""
-    task = fp.load_problem(name)
-    short = replace(task.problem, duration=60 * task.problem.period, measure_from=0.0)
-    ready = fp.simulator(short, task.controllers[title], compiled=False, live=["reference.scale"])
-    run = ready.run(seed=0, settings={"reference.scale": 1.3})
-    other = fp.simulate(
-        fp.with_settings(short, {"reference.scale": 1.3}), task.controllers[title], seed=0, compiled=False
-    )
-    close = 1e-9 if task.controllers[title].planner is None else 1e-3
-    for signal in ("reference", "command", "true_error" if "true_error" in run.layout.names else "error"):
-        wanted = np.asarray(other[signal])
-        np.testing.assert_allclose(run[signal], wanted, rtol=0, atol=close * max(1.0, np.abs(wanted).max()))
 
 
 def test_table_agrees_with_the_expression_it_samples():

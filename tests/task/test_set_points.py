@@ -212,29 +212,6 @@ def test_run_and_file_record_what_was_in_force(tmp_path):
     assert again.settings["setpoints"] == {"q1": [[0.0, 2.2], [0.0505, 2.3]], "q2": [list(p) for p in STEPS["q2"]]}
 
 
-@pytest.mark.parametrize(
-    ("name", "compiled"), [("CTC+FPI (eq 6)", False), ("CTC+FPI (eq 6)", True), ("RHC+FPI", False)]
-)
-def test_live_rate_of_the_filter(name, compiled):
-    """Changed equals rebuilt bit by bit, also with a plan whose reference rests over the first horizon."""
-    steps = {"q1": [(0.0, 2.2), (0.21, 2.4)], "q2": 5.4}
-    controller = tasks.two_mass.controllers[name]
-    ready = fp.simulator(two_mass(values=steps), controller, compiled=compiled, live=["reference.rate"])
-    changed = ready.run(seed=0, settings={"reference.rate": 7.3})
-    rebuilt = fp.simulate(two_mass(values=steps, rate=7.3), controller, seed=0, compiled=compiled)
-    np.testing.assert_array_equal(changed["reference"], rebuilt["reference"])
-    np.testing.assert_array_equal(changed["command"], rebuilt["command"])
-
-
-def test_a_live_rate_moves_the_plans():
-    """They follow the rate as those of a loop that is built with it; scale and first plan are those of the build."""
-    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["RHC"], compiled=False, live=["reference.rate"])
-    changed = ready.run(seed=0, settings={"reference.rate": 7.3})
-    rebuilt = fp.simulate(two_mass(rate=7.3), tasks.two_mass.controllers["RHC"], seed=0, compiled=False)
-    size = np.abs(rebuilt["command"]).max()
-    np.testing.assert_allclose(changed["command"], rebuilt["command"], rtol=0, atol=1e-3 * size)
-
-
 def test_slots_need_the_order_of_their_chain():
     """A slot differentiates its coordinate as often as its chain is long."""
     task = fp.load_problem("two_tanks_slots")
