@@ -464,7 +464,8 @@ def new(
     from fpirhc.scaffold import create_problem
 
     problem, test = create_problem(name, folder)
-    print(f"wrote {problem}\nwrote {test}\nnext: fpirhc compare {problem}; python -m pytest {test}")
+    print(f"wrote {problem}, which runs as it is: put your equations into it\nwrote {test}")
+    print(f"next: fpirhc review {problem}; fpirhc compare {problem}; python -m pytest {test}")
 
 
 @_command("list", name="list")
