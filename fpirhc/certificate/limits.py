@@ -135,7 +135,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     if ready.learns or ready.feeds or ready.deforms != "response":
         yield "its model, state or command is changed beside the deformation"
     if ready.plant_model(problem).exact:
-        yield "its model has the exact parameters of every plant, so there is no box to be certified"
+        yield "its model has the exact parameters of every plant, so there are no other plants to be certified"
     plain = type(deformation) is ModelReferenced and type(deformation.map) is Affine and deformation.map.weights is None
     if not plain or not deformation.mirror.bare:
         yield "the deformation must be ModelReferenced(Affine(gain=...)) without dead time, lag, weights or filter"

@@ -222,7 +222,7 @@ class Sweep:
             if not factor < 1:
                 return (
                     f"the iteration need not contract: with the effective gain {self.gain:g} the bound of the spectral radius of "
-                    f"|I - a J| over the box is {factor:.3g}, and it must be below 1"
+                    f"|I - a J| over all plants and states of the run is {factor:.3g}, and it must be below 1"
                 )
             follows = self._follow(bounds)
             if follows.within(bounds):

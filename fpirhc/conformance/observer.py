@@ -108,7 +108,7 @@ def right_model_believes_what_is(trial: _Trial, generator: np.random.Generator) 
     """With the exact model, the right start and no noise the believed state is the plant's."""
     run = trial.exact_run(trial.problem)
     error, size = np.abs(run["state"] - run["plant_state"]).max(), np.abs(run["plant_state"]).max()
-    hold(within(error, _SAME * size), f"the believed state is off by {error:.3g}, states are as large as {size:.3g}")
+    hold(within(error, _SAME * size), f"the estimated state is off by {error:.3g}, states are as large as {size:.3g}")
 
 
 def lives_in_the_time_of_the_samples(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -125,7 +125,7 @@ def finite_under_noise(trial: _Trial, generator: np.random.Generator) -> None:  
     """With a wrong model and noise on all that is measured every believed state is a number; skipped cycles would hide it."""
     run = trial.noisy_run
     finite = bool(np.isfinite(run["state"]).all() and (run["status"] == Status.OK).all())
-    hold(run.stop is None and finite, "under noise a believed state is not finite")
+    hold(run.stop is None and finite, "under noise an estimated state is not finite")
 
 
 @without_warning()
@@ -142,7 +142,7 @@ def one_step_with_the_controller(trial: _Trial, generator: np.random.Generator) 
             hold(not wrong, f"a sample of NaN reaches {wrong} in the memory")
         _, memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
         same = np.array_equal(stepper.trace()["state"], run["state"][k])
-        hold(same, f"in cycle {k} a stepper believes another state than the run")
+        hold(same, f"in cycle {k} a stepper estimates another state than the run")
 
 
 def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) -> None:
@@ -154,7 +154,7 @@ def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) 
     same = all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one(sample), two(sample), strict=True))
     hold(
         same,
-        f"with exact parameters {_OTHER - 1:.0%} larger, and the same evidence, it believes another state; use evidence.parameters",
+        f"with exact parameters {_OTHER - 1:.0%} larger, and equal evidence, it estimates another state; use evidence.parameters",
     )
 
 
@@ -165,13 +165,13 @@ def old_samples_do_nothing(trial: _Trial, generator: np.random.Generator) -> Non
     change = float(np.abs(cycle(sample)[0] - cycle(replace(sample, measured=sample.measured + 1.0))[0]).max())
     hold(
         change == 0,
-        f"with counts = 0 a measurement that is larger by 1 changes the believed state by {change:.3g}; select with if_else",
+        f"with counts = 0 a measurement that is larger by 1 changes the estimated state by {change:.3g}; select with if_else",
     )
     still = replace(cycle.sample(generator), moves=0.0)
     change = float(np.abs(cycle(still)[0] - cycle(replace(still, command=still.command + 1.0))[0]).max())
     hold(
         change == 0,
-        f"with moves = 0 a command that is larger by 1 changes the believed state by {change:.3g}; move by evidence.moves",
+        f"with moves = 0 a command that is larger by 1 changes the estimated state by {change:.3g}; move by evidence.moves",
     )
 
 

@@ -150,13 +150,13 @@ def _check_observed(problem: Problem) -> None:
         hidden = [plant.state.elements[k] for k in members(basis)]
         raise NoAnswer(
             f"{type(observer).__name__}: {' and '.join(hidden)} cannot be observed along the reference from {', '.join(names)}, "
-            f"and an error of what is believed does not decay (pole {pole:.3g} {problem.rate_unit}); measure {hidden[0]}, or "
+            f"and an error of the estimate does not decay (pole {pole:.3g} {problem.rate_unit}); measure {hidden[0]}, or "
             "another quantity that depends on it"
         )
 
 
 def _against(problem: Problem, controller: Controller) -> Iterator[str]:
-    """Reasons against believed states."""
+    """Reasons against observed states."""
     sensing, plant = problem.sensing, problem.plant
     lost = sensing.believed_response(plant)
     if lost and controller.deformation.adapts:
@@ -168,7 +168,7 @@ def _against(problem: Problem, controller: Controller) -> Iterator[str]:
     model = controller.plant_model(problem).plant
     if model.parameter.elements != plant.parameter.elements:
         yield (
-            f"{type(controller).__name__} has a model with other parameters than the problem's, and states are believed by the "
+            f"{type(controller).__name__} has a model with other parameters than the problem's, and the observer has the "
             "problem's; leave the observer out, or give both the same parameters"
         )
 
@@ -189,7 +189,7 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
             slopes.append(slope)
             seen.append(part)
     if not slopes:
-        raise NoAnswer("believed states: the model has no finite Jacobian along the reference")
+        raise NoAnswer("observed states: the model has no finite Jacobian along the reference")
     return np.array(states), slopes, seen
 
 

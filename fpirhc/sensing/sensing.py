@@ -88,8 +88,8 @@ def uncovered(
         )
     elif observer is None and missing:
         yield (
-            f"measured: {type(estimator).__name__} also needs {', '.join(missing)}; measure it, or state how it is "
-            "believed: Sensing(measured=..., observer=KalmanFilter(...))"
+            f"measured: {type(estimator).__name__} also needs {', '.join(missing)}; measure it, or estimate it by "
+            "an observer: Sensing(measured=..., observer=KalmanFilter(...))"
         )
     if plant.outputs:
         yield from _of_outputs(plant, estimator, missing, measured, believes=observer is not None)
@@ -102,7 +102,7 @@ def _of_outputs(
     if believes and followed:
         yield (
             f"measured: {type(estimator).__name__} needs {', '.join(followed)}, and outputs that are controlled are measured or "
-            "estimated, never believed; measure it, or choose an estimator of what is measured, such as PositionDifference()"
+            "differentiated, never observed; measure it, or choose an estimator of what is measured, such as PositionDifference()"
         )
     states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
     if not believes and states:

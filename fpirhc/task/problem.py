@@ -342,7 +342,7 @@ class Problem(Checked):
             if response_age(self.plant) * order > 1:
                 raise InvalidValue(
                     f"disturbances: the output '{name}' of a map has relative order {order}, and its differences look ahead to "
-                    "disturbances that nobody knows yet; disturb a state or an input, or an output of order 1"
+                    "unknown disturbances; disturb a state or an input, or an output of order 1"
                 )
             self.disturbances[name].derivative(instants, 1)
 
@@ -491,7 +491,7 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
     smooth = not_held(problem.signals, differentiated_signals(plant))
     if smooth:
         mistakes.add(
-            f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives nobody states; state it in "
+            f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state it in "
             "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
     if len(plant.inputs) == len(plant.controlled or plant.chains):
@@ -643,7 +643,7 @@ def _other_rows(problem: Problem) -> list[tuple[str, str]]:
     believed = problem.sensing.believed(problem.plant)
     if believed:
         rows.append(("measured", ", ".join(problem.sensing.measures(problem.plant))))
-        rows.append(("believed", f"{', '.join(believed)}, by {type(problem.sensing.observer).__name__}"))
+        rows.append(("observed", f"{', '.join(believed)}, by {type(problem.sensing.observer).__name__}"))
     return rows
 
 

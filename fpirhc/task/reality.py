@@ -290,7 +290,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
     if own not in units:
         if name not in seen:
             followed = name in (model.controlled or model.chains)
-            believed = "" if followed else ", or have it believed: Sensing(measured=..., observer=KalmanFilter(...))"
+            believed = "" if followed else ", or estimate it: Sensing(measured=..., observer=KalmanFilter(...))"
             mistakes.add(
                 f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
                 f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"

@@ -57,7 +57,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "measured name": (lambda: task(measured=["Y"], observer=KALMAN), "measured: quantity 'Y'"),
     "no observer": (
         lambda: task(measured=["y"], estimator=fp.Measured()),
-        "also needs y', y''; measure it, or state how it is believed",
+        "also needs y', y''; measure it, or estimate it by an observer",
     ),
     "filter of what no sensor shows": (
         lambda: task(measured=["y"], observer=fp.KalmanFilter(measured={"y'": 0.1}, noise={"y": 1.0})),
