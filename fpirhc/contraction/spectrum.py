@@ -349,7 +349,7 @@ def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, flo
 
 
 def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:
-    text = f"{what} shrinks an error of the request at least to {predicted:.3g} of it per cycle"
+    text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle"
     if not within:
         text += (
             ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
