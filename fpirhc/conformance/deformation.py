@@ -1,25 +1,34 @@
-"""Laws that every deformation keeps."""
+"""Laws that every deformation keeps: about one step, and about its facts in many cycles.
+
+The facts are compared with the map itself, which runs without a plant, with zero desired response and prescribed response errors.
+An impulse of the error in one of two runs that are otherwise the same shows gain, filter and pairing of the map at that time.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.conformance.deformation_facts import check_deformation_facts
-from fpirhc.conformance.laws import hold, is_a_frozen_value, keep
-from fpirhc.deformation.base import Deformation, of_last_pair
+from fpirhc.conformance.laws import frozen_value, hold, keep
+from fpirhc.deformation.base import Deformation, RequestChange, automatic, innermost, of_last_pair, with_inner
+from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
 Array = npt.NDArray[Any]
 
 _TRIALS = 5
+_SEEN = 1e-9  # of the amplitude: a shorter step drowns in the rounding of the request
+_FADES = 1e-6  # of the longest step that a smaller error causes
+_WARM = 60  # cycles of history beyond those that a pairing needs
+_SHOWN = 24  # cycles after an impulse
+_SMALL = 1e-4  # errors, in units of the amplitude: the map is linear there
+_SAME = 1e-2  # relative
 
 
 def check_deformation(
@@ -41,16 +50,18 @@ def check_deformation(
         AssertionError: the first law that does not hold, in one sentence.
         FpirhcError: the map is not complete, a Sigmoid without scale for instance.
     """
-    laws = LAWS if of_last_pair(deformation) else ANY
-    keep(deformation, _Trial(deformation, tuple(elements), amplitude), laws, seed)
-    check_deformation_facts(deformation, seed=seed, amplitude=amplitude)
+    laws = STEPS if of_last_pair(deformation) else ANY
+    keep(deformation, _Map(deformation, deformation, tuple(elements), amplitude), laws, seed)
+    settled = deformation.with_scale_for(RequestChange(amplitude, sudden=True))
+    keep(deformation, _Map(deformation, settled, ("q",), amplitude), FACTS, seed)
 
 
 @dataclass(frozen=True, eq=False)
-class _Trial:
-    """A deformation as numeric functions of (request, response, desired, memory)."""
+class _Map:
+    """A deformation as numeric functions (request, response, desired, memory) -> (request, memory)."""
 
     deformation: Deformation
+    settled: Deformation  # whose step is tried
     elements: tuple[str, ...]
     amplitude: float
 
@@ -63,7 +74,7 @@ class _Trial:
         return self.deformation.memory(self.elements)
 
     @cached_property
-    def scalar_function(self) -> ca.Function:
+    def function(self) -> ca.Function:
         return self._function(ca.SX)
 
     @cached_property
@@ -71,32 +82,51 @@ class _Trial:
         return self._function(ca.MX)
 
     def _function(self, kind: Any) -> ca.Function:
-        request, response, desired = (kind.sym(name, self.size) for name in ("request", "response", "desired"))
+        arguments = request, response, desired = [kind.sym(n, self.size) for n in ("request", "response", "desired")]
         memory = kind.sym("memory", self.layout.size)
-        deformed, next_memory = self.deformation.step(request, response, desired, self.layout.split(memory))
-        hold(
-            set(next_memory) == set(self.layout.names),
-            f"step remembers {sorted(next_memory)} but memory() lays out {sorted(self.layout.names)}",
-        )
-        column = kind(deformed)
-        hold(column.shape == (self.size, 1), f"step gives a request of shape {column.shape}, expected ({self.size}, 1)")
-        outputs = [ca.densify(column), ca.densify(kind(self.layout.join(next_memory)))]
-        hold(outputs[1].numel() == self.layout.size, "step remembers vectors of another size than memory() lays out")
-        return ca.Function("map", [request, response, desired, memory], outputs)
+        deformed, after = self.settled.step(request, response, desired, self.layout.split(memory))
+        told, size = sorted(self.layout.names), self.layout.size
+        hold(sorted(after) == told, f"step remembers {sorted(after)} but memory() lays out {told}")
+        shape = kind(deformed).shape
+        hold(shape == (self.size, 1), f"step gives a request of shape {shape}, expected ({self.size}, 1)")
+        outputs = [ca.densify(kind(deformed)), ca.densify(kind(self.layout.join(after)))]
+        hold(outputs[1].numel() == size, "step remembers vectors of another size than memory() lays out")
+        return ca.Function("map", [*arguments, memory], outputs)
 
     def __call__(self, request: Array, response: Array, desired: Array) -> Array:
-        return np.asarray(self.scalar_function(request, response, desired, self.layout.start())[0].full())[:, 0]
+        return np.asarray(self.function(request, response, desired, self.layout.start())[0].full())[:, 0]
 
     def vector(self, generator: np.random.Generator) -> Array:
         return self.amplitude * generator.normal(size=self.size)
 
+    @cached_property
+    def wait(self) -> int:
+        """Cycles after which every pair is one of this run."""
+        pairing = self.deformation.iteration.pairing
+        return 0 if pairing is None else int(np.ceil(pairing.cycles)) + pairing.uncertainty + 2
 
-def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """A deformation is a frozen value that can be hashed, copied and described."""
-    is_a_frozen_value(trial.deformation)
+    def after(self, errors: Array) -> Array:
+        """Requests after every cycle with these response errors; the first is zero."""
+        request, memory, requests = 0.0, self.layout.start(), np.empty(len(errors))
+        for k, error in enumerate(errors):
+            request, memory = (v.full() for v in self.function(request, error, 0.0, memory))
+            requests[k] = request.item()
+        return requests
+
+    @cached_property
+    def impulse_response(self) -> Array:
+        """Change of the requests by one error after cycles without errors, per unit of the error."""
+        calm, size = np.zeros(_WARM + _SHOWN + 3 * self.wait), _SMALL * self.amplitude
+        begin = _WARM + 2 * self.wait
+        return np.asarray((self.after(size * (np.arange(len(calm)) == begin)) - self.after(calm))[begin:]) / size
+
+    @property
+    def linear(self) -> bool:
+        """Whether it answers an error in the same way at any time."""
+        return self.deformation.iteration.constant and self.deformation.adapts
 
 
-def fixed_point_stays(trial: _Trial, generator: np.random.Generator) -> None:
+def fixed_point_stays(trial: _Map, generator: np.random.Generator) -> None:
     """A response that is the desired one leaves the request alone, to rounding."""
     for _ in range(_TRIALS):
         request, desired = trial.vector(generator), trial.vector(generator)
@@ -104,24 +134,23 @@ def fixed_point_stays(trial: _Trial, generator: np.random.Generator) -> None:
         hold(step <= 1e-12 * trial.amplitude, f"at response = desired the request moved by {step:.3g} instead of 0")
 
 
-def derivatives_are_finite(trial: _Trial, generator: np.random.Generator) -> None:
+def derivatives_are_finite(trial: _Map, generator: np.random.Generator) -> None:
     """Value, gradient and Hessian are finite at zero error, in SX and in MX, so that an optimiser can use the map."""
     request, desired = trial.vector(generator), trial.vector(generator)
-    for function in (trial.scalar_function, trial.matrix_function):
-        symbols = ca.MX.sym("z", 3 * trial.size)
-        parts = ca.vertsplit(symbols, trial.size)
-        deformed = function(*parts, trial.layout.start())[0]
-        gradient = ca.jacobian(deformed, symbols)
-        hessian = ca.jacobian(ca.vec(gradient), symbols)
-        for what, expression in (("value", deformed), ("gradient", gradient), ("Hessian", hessian)):
-            evaluated = ca.Function("f", [symbols], [expression])(np.concatenate([request, desired, desired]))
+    for function in (trial.function, trial.matrix_function):
+        z = ca.MX.sym("z", 3 * trial.size)
+        deformed = function(*ca.vertsplit(z, trial.size), trial.layout.start())[0]
+        gradient = ca.jacobian(deformed, z)
+        parts = {"value": deformed, "gradient": gradient, "Hessian": ca.jacobian(ca.vec(gradient), z)}
+        for what, expression in parts.items():
+            numbers = ca.Function("f", [z], [expression])(np.concatenate([request, desired, desired])).full()
             hold(
-                bool(np.isfinite(evaluated.full()).all()),
+                bool(np.isfinite(numbers).all()),
                 f"the {what} is not finite at response = desired; guard the 0/0 without a division in a dead branch",
             )
 
 
-def first_step_is_effective_gain(trial: _Trial, generator: np.random.Generator) -> None:
+def first_step_is_effective_gain(trial: _Map, generator: np.random.Generator) -> None:
     """A small response error moves the request by -effective_gain() times the error."""
     gain, zero = trial.deformation.effective_gain(), np.zeros(trial.size)
     for _ in range(_TRIALS):
@@ -130,7 +159,7 @@ def first_step_is_effective_gain(trial: _Trial, generator: np.random.Generator) 
         hold(missed <= 1e-4, f"the first-order step misses effective_gain()={gain:.6g} by the share {missed:.3g}")
 
 
-def gain_can_be_set(trial: _Trial, generator: np.random.Generator) -> None:
+def gain_can_be_set(trial: _Map, generator: np.random.Generator) -> None:
     """`with_effective_gain` returns the same kind of map with that gain, of either sign."""
     for gain in generator.uniform(0.1, 1.5, size=_TRIALS) * (-1) ** np.arange(_TRIALS):
         changed = trial.deformation.with_effective_gain(float(gain))
@@ -139,23 +168,7 @@ def gain_can_be_set(trial: _Trial, generator: np.random.Generator) -> None:
         hold(abs(got - gain) <= 1e-12, f"with_effective_gain({gain:.6g}) returned a map with effective gain {got:.6g}")
 
 
-def contraction_is_predicted(trial: _Trial, generator: np.random.Generator) -> None:
-    """On linear plants with J similar to a positive definite matrix the error shrinks by max|1 - a lambda|."""
-    for _ in range(_TRIALS):
-        mass, model = (_positive_definite(generator, trial.size) for _ in range(2))
-        plant = np.linalg.solve(mass, model)
-        eigenvalues = np.linalg.eigvals(plant).real
-        gain = float(generator.uniform(0.2, 1.8)) / eigenvalues.max()
-        changed = _Trial(trial.deformation.with_effective_gain(gain), trial.elements, trial.amplitude)
-        predicted = float(np.abs(1 - gain * eigenvalues).max())
-        measured = _measured_factor(changed, plant, mass, generator)
-        hold(
-            abs(measured - predicted) <= 1e-3,
-            f"the error shrinks by {measured:.5f} per cycle, predicted max|1 - a lambda| = {predicted:.5f}",
-        )
-
-
-def secant_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
+def secant_is_bounded(trial: _Map, generator: np.random.Generator) -> None:
     """From zero request no error, small or large, causes a larger step per unit than |secant_gain()|."""
     bound, zero = abs(trial.deformation.secant_gain()), np.zeros(trial.size)
     effective = abs(trial.deformation.effective_gain())
@@ -171,11 +184,7 @@ def secant_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
         )
 
 
-_SEEN = 1e-9  # of the amplitude: a shorter step drowns in the rounding of the request
-_FADES = 1e-6  # of the longest step that a smaller error causes
-
-
-def only_desired_is_fixed(trial: _Trial, generator: np.random.Generator) -> None:
+def only_desired_is_fixed(trial: _Map, generator: np.random.Generator) -> None:
     """A larger error of the same direction moves the request the same way, so no response but the desired one leaves it alone.
 
     A map that turns back, or that fades far out, as a wavelet does, has false fixed points: there the iteration rests although
@@ -185,86 +194,180 @@ def only_desired_is_fixed(trial: _Trial, generator: np.random.Generator) -> None
     for request in (np.zeros(trial.size), *(trial.vector(generator) for _ in range(_TRIALS))):
         desired, direction = trial.vector(generator), generator.normal(size=trial.size)
         responses = desired[:, None] + direction[:, None] / np.linalg.norm(direction) * sizes
-        moved = np.asarray(trial.scalar_function(request, responses, desired, trial.layout.start())[0].full())
-        steps = moved - request[:, None]
+        steps = (
+            np.asarray(trial.function(request, responses, desired, trial.layout.start())[0].full()) - request[:, None]
+        )
         lengths = np.linalg.norm(steps, axis=0)
         seen = np.flatnonzero(lengths > _SEEN * trial.amplitude)
         hold(seen.size > 0, f"no error up to {sizes[-1]:.3g} moves the request")
         begin = seen[0]
-        along = steps[:, begin] @ steps[:, begin:] / lengths[begin]
-        kept = along > _FADES * np.maximum.accumulate(lengths[begin:])
-        where = sizes[begin + int(np.argmin(kept))]
+        kept = steps[:, begin] @ steps[:, begin:] / lengths[begin] > _FADES * np.maximum.accumulate(lengths[begin:])
         hold(
             bool(kept.all()),
-            f"an error of {where:.3g} does not move the request the way a smaller one does, so a false fixed point is near: use a "
-            "step that grows with the error or saturates",
+            f"an error of {sizes[begin + int(np.argmin(kept))]:.3g} does not move the request the way a smaller one does, so a "
+            "false fixed point is near: use a step that grows with the error or saturates",
         )
 
 
-def step_is_bounded(trial: _Trial, generator: np.random.Generator) -> None:
+def step_is_bounded(trial: _Map, generator: np.random.Generator) -> None:
     """No error moves the request by more than largest_step()."""
     bound = trial.deformation.largest_step()
     for size in np.logspace(-3, 6, 50):
         request, desired = trial.vector(generator), trial.vector(generator)
-        response = desired + size * trial.vector(generator)
-        step = float(np.linalg.norm(trial(request, response, desired) - request))
+        step = float(np.linalg.norm(trial(request, desired + size * trial.vector(generator), desired) - request))
         hold(step <= bound * (1 + 1e-9), f"the request moved by {step:.9g}, above largest_step() = {bound:.9g}")
 
 
-def graphs_agree(trial: _Trial, generator: np.random.Generator) -> None:
+def graphs_agree(trial: _Map, generator: np.random.Generator) -> None:
     """The map built from SX and from MX gives the same request and memory."""
     for size in np.logspace(-6, 3, 10):
         desired = trial.vector(generator)
         arguments = (trial.vector(generator), desired + size * trial.vector(generator), desired, trial.layout.start())
-        for one, other in zip(trial.scalar_function(*arguments), trial.matrix_function(*arguments), strict=True):
-            difference = float(ca.norm_inf(one - other)) if one.numel() else 0.0
-            scale = max(1.0, float(ca.norm_inf(one))) if one.numel() else 1.0
-            hold(difference <= 1e-12 * scale, f"SX and MX graphs differ by {difference:.3g}")
+        one, other = (
+            np.concatenate([v.full().ravel() for v in f(*arguments)]) for f in (trial.function, trial.matrix_function)
+        )
+        apart = float(np.abs(one - other).max())
+        hold(apart <= 1e-12 * max(1.0, np.abs(one).max()), f"SX and MX graphs differ by {apart:.3g}")
 
 
-def nan_shows(trial: _Trial, generator: np.random.Generator) -> None:
+def nan_shows(trial: _Map, generator: np.random.Generator) -> None:
     """A response that is not a number never acts: the request is not one either, or it is the desired response."""
     for place in range(trial.size):
         response, desired = trial.vector(generator), trial.vector(generator)
         response[place] = np.nan
         deformed = trial(trial.vector(generator), response, desired)
+        shown = bool(np.isnan(deformed).any()) or np.array_equal(deformed, desired)
+        hold(shown, "a response of NaN is hidden: the request is finite, and not the desired response")
+
+
+# Facts, in many cycles of one coordinate
+
+
+def inner_can_be_exchanged(trial: _Map, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """The inner map can be replaced: around its own inner map a wrapper stays the same."""
+    deformation = trial.deformation
+    if deformation.inner is not None:
+        same = with_inner(deformation, deformation.inner)
+        hold(describe(same) == describe(deformation), f"around its own inner map it is {same}")
+
+
+def gain_is_proportional_to_its_field(trial: _Map, generator: np.random.Generator) -> None:
+    """The field that `gain_name` names is proportional to the effective gain: advice in units of one is advice in the other."""
+    gain, factor = trial.deformation.effective_gain(), float(generator.uniform(1.2, 1.9))
+    if gain == 0:
+        return
+    before = innermost(trial.deformation)
+    after = innermost(trial.deformation.with_effective_gain(factor * gain))
+    one, other = (getattr(own, own.gain_name, None) for own in (before, after))
+    numbers = isinstance(one, int | float) and isinstance(other, int | float)
+    told = numbers and abs(other - factor * one) <= _SAME * abs(one)  # type: ignore[operator,arg-type]
+    hold(told, f"with {factor:.3g} times its effective gain its '{before.gain_name}' is {other}, and was {one}")
+
+
+def exact_model_is_left_alone(trial: _Map, generator: np.random.Generator) -> None:
+    """With a `mirror` it is given the model's response, and where this is the plant's the request is the desired response."""
+    if not trial.deformation.mirror.share:
+        return
+    memory = trial.layout.start()
+    for response, desired in generator.normal(size=(_WARM, 2)) * trial.amplitude:
+        request, memory = trial.function(response, response, desired, memory)
+        missed = abs(float(request) - desired)
         hold(
-            bool(np.isnan(deformed).any()) or np.array_equal(deformed, desired),
-            "a response of NaN is hidden: the request is finite, and not the desired response",
+            missed <= 1e-9 * trial.amplitude,
+            f"given the model's response as the plant's, the request misses the desired one by {missed:.3g}",
         )
 
 
+def shown_is_remembered(trial: _Map, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """Every signal that `shown` logs is a scalar of the memory."""
+    for name, source in trial.deformation.shown().items():
+        scalar = source in trial.layout and trial.layout[source].size == 1
+        hold(scalar, f"it shows '{source}' as '{name}', which is no scalar of its memory {list(trial.layout.names)}")
+
+
+def automatic_settings_are_chosen(trial: _Map, generator: np.random.Generator) -> None:
+    """`with_scale_for` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
+    given = not automatic(trial.deformation)
+    for sudden in (False, True):
+        change = float(generator.uniform(2.0, 20.0))
+        ready = trial.deformation.with_scale_for(RequestChange(change, sudden))
+        hold(not automatic(ready), f"with_scale_for() leaves {automatic(ready)} open")
+        same, step = describe(ready) == describe(trial.deformation), ready.largest_step()
+        hold(same or not given, f"no setting is automatic, but with_scale_for() gives {ready}")
+        covers = given or step >= 0.99 * change
+        hold(covers, f"with the scale for changes of {change:.3g} its largest step is {step:.3g}")
+
+
+def filter_and_pairing_are_told(trial: _Map, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """An error changes the request at once and permanently, unless `error_pole` spreads it or `pairing` repeats it."""
+    if not trial.linear:
+        return
+    answer, gain = trial.impulse_response, trial.deformation.effective_gain()
+    pairing, pole = trial.deformation.iteration.pairing, trial.deformation.iteration.error_pole
+    if pairing is None:
+        expected = -gain * (1 - pole ** np.arange(1, answer.size + 1))
+        facts = f"the pole {pole:g} and no pairing"
+    elif pole == 0 and pairing.uncertainty == 0 and float(pairing.cycles).is_integer():
+        expected = -gain * (np.arange(answer.size) % (int(pairing.cycles) + 1) == 0)
+        facts = f"pairs {pairing.cycles:g} cycles apart"
+    else:
+        return
+    missed = np.abs(answer - expected) / abs(gain)
+    worst = int(np.argmax(missed))
+    hold(
+        bool(missed[worst] <= _SAME),
+        f"its facts are {facts}, but {worst} cycles after an error of one the request has changed by {answer[worst]:.4g}, not by "
+        f"{expected[worst]:.4g}",
+    )
+
+
+def adaptation_is_told(trial: _Map, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """`adapts` is true where a response changes a request, and only there: a map that says no is compared as no adaptation."""
+    changed, adapts = float(np.abs(trial.impulse_response).max()), trial.deformation.adapts
+    hold(
+        changed > 0 if trial.linear else adapts or changed == 0,
+        f"`adapts` is {str(adapts).lower()}, but an error of the response changes the request by {changed:.3g} per unit",
+    )
+
+
+def leak_is_told(trial: _Map, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """An error changes the next request by the effective gain times 1 - `leak` times 1 - `error_pole`."""
+    if not trial.linear:
+        return
+    first, gain, facts = (
+        float(trial.impulse_response[0]),
+        trial.deformation.effective_gain(),
+        trial.deformation.iteration,
+    )
+    expected = -gain * (1 - facts.leak) * (1 - facts.error_pole)
+    hold(
+        abs(first - expected) <= _SAME * abs(gain),
+        f"its leak is {facts.leak:g}, its error_pole {facts.error_pole:g} and its gain {gain:.4g}, but an error of one changes the "
+        f"next request by {first:.4g} and not by {expected:.4g}: limits of its gain would be those of another map",
+    )
+
+
 ANY = (frozen_value, derivatives_are_finite, gain_can_be_set, graphs_agree)
-LAWS = (
+STEPS = (
     frozen_value,
     fixed_point_stays,
     derivatives_are_finite,
     first_step_is_effective_gain,
     gain_can_be_set,
-    contraction_is_predicted,
     secant_is_bounded,
     only_desired_is_fixed,
     step_is_bounded,
     graphs_agree,
     nan_shows,
 )
-
-
-def _positive_definite(generator: np.random.Generator, size: int) -> Array:
-    factor = generator.normal(size=(size, size))
-    return np.asarray(factor @ factor.T + 0.5 * size * np.eye(size))
-
-
-def _measured_factor(trial: _Trial, plant: Array, mass: Array, generator: np.random.Generator) -> float:
-    """Mean shrinking of the request in the mass norm, where J is normal, on the plant f(r) = J r with desired 0."""
-    zero = np.zeros(trial.size)
-    small = 1e-6 * trial.amplitude
-    request, logarithms = trial.vector(generator), []
-    for _ in range(400):
-        request *= small / np.sqrt(request @ mass @ request)
-        next_request = trial(request, plant @ request, zero)
-        logarithms.append(0.5 * np.log(next_request @ mass @ next_request) - np.log(small))
-        request = next_request
-    later = logarithms[200:]
-    hold(all(b >= a - 1e-6 for a, b in pairwise(later)), "the shrinking per cycle does not settle on a linear plant")
-    return float(np.exp(np.mean(later)))
+FACTS = (
+    inner_can_be_exchanged,
+    automatic_settings_are_chosen,
+    adaptation_is_told,
+    filter_and_pairing_are_told,
+    leak_is_told,
+    gain_is_proportional_to_its_field,
+    exact_model_is_left_alone,
+    shown_is_remembered,
+)
+LAWS = (*STEPS, *FACTS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -70,32 +70,31 @@ class Trial:
     tolerance: float  # stationarity below which it calls a plan OK
     calls: int  # calls within which it must solve a small problem
 
+    def _task(self, nonlinearity: float, **limits: dict[str, tuple[float, float]]) -> TrialHorizon:
+        return TrialHorizon(self.optimiser, self.calls, _oscillator(nonlinearity), Limits(**limits))  # type: ignore[arg-type]
+
     @cached_property
     def linear(self) -> TrialHorizon:
         """A linear model without limits."""
-        return self._task(0.0, Limits())
+        return self._task(0.0)
 
     @cached_property
     def bounded(self) -> TrialHorizon:
         """A linear model with limits of the input that bind."""
-        return self._task(0.0, Limits(inputs={"u": (-BOUND, BOUND)}))
+        return self._task(0.0, inputs={"u": (-BOUND, BOUND)})
 
     @cached_property
     def nonlinear(self) -> TrialHorizon:
         """A nonlinear model without limits."""
-        return self._task(1.0, Limits())
+        return self._task(1.0)
 
     @cached_property
     def impossible(self) -> TrialHorizon:
         """A limit that no input can keep in the first stages."""
-        return self._task(0.0, Limits(inputs={"u": (-BOUND, BOUND)}, states={"y": (-CORRIDOR, CORRIDOR)}))
-
-    def _task(self, nonlinearity: float, limits: Limits) -> TrialHorizon:
-        return TrialHorizon(self.optimiser, self.calls, _oscillator(nonlinearity), limits)
+        return self._task(0.0, inputs={"u": (-BOUND, BOUND)}, states={"y": (-CORRIDOR, CORRIDOR)})
 
 
-@dataclass(frozen=True, eq=False)
-class TrialPlan:
+class TrialPlan(NamedTuple):
     """The result of the last of some calls."""
 
     state: Array  # first state
@@ -182,14 +181,11 @@ class TrialHorizon:
         return TrialPlan(state, inputs, diagnostics[:, 0], next_memory[:, 0], calls)
 
     @cached_property
-    def cost(self) -> Quadratic:
-        """Squares of state and input, ended by the Riccati equation's weight."""
-        return Quadratic(states=_WEIGHTS, effort={"u": _EFFORT}, terminal=LQRTerminal())
-
-    @cached_property
     def _posed(self) -> Posed:
-        horizon, start = Horizon(STAGES, STEP), {"y": 0.0}
-        return posed(Problem(self.plant, _REST, start, STEP, STEP, limits=self.limits, horizon=horizon, cost=self.cost))
+        """Squares of state and input, ended by the Riccati equation's weight."""
+        horizon, rest = Horizon(STAGES, STEP), Trajectory(lambda t: {"y": 0 * t})
+        cost = Quadratic(states=_WEIGHTS, effort={"u": _EFFORT}, terminal=LQRTerminal())
+        return posed(Problem(self.plant, rest, {"y": 0.0}, STEP, STEP, limits=self.limits, horizon=horizon, cost=cost))
 
     @property
     def ocp(self) -> OptimalControl:
@@ -259,9 +255,6 @@ class TrialHorizon:
             slope[0, stage] = (ends[0] - ends[1]) / (2 * step)
         move = slope / (STEP * self.ocp.curvature[0])
         return float(np.abs(inputs - np.clip(inputs - move, self.ocp.input_lower, self.ocp.input_upper)).max())
-
-
-_REST = Trajectory(lambda t: {"y": 0 * t})
 
 
 def _oscillator(nonlinearity: float) -> Plant:

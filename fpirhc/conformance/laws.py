@@ -53,13 +53,10 @@ def within(value: Any, bound: float) -> bool:
     return bool(np.all(np.abs(np.asarray(value, dtype=float)) <= bound))
 
 
-def is_a_frozen_value(subject: Any) -> None:
-    """A method is a frozen dataclass that can be hashed, compared, copied, and described as plain data."""
-    name = type(subject).__name__
-    hold(
-        is_dataclass(subject) and not isinstance(subject, type),
-        f"{name} is no dataclass; write @dataclass(frozen=True)",
-    )
+def frozen_value(trial: Any, generator: np.random.Generator) -> None:  # noqa: ARG001
+    """A member is a frozen dataclass that can be hashed, compared, copied, and described as plain data."""
+    subject = next(iter(vars(trial).values()))  # the first field of every trial
+    hold(is_dataclass(subject), f"{type(subject).__name__} is no dataclass; write @dataclass(frozen=True)")
     for field in fields(subject):
         try:
             setattr(subject, field.name, getattr(subject, field.name))

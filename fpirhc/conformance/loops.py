@@ -26,7 +26,6 @@ from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Layout
 from fpirhc.task.exogenous import really_known
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
@@ -87,15 +86,10 @@ class Trial:
     @cached_property
     def exact(self) -> Problem:
         """The problem with an exact model, ideal sensors and no disturbance."""
-        plant = self.problem.plant
-        parameters = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
-        return replace(
-            self.problem,
-            plant=replace(plant, parameters=parameters),
-            disturbances={},
-            sensing=Sensing(),
-            signals=really_known(self.problem.signals),
-        )
+        plant, signals = self.problem.plant, really_known(self.problem.signals)
+        exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
+        known = replace(plant, parameters=exact)
+        return replace(self.problem, plant=known, disturbances={}, sensing=Sensing(), signals=signals)
 
     def simulated(self, problem: Problem) -> Run:
         """A run of the controller, in CasADi's virtual machine."""
@@ -110,20 +104,13 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Cycle:
-    """What a controller says in one cycle.
+    """What a controller says in one cycle: its signals by name, and the memory before the next one."""
 
-    Args:
-        trace: its signals, one column.
-        layout: of the trace.
-        memory: before the next cycle.
-    """
-
-    trace: Array
-    layout: Layout
+    signals: dict[str, Array]
     memory: Array
 
     def __getitem__(self, name: str) -> Array:
-        return np.asarray(self.trace[self.layout.slice(name)])
+        return self.signals[name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +143,10 @@ class Replay:
         """The cycle k of the run from a memory, with other values of what is read where they are given by name."""
         model = self.controller.plant_model(self.problem)
         seen = {"time": self.run.time[k], "parameters": model.parameters(model.plant), **instead}
-        names = self._composite.reads.names
-        read = [seen[n] if n in seen else self.run[n][k] for n in names]
+        read = [seen[n] if n in seen else self.run[n][k] for n in self._composite.reads.names]
         after, trace, _ = self._evaluator(memory, *read)
-        return Cycle(trace.copy(), self._composite.trace, after.copy())
+        said = self._composite.trace
+        return Cycle({name: trace[said.slice(name)].copy() for name in said.names}, after.copy())
 
     @cached_property
     def _composite(self) -> Composite:
@@ -179,17 +166,16 @@ def spelled_by_states(problem: Problem) -> Problem | None:
     own = bool(problem.limits.states) or problem.signals or problem.reality is not None
     if plant.outputs or plant.step is not None or own:
         return None
-    elements = plant.state.elements
+    elements, (x, u, p) = plant.state.elements, plant.symbols()
     names = {e: f"z{k}" for k, e in enumerate(reversed(elements))}
     units = dict(zip(elements, plant.state.units, strict=True))
-    x, u, p = plant.symbols()
     rates = ca.Function("rates", [x, u, p], [plant.equations.forced_rate(x, u, p, ca.DM.zeros(len(plant.names)))])
 
     def moved(z: Any, inputs: Any, values: Any) -> dict[str, Any]:
-        state = ca.vertcat(*(-z[names[e]] for e in elements))
-        slopes = rates(
-            state, ca.vertcat(*(inputs[n] for n in plant.inputs)), ca.vertcat(*(values[n] for n in plant.parameters))
+        numbers = (
+            ca.vertcat(*(one[n] for n in some)) for one, some in ((inputs, plant.inputs), (values, plant.parameters))
         )
+        slopes = rates(ca.vertcat(*(-z[names[e]] for e in elements)), *numbers)
         return {names[e]: -slopes[k] for k, e in enumerate(elements)}
 
     other = Plant.of_states(

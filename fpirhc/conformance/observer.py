@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.conformance.laws import frozen_value, hold, keep, within
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.controllers.contract import Controller
@@ -18,17 +18,12 @@ from fpirhc.controllers.path import observed_model
 from fpirhc.controllers.wrappers.exact_model import ExactModel
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, unobservable, values_of
-from fpirhc.sensing.sensing import Sensing, Sensor
+from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
-from fpirhc.simulation.step_arguments import raw_measurements
-from fpirhc.simulation.stepper import Stepper
-from fpirhc.simulation.trials import without_warning
-from fpirhc.status import Status
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.dead_time import DeadTime
-from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.linear_law import Exponential
 
@@ -36,7 +31,6 @@ Array = npt.NDArray[Any]
 
 _CYCLES = 20
 _SAME = 1e-9  # of the largest state
-_NOISE = 1e-3  # of the first measured values' size
 _OTHER = 1.01  # factor of exact parameters
 _UNSEEN = 1e-6  # part of a direction that counts as none
 _LONG, _WRONG = 400, 0.1  # samples, and first error beside the largest state
@@ -76,25 +70,12 @@ class _Trial:
     seed: int
 
     @cached_property
-    def noisy(self) -> Problem:
-        """The problem with noise on all that is measured."""
-        sensing, plant = self.problem.sensing, self.problem.plant
-        sensors = {name: Sensor(noise=Noise(_NOISE)) for name in sensing.measures(plant)}
-        return replace(self.problem, sensing=replace(sensing, sensors=sensors))
-
-    @cached_property
-    def noisy_run(self) -> Run:
-        """With a wrong model, in the virtual machine."""
-        return simulate(self.noisy, self.controller, seed=self.seed, compiled=False)
+    def cycle(self) -> Cycle:
+        return Cycle(self.observer, self.problem)
 
     def exact_run(self, problem: Problem) -> Run:
         """With the exact model."""
         return simulate(problem, ExactModel(self.controller), seed=self.seed, compiled=False)
-
-
-def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """An observer is a frozen value that can be hashed, copied and described."""
-    is_a_frozen_value(trial.observer)
 
 
 def facts_hold(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -121,30 +102,6 @@ def lives_in_the_time_of_the_samples(trial: _Trial, generator: np.random.Generat
     hold(within(error, _SAME * np.abs(true).max()), f"behind a late measurement it is off by {error:.3g}")
 
 
-def finite_under_noise(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """With a wrong model and noise on all that is measured every believed state is a number; skipped cycles would hide it."""
-    run = trial.noisy_run
-    finite = bool(np.isfinite(run["state"]).all() and (run["status"] == Status.OK).all())
-    hold(run.stop is None and finite, "under noise an estimated state is not finite")
-
-
-@without_warning()
-def one_step_with_the_controller(trial: _Trial, generator: np.random.Generator) -> None:
-    """Raw measurements of a run give its states bit by bit; a bad sample leaves finite numbers, and no correction."""
-    run = trial.noisy_run
-    measured = raw_measurements(run)
-    stepper = Stepper(trial.noisy, trial.controller, compiled=False, bounded=False)
-    memory, bad = stepper.start(), int(generator.integers(1, run.cycles))
-    for k in range(run.cycles):
-        if k == bad:
-            _, after = stepper.step_measured(float(run.time[k]), np.full(measured.shape[1], np.nan), memory)
-            wrong = [stepper.memory.columns[i] for i in np.flatnonzero(~np.isfinite(after))]
-            hold(not wrong, f"a sample of NaN reaches {wrong} in the memory")
-        _, memory = stepper.step_measured(float(run.time[k]), measured[k], memory)
-        same = np.array_equal(stepper.trace()["state"], run["state"][k])
-        hold(same, f"in cycle {k} a stepper estimates another state than the run")
-
-
 def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) -> None:
     """Prediction and correction do not depend on the exact parameters, which nobody knows of a real plant."""
     plant = trial.problem.plant
@@ -160,8 +117,7 @@ def exact_parameters_are_unknown(trial: _Trial, generator: np.random.Generator) 
 
 def old_samples_do_nothing(trial: _Trial, generator: np.random.Generator) -> None:
     """A sample from before the run, which a dead time shows again, corrects (`counts` = 0) and moves (`moves` = 0) nothing."""
-    cycle = Cycle(trial.observer, trial.problem)
-    sample = replace(cycle.sample(generator), counts=0.0)
+    cycle, sample = trial.cycle, replace(trial.cycle.sample(generator), counts=0.0)
     change = float(np.abs(cycle(sample)[0] - cycle(replace(sample, measured=sample.measured + 1.0))[0]).max())
     hold(
         change == 0,
@@ -202,8 +158,6 @@ LAWS = (
     wrong_start_is_corrected,
     right_model_believes_what_is,
     lives_in_the_time_of_the_samples,
-    finite_under_noise,
-    one_step_with_the_controller,
 )
 
 
@@ -219,12 +173,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Cycle:
-    """An observer for a problem: (memory, sample) -> (believed state, memory).
-
-    Args:
-        observer: the observer.
-        problem: whose plant is the model; its start is where the observer begins.
-    """
+    """An observer of a problem, whose plant is the model: (sample, memory) -> (believed state, memory)."""
 
     observer: StateObserver
     problem: Problem

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -36,7 +35,7 @@ def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float
     mistakes = Mistakes("box")
     mistakes.unknown("state or input", box or {}, [*plant.state.elements, *input_columns(plant)])
     mistakes.raise_if_any()
-    keep(plant, _Trial(plant, dict(box or {})), LAWS, seed)
+    keep(plant, _Trial(plant, box or {}), LAWS, seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,32 +43,22 @@ class _Trial:
     """A plant with the box from which its points are drawn."""
 
     plant: Plant
-    box: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    box: Mapping[str, tuple[float, float]]
+
+    @property
+    def names(self) -> list[str]:
+        return [*self.plant.state.elements, *input_columns(self.plant)]
 
     @property
     def parameters(self) -> dict[str, np.ndarray]:
         return {"approximate": self.plant.approximate, "exact": self.plant.exact}
 
-    @cached_property
-    def invertible(self) -> bool:
-        """Whether as many coordinates are controlled as there are inputs."""
-        plant = self.plant
-        return plant.controlled is not None or len(plant.inputs) == len(plant.chains)
-
-    def points(self, generator: np.random.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
-        """States and inputs."""
-        return [
-            (self._drawn(self.plant.state.elements, generator), self._drawn(input_columns(self.plant), generator))
-            for _ in range(_POINTS)
-        ]
-
-    def where(self, x: np.ndarray, u: np.ndarray) -> str:
-        """A point in words."""
-        names = [*self.plant.state.elements, *input_columns(self.plant)]
-        return "at " + ", ".join(f"{n} = {v:.4g}" for n, v in zip(names, [*x, *u], strict=True))
-
-    def _drawn(self, names: tuple[str, ...], generator: np.random.Generator) -> np.ndarray:
-        return np.array([generator.uniform(*self.box.get(n, (-1.0, 1.0))) for n in names])
+    def points(self, generator: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray, str]]:
+        """States and inputs, and both in words."""
+        for _ in range(_POINTS):
+            z = np.array([generator.uniform(*self.box.get(n, (-1.0, 1.0))) for n in self.names])
+            where = "at " + ", ".join(f"{n} = {v:.4g}" for n, v in zip(self.names, z, strict=True))
+            yield z[: self.plant.state.size], z[self.plant.state.size :], where
 
 
 def _numbers(function: ca.Function, *arguments: Any) -> np.ndarray:
@@ -79,14 +68,12 @@ def _numbers(function: ca.Function, *arguments: Any) -> np.ndarray:
 def response_is_finite(trial: _Trial, generator: np.random.Generator) -> None:
     """The response is finite at every point of the box, with the approximate and with the exact parameters."""
     plant = trial.plant
-    for x, u in trial.points(generator):
+    for x, u, where in trial.points(generator):
         for which, p in trial.parameters.items():
             response = _numbers(plant.equations.response, x, u, p)
             for name, value in zip(plant.names, response, strict=True):
-                hold(
-                    bool(np.isfinite(value)),
-                    f"the response of '{name}' ({which} parameters) is {value} {trial.where(x, u)}",
-                )
+                finite = bool(np.isfinite(value))
+                hold(finite, f"the response of '{name}' ({which} parameters) is {value} {where}")
 
 
 def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -111,16 +98,16 @@ def both_parameter_sets_enter(trial: _Trial, generator: np.random.Generator) -> 
 def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
     """Building the response once more gives the same response: it has no random numbers and no memory."""
     again = replace(trial.plant)
-    for x, u in trial.points(generator):
+    for x, u, where in trial.points(generator):
         one, other = (_numbers(p.equations.response, x, u, p.exact) for p in (trial.plant, again))
-        hold(np.array_equal(one, other), f"built twice, it gives {one} and then {other} {trial.where(x, u)}")
+        hold(np.array_equal(one, other), f"built twice, it gives {one} and then {other} {where}")
 
 
 def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> None:
     """dx/dt holds the next derivative of every coordinate, in the highest place the response plus the forcing."""
     plant = trial.plant
     elements = plant.state.elements
-    for x, u in trial.points(generator):
+    for x, u, _ in trial.points(generator):
         forcing = generator.normal(size=len(plant.names))
         if plant.steps > 1:  # a forcing of a map acts in each of its steps, and moves the state of the later ones
             forcing[:] = 0
@@ -141,11 +128,10 @@ def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
     z = ca.vertcat(x, u)
     slope = ca.Function("slope", [z, p], [ca.densify(ca.jacobian(plant.equations.response(x, u, p), z))])
     split = plant.state.size
-    names = [*plant.state.elements, *plant.input.elements]
-    for x0, u0 in trial.points(generator):
+    for x0, u0, where in trial.points(generator):
         at = np.concatenate([x0, u0])
         slopes = np.asarray(slope(at, plant.exact).full())
-        for k, name in enumerate(names):
+        for k, name in enumerate(trial.names):
             step = 1e-5 * max(1.0, abs(at[k]))
             ends = [at + side * step * np.eye(at.size)[k] for side in (1, -1)]
             up, down = (_numbers(plant.equations.response, end[:split], end[split:], plant.exact) for end in ends)
@@ -155,16 +141,16 @@ def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
             hold(
                 within(missed, _SLOPE * scale),
                 f"the derivative of the response by '{name}' is {slopes[:, k]}, central differences give {expected} "
-                f"{trial.where(x0, u0)}",
+                f"{where}",
             )
 
 
 def inverse_inverts(trial: _Trial, generator: np.random.Generator) -> None:
     """The input that the inverse finds for a response causes that response, with either parameter set."""
     plant = trial.plant
-    if not trial.invertible:
+    if plant.controlled is None and len(plant.inputs) != len(plant.chains):
         return
-    for x, u in trial.points(generator):
+    for x, u, where in trial.points(generator):
         for which, p in trial.parameters.items():
             wanted = _numbers(plant.equations.controlled_response, x, u, p)
             command = _numbers(plant.equations.inverse, x, wanted, p)
@@ -173,7 +159,7 @@ def inverse_inverts(trial: _Trial, generator: np.random.Generator) -> None:
             hold(
                 within(missed, _INVERSE * (1 + float(np.abs(wanted).max()))),
                 f"for the response {wanted} the inverse ({which} parameters) gives the input {command}, whose response is "
-                f"{got} {trial.where(x, u)}",
+                f"{got} {where}",
             )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.conformance.laws import hold, is_a_frozen_value, keep, within
+from fpirhc.conformance.laws import frozen_value, hold, keep, within
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.motion import places
@@ -95,18 +95,10 @@ class _Trial:
     def cycle(self) -> Composite:
         """The law and its update as one step (memory, state, target, nominal, warm_up, clipped, cut off, held)."""
         plant = self.plant
-        reads = Layout(
-            (
-                plant.state,
-                Signal("_target", plant.state.elements, plant.state.units),
-                plant.response_signal("nominal"),
-                scalar("warm_up"),
-                scalar("clipped"),
-                plant.response_signal("_cut_off"),
-                scalar("_held"),
-            )
-        )
+        target, cut = Signal("_target", plant.state.elements, plant.state.units), plant.response_signal("_cut_off")
+        offered = plant.state, target, plant.response_signal("nominal"), scalar("warm_up"), scalar("clipped"), cut
         blocks, delays = [self.law, self.update], self.tracking.delays(plant)
+        reads = Layout((*offered, scalar("_held")))
         return compose("tracking_cycle", reads, blocks, delays, outputs=("desired", "_target_error"))
 
     @cached_property
@@ -114,20 +106,13 @@ class _Trial:
         return Evaluator(self.cycle.function)
 
     def __call__(
-        self,
-        memory: Array,
-        state: Array,
-        target: Array,
-        nominal: Array,
-        *,
-        warm_up: float = 1.0,
-        cut_off: Array | None = None,
+        self, memory: Array, state: Array, target: Array, nominal: Array, warm_up: float = 1.0, cut: Array | None = None
     ) -> tuple[Array, Array, Array]:
         """(memory of the next cycle, desired response, error to the target)."""
-        cut = np.zeros(len(self.orders)) if cut_off is None else cut_off
+        cut = np.zeros(len(self.orders)) if cut is None else cut
         clipped = float(np.any(cut != 0))
-        next_memory, _, desired, error = self.evaluator(memory, state, target, nominal, warm_up, clipped, cut, 0.0)
-        return next_memory, desired, error
+        after, _, desired, error = self.evaluator(memory, state, target, nominal, warm_up, clipped, cut, 0.0)
+        return after, desired, error
 
     def start(self) -> Array:
         return self.cycle.memory.start()
@@ -151,49 +136,28 @@ def _ideal(orders: tuple[int, ...]) -> Plant:
     return Plant(dict.fromkeys(names, "m"), inputs, {}, response, dict(zip(names, orders, strict=True)))
 
 
-def frozen_value(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
-    """A tracking law is a frozen value that can be hashed, copied and described."""
-    is_a_frozen_value(trial.tracking)
-
-
 def only_declared_signals(trial: _Trial, generator: np.random.Generator) -> None:  # noqa: ARG001
     """Both blocks read signals that are offered or remembered, and write exactly the declared signals."""
     delays = trial.tracking.delays(trial.plant)
-    remembered = {d.now.name for d in delays}
-    law, update = trial.law, trial.update
+    law, update, offered = trial.law, trial.update, {*_OFFERED, *(d.now.name for d in delays)}
     for name in ("_target_error", "desired"):
         hold(name in law.writes, f"law() writes {list(law.writes.names)}, but not '{name}'")
         size = law.writes[name].size
         hold(size == len(trial.orders), f"law() writes '{name}' with {size} entries, expected {len(trial.orders)}")
-    _reads_only(law, {*_OFFERED, *remembered}, "law()")
-    _reads_only(update, {*_OFFERED, *remembered, *law.writes.names, *_LIMITED}, "update()")
-    written = {*law.writes.names, *update.writes.names}
     for delay in delays:
-        hold(delay.source in written, f"delays() carries '{delay.source}' on, which neither law() nor update() writes")
-    for block, what in ((law, "law()"), (update, "update()")):
-        _writes_what_it_declares(block, what)
-
-
-def _reads_only(block: Block, allowed: set[str], what: str) -> None:
-    foreign = sorted(set(block.reads.names) - allowed)
-    hold(not foreign, f"{what} reads {foreign}, which are not offered; it may read {sorted(allowed)}")
-
-
-def _writes_what_it_declares(block: Block, what: str) -> None:
-    read: set[str] = set()
-    matrix = kind(block.opaque)
-    symbols = {s.name: matrix.sym(s.name, s.size) for s in [*block.reads.signals, *block.memory.signals]}
-
-    class Reading(Signals):
-        def __getattr__(self, name: str) -> Expression:
-            read.add(name)
-            return symbols.get(name, matrix(0))
-
-    written = set(block.step(Reading({})))
-    unknown = sorted(read - set(symbols))
-    hold(not unknown, f"the step of {what} reads {unknown}, which the block does not declare")
-    expected = {*block.writes.names, *(f"{m}_next" for m in block.memory.names)}
-    hold(written == expected, f"the step of {what} gives {sorted(written)}, but the block declares {sorted(expected)}")
+        written = delay.source in {*law.writes.names, *update.writes.names}
+        hold(written, f"delays() carries '{delay.source}' on, which neither law() nor update() writes")
+    for block, allowed, what in (
+        (law, offered, "law()"),
+        (update, {*offered, *law.writes.names, *_LIMITED}, "update()"),
+    ):
+        foreign = sorted(set(block.reads.names) - allowed)
+        hold(not foreign, f"{what} reads {foreign}, which are not offered; it may read {sorted(allowed)}")
+        matrix = kind(block.opaque)
+        symbols = {s.name: matrix.sym(s.name, s.size) for s in [*block.reads.signals, *block.memory.signals]}
+        gives = set(block.step(Signals(symbols)))
+        expected = {*block.writes.names, *(f"{m}_next" for m in block.memory.names)}
+        hold(gives == expected, f"the step of {what} gives {sorted(gives)}, but the block declares {sorted(expected)}")
 
 
 def error_is_target_minus_state(trial: _Trial, generator: np.random.Generator) -> None:
@@ -224,33 +188,27 @@ def feedback_is_what_it_does(trial: _Trial, generator: np.random.Generator) -> N
         feedback = trial.tracking.feedback(order)
         if feedback is None:
             continue
+        gains, elements = feedback.gains, trial.plant.state.elements
+        own = [elements.index(trial.plant.names[k] + "'" * s) for s in range(order)]
+        hold(len(gains) == order + feedback.integral, f"it has {len(gains)} gains for order {order}")
         for _ in range(_TRIALS):
             state, target, nominal = trial.motion(generator)
             memory, desired, error = trial(trial.start(), state, target, nominal)
-            name = trial.plant.names[k]
-            places = [trial.plant.state.elements.index(name + "'" * s) for s in range(order)]
-            expected = np.dot(feedback.gains[-order:], (target - state)[places])
-            scale = 1 + float(np.abs(feedback.gains).max() * np.abs(target - state).max())
-            hold(
-                len(feedback.gains) == order + feedback.integral
-                and within(desired[k] - nominal[k] - expected, _EXACT * scale),
-                f"with the integral at zero its feedback for order {order} is {desired[k] - nominal[k]:.6g}, its gains "
-                f"{feedback.gains} give {expected:.6g}",
-            )
             _, later, _ = trial(memory, state, state, nominal)
-            summed = feedback.gains[0] * trial.period * error[k] if feedback.integral else 0.0
-            hold(
-                within(later[k] - nominal[k] - summed, _EXACT * scale),
-                f"after one cycle of the error {error[k]:.4g} its integral gives {later[k] - nominal[k]:.6g} for order {order}, "
-                f"its gains give {summed:.6g}",
-            )
+            summed = gains[0] * trial.period * error[k] if feedback.integral else 0.0
+            scale = 1 + float(np.abs(gains).max() * np.abs(target - state).max())
+            for what, given, told in (
+                ("with the integral at zero", desired[k], np.dot(gains[-order:], (target - state)[own])),
+                (f"one cycle after the error {error[k]:.4g}", later[k], summed),
+            ):
+                hold(
+                    within(given - nominal[k] - told, _EXACT * scale),
+                    f"{what} its feedback for order {order} is {given - nominal[k]:.6g}, its gains {gains} give {told:.6g}",
+                )
         if feedback.rate is not None:
-            degree = len(feedback.gains)
-            modes = [math.comb(degree, s) * feedback.rate ** (degree - s) for s in range(degree)]
-            hold(
-                np.allclose(feedback.gains, modes, rtol=1e-9),
-                f"its gains {feedback.gains} are not those of the rate {feedback.rate:g}",
-            )
+            modes = [math.comb(len(gains), s) * feedback.rate ** (len(gains) - s) for s in range(len(gains))]
+            same = np.allclose(gains, modes, rtol=1e-9)
+            hold(same, f"its gains {gains} are not those of the rate {feedback.rate:g}")
 
 
 def start_forgets(trial: _Trial, generator: np.random.Generator) -> None:
@@ -270,21 +228,16 @@ def error_decays(trial: _Trial, generator: np.random.Generator) -> None:
     """On an ideal plant that starts at rest the error goes to zero, as fast as the law promises."""
     names = trial.plant.names
     first = {name: float(generator.uniform(0.5, 2.0) * generator.choice([-1, 1])) for name in names}
-    problem = Problem(
-        plant=trial.plant,
-        reference=Trajectory(lambda t: dict.fromkeys(names, 0 * t)),
-        start=first,
-        period=trial.period,
-        duration=trial.duration,
-    )
+    rest = Trajectory(lambda t: dict.fromkeys(names, 0 * t))
+    problem = Problem(trial.plant, rest, first, period=trial.period, duration=trial.duration)
     run = simulate(problem, ComputedTorque(trial.tracking), seed=0, compiled=False)
     hold(run.stop is None, f"the loop on an ideal plant diverges: {run.stop}")
     for name, order in zip(names, trial.orders, strict=True):
         share = run[f"error.{name}"] / -first[name]
-        rest = float(np.abs(share[-1]))
+        left = float(np.abs(share[-1]))
         hold(
-            within(rest, trial.left),
-            f"of an error on an ideal plant of order {order} the share {rest:.3g} is left after {trial.duration:g} s, "
+            within(left, trial.left),
+            f"of an error on an ideal plant of order {order} the share {left:.3g} is left after {trial.duration:g} s, "
             f"more than {trial.left:g}",
         )
         if trial.decay is not None:
@@ -303,7 +256,7 @@ def clipping_freezes(trial: _Trial, generator: np.random.Generator) -> None:
     cycles = round(trial.duration / trial.period)
     memory, halfway, cut_off = trial.start(), np.zeros(0), (target - state)[places(trial.plant, 0)]
     for cycle in range(cycles + 1):
-        memory, desired, _ = trial(memory, state, target, nominal, warm_up=float(cycle > 0), cut_off=cut_off)
+        memory, desired, _ = trial(memory, state, target, nominal, warm_up=float(cycle > 0), cut=cut_off)
         if cycle == cycles // 2:
             halfway = desired
     change, size = np.abs(desired - halfway), np.abs(desired - nominal) + _EXACT
