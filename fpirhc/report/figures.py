@@ -92,16 +92,22 @@ def contraction_figures(comparison: Comparison) -> list[Drawing]:
     axes = [figure.subplots() for figure in figures]
     for axis, ((name, scale), same) in zip(axes, groups.items(), strict=False):
         _draw_factor(axis, name, scale, same, colours)
+    units, cycles = {e.run.unit(f"desired.{n}") for e in entries for n in e.run.layout["desired"].elements}, 0
     for entry in entries:
         apart = (entry.run["realised"][1:] - entry.run["desired"][:-1])[:_CYCLES]
+        cycles = max(cycles, len(apart))
+        if len(units) > 1:  # of different units: shares of their own ranges
+            apart = apart / np.maximum(np.ptp(entry.run["desired"], axis=0), 1e-300)
         size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
         shown = np.where((size > 0) & np.isfinite(size), size, np.nan)
         axes[-1].semilogy(
             np.arange(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1
         )
     for axis in axes[-1:]:
-        caption_axes(axis, "control cycle", "|realised - desired|, response units")
-        axis.set_title("The response error in the first cycles", fontsize=10, y=1.0)
+        unit = f"[{units.pop()}]" if len(units) == 1 else "of the ranges of desired"
+        caption_axes(axis, "control cycle", literal(f"|realised - desired| {unit}"))
+        span = f"{cycles} cycles, {cycles * entries[0].run.period:.3g} {comparison.time_unit}"
+        axis.set_title(literal(f"The response error in the first {span}"), fontsize=10, y=1.0)
         draw_legend(axis)
     return figures
 
@@ -138,5 +144,5 @@ def _draw_factor(
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
     caption_axes(axis, literal(gain), "max|1 - a lambda|")
-    axis.set_title("Contraction factor per cycle: o predicted, x measured", fontsize=10, y=1.0)
+    axis.set_title("Contraction per cycle where errors count: o predicted, x measured", fontsize=10, y=1.0)
     draw_legend(axis)

@@ -76,9 +76,9 @@ def render(comparison: Comparison) -> str:
         own=own,
         motions=motions,
         contraction=[
-            Image(one.address, "contraction factor or response error") for one in contraction_figures(comparison)
+            Image(one.address, f"{one.axes[0].get_title()}: {one.axes[0].get_ylabel()}")
+            for one in contraction_figures(comparison)
         ],
-        contracts=[f"{e.name}: {e.contraction.report.text}" for e in comparison.entries if e.contraction],
         in_force=changed,
     )
 

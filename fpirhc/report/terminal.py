@@ -85,12 +85,14 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
         if table.rows:
             narrow = replace(table.narrow, title="" if table.title == view.title else table.title)
             show_table(narrow) if verbose else show_brief(narrow)
-    notes = [text for texts in view.lists.values() for text in texts]
-    for text in notes if verbose else ():
-        say(text)
+    for heading, texts in view.lists.items() if verbose else ():
+        say(heading, "bold")
+        for text in texts:
+            say(f"- {text}")
     for name, why in view.skipped.items():
         say(f"skipped {name}: {why}")
-    more = "" if verbose else f" ({len(notes)} notes there, or by --verbose)" if notes else " (more by --verbose)"
+    notes = sum(map(len, view.lists.values()))
+    more = "" if verbose else f" ({notes} notes there, or by --verbose)" if notes else " (more by --verbose)"
     say(f"report: {report}", more=more, wrap=False)
 
 

@@ -91,9 +91,7 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> 
                 f"metric '{metric.name}' has a number for every {metric.by}; give one: '{metric.name}.NAME'"
             )
         if metric.by == "term" and (problem.cost is None or problem.horizon is None):
-            raise InvalidValue(
-                f"metric '{name}' needs Problem(horizon=..., cost=...), and this problem lacks one of them"
-            )
+            raise InvalidValue(f"metric '{name}' needs Problem(horizon=..., cost=...), and this problem lacks one")
         elements = {"coordinate": followed_units(problem.plant), "input": problem.plant.inputs}.get(metric.by or "", ())
         if elements and element not in elements:
             raise InvalidName(f"metric '{name}' is unknown.{nearest(name, [metric.key(one) for one in elements])}")

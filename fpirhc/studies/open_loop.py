@@ -69,9 +69,7 @@ class Certificate:
 
     def _repr_html_(self) -> str:
         """The bounds as a table, for notebooks."""
-        note = (
-            "" if self.factor < 1 else "Nothing is known about the distance to the optimum: the factor is not below 1."
-        )
+        note = "" if self.factor < 1 else "The distance to the optimum is not known: the factor is not below 1."
         return table("Certificate", ("", "value"), self._facts(), [note])
 
     def _facts(self) -> list[tuple[str, str]]:

@@ -48,7 +48,12 @@ def test_report_is_self_contained_and_small(written):
     assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", whole)
     assert "@import" not in whole
     assert [p.name for p in written.parent.iterdir()] == ["report.html"]
-    assert whole.count("alt='contraction factor or response error'") == 2
+    pictures = re.findall(r"alt='(Contraction per cycle.*?|The response error in the first .*?)[:']", whole)
+    assert pictures == [
+        "Contraction per cycle where errors count",
+        "The response error in the first 150 cycles, 0.15 s",
+    ]
+    assert "0.15 s: |realised - desired| [m/s^2]'" in whole
     marks = ("id='verdict'", "<table>", "<h2>Signals over time", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
     places = [whole.index(mark) for mark in marks]
     assert places == sorted(places)

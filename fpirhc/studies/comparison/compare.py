@@ -17,6 +17,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
+from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
@@ -32,7 +33,7 @@ from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
-from fpirhc.studies.comparison.verdict import Finding, Outcome, Yardstick, findings
+from fpirhc.studies.comparison.verdict import NULL, Finding, Outcome, Yardstick, findings
 from fpirhc.studies.objective import objective
 from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
 from fpirhc.summary import Column, Table, in_percent, written_out
@@ -59,9 +60,8 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            mistakes.add(
-                f"controller '{name}': {error}" + ("" if best is None else f"; recommended effective gain {best:.3g}")
-            )
+            advice = "" if best is None else f"; recommended effective gain {best:.3g}"
+            mistakes.add(f"controller '{name}': {error}{advice}")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()
@@ -76,6 +76,13 @@ class Contraction:
     measured: float
     report: ContractionReport
     spectrum: Spectrum
+
+    def said(self, run: Run) -> str:
+        """What is admissible, and how near every response came to what was desired, root mean square of the whole run."""
+        near = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1]) ** 2, axis=0))
+        units = (with_space(run.unit(f"desired.{n}")) for n in run.layout["desired"].elements)
+        each = (f"{n} {written_out(v)}{u}" for n, v, u in zip(run.layout["desired"].elements, near, units, strict=True))
+        return f"{self.report.text} Measured factor {written_out(self.measured)}; realised - desired, rms: {', '.join(each)}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,15 +141,11 @@ class Comparison(Study):
     @property
     def view(self) -> View:
         shown = columns([e.metrics for e in self.entries], in_report)
-        best = {
-            c: c.best([c.number(e.metrics) for e in self.entries if e.run.stop is None])
-            for c in shown
-            if c.metric.headline
-        }
+        done = [e.metrics for e in self.entries if e.run.stop is None]
+        best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.headline}
         heads = [Column(c.heading, c.short if c.metric.headline else None) for c in shown]
-        table = Table(
-            self.title, [Column("controller"), *heads, Column("cycle [us]", "cycle us"), Column("status", left=True)]
-        )
+        heads = [Column("controller"), *heads, Column("cycle [us]", "cycle us"), Column("status", left=True)]
+        table = Table(self.title, heads)
         for e in self.entries:
             marked = [k for k, c in enumerate(shown, 1) if best.get(c) is not None and c.number(e.metrics) == best[c]]
             texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
@@ -153,9 +156,10 @@ class Comparison(Study):
         about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
         notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
-        return self.viewed(
-            sentences, about, (table.filled,), self._facts(), lists={"Notes": notes}, skipped=self.skipped
-        )
+        lists = {"Notes": notes, "Flags": [f"{f.pair[1]}: {f.flags}" for f in self.findings if f.pair and f.flags]}
+        lists[f"Null tests: {NULL}"] = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
+        lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run)}" for e in self.entries if e.contraction]
+        return self.viewed(sentences, about, (table.filled,), self._facts(), lists=lists, skipped=self.skipped)
 
     def _facts(self) -> dict[str, Any]:
         rows = {
@@ -309,14 +313,14 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     noise = np.random.default_rng(run.seed).standard_normal(quiet["realised"].shape) * np.ptp(quiet["realised"], axis=0)
     other = bench.run(bias=NOISE * noise, seed=run.seed)
     before, after = bench.errors(quiet), bench.errors(other)
-    moves = bench.steps(other) / max(bench.steps(quiet), 1e-300)
+    moves = float((bench.moves(other) / np.maximum(bench.moves(quiet), 1e-300)).max())
     ratios = {n: after[n] / max(e, 1e-300) for n, e in before.items()}
     name = max(ratios, key=ratios.__getitem__)
-    return Finding(
-        f"The response of {run.controller} is measured without noise: with noise of {in_percent(NOISE)} of its range the rms error "
-        f"of {name} is {written_out(ratios[name])} times as large, and the command moves {written_out(moves)} times as much.",
-        ratios=ratios,
+    text = f"The response of {run.controller} is measured without noise: white noise of {in_percent(NOISE)} of its range, rms, "
+    text += (
+        f"multiplies the rms error of {name} by {written_out(ratios[name])} and the total variation of the command by "
     )
+    return Finding(f"{text}{written_out(moves)} ({bench.since(quiet.cycles)}).", ratios=ratios)
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one

@@ -21,7 +21,7 @@ from fpirhc.simulation.metrics.entries.errors import rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
 from fpirhc.studies.objective import Objective
-from fpirhc.summary import written_out
+from fpirhc.summary import in_percent, in_words
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ class Finding:
     outcome: Outcome | None = None  # of the pair that it is about; None for a remark
     pair: tuple[str, str] | None = None  # names without and with adaptation
     ratios: Mapping[str, float] = field(default_factory=dict)  # error with adaptation over that without, largest first
+    flags: str = ""  # what all flags measured
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
@@ -76,9 +77,8 @@ class Yardstick:
     scales: Mapping[str, float]  # range of the reference, its start included; 1 where it does not move
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
     moving: frozenset[str]  # coordinates whose references move by themselves
-    resting: Mapping[
-        str, float
-    ]  # size of the set-point; where that is zero or disturbances act, that of the movement left alone
+    resting: Mapping[str, float]  # size of the set-point, or that of the movement left alone where disturbances act
+    span: str  # of time in which errors count
 
     @staticmethod
     def of(problem: Problem, seed: int) -> Yardstick:
@@ -95,14 +95,12 @@ class Yardstick:
         wide = {n: high - low for n, (low, high) in problem.limits.states.items() if math.isfinite(high - low)}
         held = {n: weights[n] ** -0.5 if weights.get(n, 0) > 0 else wide.get(n, 1.0) for n in places}
         scales = {n: size if size > small[n] else held[n] for n, size in both.items()}
-        return Yardstick(scales, alone, frozenset(n for n in places if own[n] > small[n]), resting)
+        span = f"t = {problem.measure_from:.4g} to {problem.duration:.4g}{with_space(problem.time_unit)}"
+        return Yardstick(scales, alone, frozenset(n for n in places if own[n] > small[n]), resting, span)
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
         return entry.errors[name] > max(self.scales[name], 0.0 if name in self.moving else self.resting[name])
-
-
-# --- Flags ---------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,30 +175,33 @@ class Flag:
 
     measure: Callable[[Pair], float]
     least: float  # value from which it is raised
-    text: str  # with the value as {0}
+    text: str  # with the {value}, and behind | what it means
     doubts: bool = False  # whether it turns a smaller error into a doubtful one
 
 
+NULL = "its own model as the plant, the problem's sensors and no disturbances"
 FLAGS = (
-    Flag(_left_alone, 1.0, "its error is {0} times that of the plant left alone", True),
-    Flag(_growth, 8.0, "its error grows {0} times from the first quarter of the run to the last, as in an unstable loop", True),
-    Flag(_unsolved, 0.05, "a share of {0} of its plans did not converge: give the optimiser more iterations", True),
-    Flag(_at_limit, 0.2, "its command stands at a limit for a share of {0} of the run, where no adaptation can act", True),
-    Flag(_chatters, 10.0, "its command chatters: it moves {0} times as much", True),
-    Flag(_moves, 2.0, "its command moves {0} times as much"),
-    Flag(_grows, 0.05, "its iteration is no contraction in a share of {0} of the cycles: see the gain in fpirhc review"),
-    Flag(_null, 0.0, "it makes the error of a right model {0} times as large", True),
+    Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
+    Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last| as in an unstable loop", True),
+    Flag(_unsolved, 0.05, "{value:%} of its plans did not converge| give the optimiser more iterations", True),
+    Flag(_at_limit, 0.2, "its command stands at a limit in {value:%} of the cycles| where no adaptation can act", True),
+    Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation| it chatters", True),
+    Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
+    Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles| see the gain in fpirhc review"),
+    Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),
 )  # fmt: skip
 
 
-def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
-    """Return the flags that are raised for a pair, each with its sentence."""
-    raised = [(flag, value) for flag in FLAGS if (value := flag.measure(pair)) > flag.least]
+def flags_of(pair: Pair) -> tuple[list[tuple[Flag, str]], str]:
+    """Return the flags that are raised for a pair, each with its sentence, and what all of them measured."""
+    every = [(flag, flag.measure(pair)) for flag in FLAGS]
+    raised = [(flag, in_words(flag.text, {"value": value}, {})) for flag, value in every if value > flag.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
-    return [(f, f.text.format(written_out(v))) for f, v in raised if not (chatter and f.measure is _moves)]
-
-
-# --- The verdict ---------------------------------------------------------------------------------------------------------
+    kept = [
+        (f, v) for f, v in every if f.measure is not _chatters and (v > 0 or ":%" in f.text)
+    ]  # 0: it does not apply
+    told = "; ".join(in_words(f.text.partition("|")[0], {"value": v}, {}) for f, v in kept)
+    return [one for one in raised if not (chatter and one[0].measure is _moves)], told
 
 
 def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
@@ -222,18 +223,17 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     ratios = {n: after[n] / before[n] if before[n] else math.inf if after[n] else math.nan for n in major}
     ratios = dict(sorted(ratios.items(), key=lambda pair: -pair[1]))
     up, down = any(r > HURTS for r in ratios.values()), any(r < HELPS for r in ratios.values())
-    outcome = (
-        Outcome.MIXED if up and down else Outcome.WORSE if up else Outcome.BETTER if down else Outcome.NO_DIFFERENCE
-    )
-    raised = flags_of(Pair(plain, adaptive, yard, major))
+    one_way = Outcome.WORSE if up else Outcome.BETTER if down else Outcome.NO_DIFFERENCE
+    outcome = Outcome.MIXED if up and down else one_way
+    raised, flags = flags_of(Pair(plain, adaptive, yard, major))
     said = [text for _, text in raised]
     if any(yard.beyond(plain, n) and yard.beyond(adaptive, n) for n in major):
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
     errors = ", ".join(f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(run.unit(f'error.{n}'))}" for n in ratios)
-    text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'})."
-    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
+    text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'}, {yard.span})."
+    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios, flags)
 
 
 def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
@@ -305,13 +305,13 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     if fair:
         best = min(fair, key=fair.__getitem__)
         among = " of those with the wrong model" if any(e.exact for e in entries) else ""
-        yield f"The smallest error{among} is that of {best}, {written_out(100 * fair[best])} % of the range."
+        yield f"The smallest rms error{among} is that of {best}: {in_percent(fair[best])} of the range ({yard.span})."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:
-            yield f"{exact.name} is no bound here: {', '.join(beaten)} have smaller errors; its cost or its rate is another."
+            yield f"{exact.name}, exact, is no bound here. Smaller errors: {', '.join(beaten)}; their cost or rate is another."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
             lost = [n for n in entry.errors if yard.beyond(entry, n)]
             if lost:
-                yield f"{entry.name} leaves the neighbourhood of its reference in {', '.join(lost)}."
+                yield f"{entry.name} does not follow its reference: the rms error of {', '.join(lost)} is larger than the motion."
