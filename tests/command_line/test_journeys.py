@@ -91,7 +91,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     "probe": [
         (None, "probe line.py --cycles 80 --no-trials", 0, "line: probe with CTC"),
         (recorded, "probe line.py --recording run.csv --json", 0, "{"),
-        (None, "probe line.py --cycles 80 --chatter 1e-9", 1, "line: probe with CTC"),
+        (None, "probe line.py --cycles 80 --chatter 1e-9 --no-trials", 1, "line: probe with CTC"),
         (WEAK, "probe line.py --cycles 80", 2, "fpirhc: probe: the input 'u' never changes"),
     ],
     "compare": [
@@ -102,10 +102,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     ],
     "plans": [
         (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
-        (receding, "compare line.py --plans", 0, "line, first horizon"),
-        (None, "compare line.py --plans --optimisers fixed-point ipopt", 0, "line, first horizon"),
-        (None, "compare line.py --optimisers fixed-point ipopt --no-compile -c RHC", 0, MASS),
-        (TIGHT, "compare line.py --plans", 4, "line, first horizon"),
+        (receding, "compare line.py --optimisers fixed-point ipopt --no-compile -c RHC", 0, MASS),
     ],
     "optimisers by name": [
         (lambda: (receding(), CHOSEN()), "compare line.py --optimisers ipopt --no-compile -c RHC", 0, MASS),

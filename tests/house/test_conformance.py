@@ -160,7 +160,11 @@ OPTIMISERS = (
 )
 
 
-@pytest.mark.parametrize("optimiser", OPTIMISERS, ids=named(OPTIMISERS))
+LONG = fp.FullSpaceFixedPoint  # a baseline of thousands of iterations: half a minute
+LANES = [pytest.param(o, marks=pytest.mark.slow if isinstance(o, LONG) else ()) for o in OPTIMISERS]
+
+
+@pytest.mark.parametrize("optimiser", LANES, ids=named(OPTIMISERS))
 def test_optimiser_laws(optimiser):
     """Riccati, finite differences and least squares agree with what each finds and says."""
     check_optimiser(optimiser, tolerance=FINE, seed=1)

@@ -220,38 +220,3 @@ TWO_TASK = fp.Problem(
 def test_estimators_that_do_not_fit_are_refused(problem, estimator, error, message):
     with pytest.raises(error, match=message):
         fp.Estimating(RHC, estimator).check(problem)
-
-
-@pytest.fixture(scope="module")
-def duffing() -> dict[str, float]:
-    return errors("van_der_pol_duffing", "q")
-
-
-def errors(name: str, coordinate: str) -> dict[str, float]:
-    """The rms errors of all controllers of a shipped problem."""
-    shipped = fp.load_problem(name)
-    runs = {n: fp.simulate(shipped.problem, c, seed=0) for n, c in shipped.controllers.items()}
-    return {n: fp.measure(shipped.problem, r).rms_error[coordinate] for n, r in runs.items()}
-
-
-def test_with_the_same_information_and_rate_the_filter_is_as_good(duffing):
-    """An estimate that acts at once, and a filter that also measures the response, by value; the shipped one has neither."""
-    shipped = fp.load_problem("van_der_pol_duffing")
-    controller = shipped.controllers["RHC offset-free"]
-    assert isinstance(controller, fp.Estimating)
-    assert isinstance(controller.estimator, fp.DisturbanceKalman)
-    seeing = replace(controller.estimator, measured={**controller.estimator.measured, "q''": 1e-3})
-    results = [duffing["RHC offset-free"], duffing["RHC+FPI"]]
-    for estimator in (controller.estimator, seeing):
-        acting = replace(controller, estimator=estimator, at_once=True)
-        run = fp.simulate(shipped.problem, acting, seed=0, compiled=False)
-        results.append(fp.measure(shipped.problem, run).rms_error["q"])
-    assert results == pytest.approx([0.757e-3, 0.295e-3, 0.247e-3, 0.144e-3], rel=0.01)
-
-
-def test_where_offset_free_control_is_the_better_choice():
-    """An error of the model where the input does not act: a deformation cannot reach it, a disturbance model can."""
-    result = errors("leaking_tanks", "h2")
-    assert result["RHC offset-free"] <= 1.3 * result["RHC exact model"]
-    assert result["RHC offset-free"] < 0.05 * result["RHC"]
-    assert result["RHC+FPI"] > 0.5 * result["RHC"]

@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers.plants import linear, pendulum
+from helpers.plants import linear
 from helpers.plants import simulated as run
 
 import fpirhc as fp
@@ -126,35 +126,6 @@ def test_a_response_shows_its_disturbance_at_once():
     assert cycles[0] >= 8
 
 
-def test_the_response_alone_is_a_low_pass_of_the_model_error():
-    """Measured alone, with the states nearly exact, w^ <- w^ + L (f - f^ - w^) with the stationary L of a random walk."""
-    problem = spring(
-        plant=pendulum(),
-        reference=fp.Trajectory(lambda t: {"angle": 0.3 * ca.sin(t)}),
-        start={"angle": 0.0},
-        limits=fp.Limits(),
-        horizon=None,
-        cost=None,
-    )
-    filter = fp.DisturbanceKalman({"angle": 3.0}, {"angle": 1e-9, "angle'": 1e-9, "angle''": 0.5}, noise={"angle": 1e3})
-    result = run(problem, fp.Estimating(TRACK, filter))
-    q, r = 9 * PERIOD, 0.25
-    root = np.sqrt(q**2 + 4 * q * r)
-    expected = (root + q) / (root + q + 2 * r)
-    plant, states, commands = problem.plant, result["state"], result["command"]
-    error = np.array(
-        [
-            float(result["realised"][k, 0] - plant.equations.response(states[k], commands[k - 1], plant.approximate))
-            for k in range(1, result.cycles)
-        ]
-    )
-    own, w = result["estimate"][:, 0], np.zeros(result.cycles)
-    for k in range(1, result.cycles):
-        w[k] = w[k - 1] + expected * (error[k - 1] - w[k - 1])
-    np.testing.assert_allclose(own, w, atol=2e-2 * np.abs(w).max())
-    assert np.ptp(w) > 0.1
-
-
 # Estimates that act in every cycle
 
 
@@ -175,11 +146,3 @@ def test_a_new_estimate_changes_the_command_between_plans():
     assert np.abs(since).max() > 0.1
     held = run(problem, offset_free(at_once=False))
     np.testing.assert_allclose(held["command"], held["planned"], atol=1e-9)
-
-
-def test_a_model_that_does_not_learn_is_followed_by_nothing():
-    """The commands are those of the controller that does not follow its model, to rounding."""
-    problem = spring()
-    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6), fp.Affine(gain=-0.3))
-    first, second = run(problem, plan), run(problem, replace(plan, follows_model=True))
-    np.testing.assert_allclose(first["command"], second["command"], atol=1e-12)
