@@ -36,16 +36,7 @@ def extended_filter(
     noise: np.ndarray,
     measured: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States of every cycle and the last covariance, from the raw measurements and commands of a run.
-
-    Args:
-        result: the run.
-        step: (x, u, w) -> state one cycle later.
-        shown: state -> what is measured.
-        start: first state and deviations.
-        noise: deviations of w.
-        measured: deviation of the sensor.
-    """
+    """States of every cycle and the last covariance, from the raw measurements and commands of a run."""
     x, p, states = start[0], np.diag(start[1]) ** 2, []
     for k, sample in enumerate(samples(result)):
         x, p = _predicted(step, x, p, result["command"][k - 1, 0], noise) if k else (x, p)

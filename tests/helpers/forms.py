@@ -1,7 +1,4 @@
-"""Every form of a problem: one thing to be moved, y follows 0.5 sin 2t, and its mass is believed 15 % too large.
-
-And any problem in another form: its coordinates as outputs.
-"""
+"""Every form of a problem: one thing to be moved, y follows 0.5 sin 2t, and its mass is believed 15 % too large."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence

@@ -22,10 +22,7 @@ _ROUGH = 1e-4  # the same for a rough judgement: interior-point methods end that
 
 @dataclass(frozen=True)
 class Judgement:
-    """cost; residual of the first-order conditions; violation, relative to the limits' half ranges; all by rolling out.
-
-    rough: the residual with multipliers also of limits that are only met to 1e-4.
-    """
+    """cost; residual of the first-order conditions; violation, relative to the limits' half ranges; all by rolling out."""
 
     cost: float
     residual: float

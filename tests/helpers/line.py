@@ -31,13 +31,6 @@ EXACT = 'controllers["CTC exact"] = fp.ExactModel(controllers["CTC"])\n'
 
 
 def line_text(task: str, deformation: str = "fp.Sigmoid(gain=-0.5)", *, bounds: str = "", more: str = "") -> str:
-    """Return the text of a problem file with the controllers CTC and CTC+FPI.
-
-    Args:
-        task: other arguments of the problem, such as "period=5e-3, duration=1.5".
-        deformation: of CTC+FPI.
-        bounds: of the gain b, such as "(0.5, 2.4)".
-        more: text at the end of the file.
-    """
+    """Return the text of a problem file with the controllers CTC and CTC+FPI."""
     plant = _PLANT.replace("BOUNDS", f", bounds={bounds}" if bounds else "")
     return plant + _TASK.replace("TASK", task) + _CONTROLLERS.replace("MAP", deformation) + more

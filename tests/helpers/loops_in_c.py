@@ -18,14 +18,7 @@ REST = fp.Trajectory(lambda t: {"a": 0.3 * ca.sin(t), "b": 0 * t})
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A composed graph and the same Function as compiled loops.
-
-    Args:
-        ocp: the horizon.
-        data: of its stages.
-        graph: in the virtual machine.
-        loops: in C.
-    """
+    """A composed graph and the same Function as compiled loops."""
 
     ocp: Any
     data: np.ndarray

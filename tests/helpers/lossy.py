@@ -11,13 +11,7 @@ from fpirhc.contracts import Controller, values_of
 
 
 class Lossy:
-    """A loop without noise; commands wait for the dead time of the inputs, samples for that of the measurement, in whole cycles.
-
-    Args:
-        problem: whose plant moves with its exact parameters.
-        controller: in the stepper.
-        settings: of the stepper.
-    """
+    """A loop without noise; commands wait for the dead time of the inputs, samples for that of the measurement, in whole cycles."""
 
     def __init__(self, problem: fp.Problem, controller: Controller, **settings: Any) -> None:
         self.problem, plant = problem, problem.plant
@@ -41,15 +35,7 @@ class Lossy:
         how: str = "lost",
         shown: Callable[[int, np.ndarray], np.ndarray] = lambda _, row: row,
     ) -> np.ndarray:
-        """Return the commands in force in every cycle, shape (cycles, inputs).
-
-        Args:
-            cycles: of the run.
-            lost: cycles whose sample is missing.
-            how: "lost": it is NaN; "missed": the stepper is not called; "interpolated": it is called afterwards, with samples on
-                the line between those before and after, and its commands are too late.
-            shown: (cycle, sample) -> what the stepper is given.
-        """
+        """Return the commands in force in every cycle, shape (cycles, inputs)."""
         problem, period = self.problem, self.problem.period
         memory, x = self.stepper.start(), np.array(problem.start_state, dtype=float)
         before = np.array(problem.inputs_before, dtype=float)

@@ -16,12 +16,7 @@ TANK = fp.Plant(
 
 
 class Tank:
-    """Another outlet than the model's.
-
-    Args:
-        inflow: function that returns what is sent.
-        show: function that takes the level.
-    """
+    """Another outlet than the model's."""
 
     def __init__(self, inflow: Callable[[], float], show: Callable[[float], None]) -> None:
         self.inflow, self.show, self.now, self.level = inflow, show, 0.0, 1.0

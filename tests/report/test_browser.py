@@ -36,14 +36,7 @@ def browser() -> Iterator[Any]:
 
 @dataclass
 class Opened:
-    """A page in the browser.
-
-    Args:
-        page: the page.
-        complaints: what the console and the page complained about.
-        requests: addresses that the page asked for.
-        refusals: reasons why nothing came, by address.
-    """
+    """A page in the browser, what it complained about, asked for, and did not get."""
 
     page: Any
     complaints: list[str] = field(default_factory=list)

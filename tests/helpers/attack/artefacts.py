@@ -15,13 +15,7 @@ Read = Callable[[Path], object]
 
 @dataclass(frozen=True)
 class Flips:
-    """What came of the flipped bits of one artefact.
-
-    Args:
-        tried: number of flips.
-        raw: errors that are none of fpirhc's, each in words.
-        unnoticed: flips after which the reader gives something else than was written.
-    """
+    """What came of the flipped bits of one artefact."""
 
     tried: int
     raw: tuple[str, ...]

@@ -23,25 +23,15 @@ class Cycle:
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault that begins, lasts and ends.
-
-    Args:
-        name: of the fault.
-        sample: changes a cycle before its step.
-        actuator: what the plant is given in place of the command: (command, lower, upper) -> command.
-        heavier: factor on the plant's first parameter.
-        first: cycle in which it begins.
-        length: number of cycles.
-        single: whether it is one bad sample, after which everything must be as with the tick left out.
-    """
+    """A fault that begins, lasts and ends."""
 
     name: str
     sample: Callable[[Cycle], None] | None = None
-    actuator: Callable[[Array, Array, Array], Array] | None = None
-    heavier: float = 1.0
+    actuator: Callable[[Array, Array, Array], Array] | None = None  # (command, lower, upper) -> what the plant is given
+    heavier: float = 1.0  # factor on the plant's first parameter
     first: int = BEGIN
     length: int = 1
-    single: bool = False
+    single: bool = False  # one bad sample, after which everything must be as with the tick left out
 
     @property
     def end(self) -> int:

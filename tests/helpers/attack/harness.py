@@ -21,23 +21,13 @@ PROBLEMS += ("mass_spring_slots", "delayed_tanks", "three_link_arm", "chain_of_m
 
 @dataclass
 class Outcome:
-    """What one fault did to one controller.
+    """What one fault did to one controller."""
 
-    Args:
-        raw: an error that is none of fpirhc's; empty: there was none.
-        outside: number of commands that were not finite or outside the limits.
-        frozen: whether the controller still skipped its cycles, or held its command, at the end of the run.
-        differs: for a single bad sample, whether something differs from the tick left out.
-        deviation: largest deviation of the command from the run without faults, in normal movements of the command per cycle; of a
-            fault at the start from its end on.
-        statuses: that occurred.
-    """
-
-    raw: str = ""
-    outside: int = 0
-    frozen: bool = False
-    differs: bool = False
-    deviation: float = 0.0
+    raw: str = ""  # an error that is none of fpirhc's
+    outside: int = 0  # commands that were not finite or outside the limits
+    frozen: bool = False  # whether it still skipped its cycles, or held its command, at the end
+    differs: bool = False  # a single bad sample: whether something differs from the tick left out
+    deviation: float = 0.0  # of the command from the run without faults, in its normal movements per cycle
     statuses: set[Status] = field(default_factory=set)
 
     @property

@@ -1,7 +1,4 @@
-"""Libraries that another user may have planted in the cache: none of them is run.
-
-A planted library is a valid one with a fitting checksum, of a model with other numbers, so that one that runs shows itself.
-"""
+"""Libraries that another user may have planted in the cache: none of them is run."""
 
 import os
 from collections.abc import Callable, Iterator
