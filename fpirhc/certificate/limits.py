@@ -132,10 +132,10 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
         yield "there are disturbances, signals from outside, hard limits of rates, or a reality that is not the plant"
     if not problem.sensing.ideal or problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
         yield "state or response are estimated, noisy or late"
-    if ready.learns or ready.feeds or ready.deforms != "response":
-        yield "its model, state or command is changed beside the deformation"
     if ready.plant_model(problem).exact:
         yield "its model has the exact parameters of every plant, so there are no other plants to be certified"
+    if ready.learns or ready.inner is not None or ready.deforms != "response":
+        yield "its model, state or command is changed beside the deformation"
     plain = type(deformation) is ModelReferenced and type(deformation.map) is Affine and deformation.map.weights is None
     if not plain or not deformation.mirror.bare:
         yield "the deformation must be ModelReferenced(Affine(gain=...)) without dead time, lag, weights or filter"

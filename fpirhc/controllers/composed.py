@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fpirhc.controllers.base import like
+from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.path import (
     ACTED,
@@ -109,10 +109,11 @@ def _informed(
     first = told.block(remembers=compares and not ahead)
     if first is None:
         return compose("controller", reads, blocks, delays, outputs=("command",))
-    needed = reads + Layout(told.reads if compares else ())
-    inner = compose("informed", needed, blocks, delays, outputs=("command",))
-    block = embedded("informed", inner, {"parameters": like(told.plant.parameter, NOW)})
-    return compose("controller", needed if ahead else reads, [first, block], outputs=("command",))
+    reads = reads + Layout(told.reads if compares and ahead else ())
+    now = like(told.plant.parameter, NOW)
+    return compose(
+        "controller", reads, [first, *(fed(b, "parameters", now) for b in blocks)], delays, outputs=("command",)
+    )
 
 
 def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:

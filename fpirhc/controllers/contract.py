@@ -177,11 +177,6 @@ class Controller(Checked, ABC):
         """Return the problem that the inner controller is built for."""
         return problem
 
-    @property
-    def feeds(self) -> Mapping[str, str]:
-        """Signals that the inner controller is given under other names: 'time', 'state', 'output', 'realised' or 'parameters'."""
-        return {} if self.inner is None else self.inner.feeds
-
     def plant_model(self, problem: Problem) -> PlantModel:
         """Return what the controller knows of its plant: the problem's equations, approximate parameters and signals."""
         return PlantModel(problem.plant, problem.signals) if self.inner is None else self.inner.plant_model(problem)

@@ -47,14 +47,6 @@ class Mirror:
         """Whether nothing is believed of the way: the command acts at once."""
         return self == type(self)()
 
-    def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
-        """Where the next request begins."""
-        return desired
-
-    def step(self, request: Expression, candidate: Expression) -> Expression:  # noqa: ARG002
-        """By how much a map moves its request; zero here, where it is given a model's response in place of its last request."""
-        return 0 * candidate
-
     def require_last_request(self, refusal: str) -> None:
         """Raise where a map is not given its own last request, with the refusal; a plan, or a law on commands, has nothing else.
 
@@ -75,17 +67,11 @@ class Mirror:
 
 
 class LastRequest(Mirror):
-    """No model: a map is given the last request, and its next one begins there."""
+    """No model: a map is given the last request."""
 
     request = "_deformed_last"
     models = ()
     share = 0.0
-
-    def origin(self, request: Expression, desired: Expression) -> Expression:  # noqa: ARG002
-        return request
-
-    def step(self, request: Expression, candidate: Expression) -> Expression:
-        return candidate - request
 
     def against_last_request(self, refusal: str) -> tuple[str, ...]:  # noqa: ARG002
         return ()

@@ -54,7 +54,6 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
     "check": "outputs are controlled",
     "deformation": "deformation acts",
     "deforms": "desired response is deformed",
-    "feeds": "facts hold",
     "inner": "facts hold",
     "inner_problem": "same command everywhere",
     "learns": "learning remembers",

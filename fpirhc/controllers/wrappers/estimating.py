@@ -7,7 +7,6 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -62,10 +61,6 @@ class Estimating(ControllerWrapper):
         plant = problem.plant
         model = _MODELS.of((self.estimator, plant), (), lambda: self.estimator.model(plant))
         return problem if model is problem.plant else replace(problem, plant=model)
-
-    @property
-    def feeds(self) -> Mapping[str, str]:
-        return {"parameters": _BELIEVED, **self.controller.feeds}
 
     learns = True
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, cast
 
@@ -164,11 +163,6 @@ class Predicted(ControllerWrapper):
     inputs: NotNegative = field(metadata={"structure": True})
     measurement: NotNegative = field(default=0.0, metadata={"structure": True})
     by: Predictor = field(default_factory=ByModel)
-
-    @property
-    def feeds(self) -> Mapping[str, str]:
-        ahead = {"time": "time_ahead", "state": "state_ahead", "output": "output_ahead"}
-        return {**ahead, **self.controller.feeds}
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         notes = self.controller.notes(problem)
