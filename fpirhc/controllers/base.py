@@ -36,12 +36,12 @@ def fed(block: Block, name: str, source: Signal) -> Block:
     """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
     if name not in block.reads:
         return block
-    reads = tuple(source if s.name == name else s for s in block.reads.signals)
+    reads = {one.name: one for one in (source if s.name == name else s for s in block.reads.signals)}
 
     def step(s: Signals) -> Mapping[str, Value]:
         return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
 
-    return replace(block, reads=Layout(reads), step=step)
+    return replace(block, reads=Layout(tuple(reads.values())), step=step)
 
 
 def under_names(block: Block, names: Mapping[str, str]) -> Block:

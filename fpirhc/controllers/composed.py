@@ -12,15 +12,7 @@ from dataclasses import replace
 
 from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.path import (
-    ACTED,
-    MEASURED,
-    MEASURED_OUTPUT,
-    MEASURED_TIME,
-    NOW,
-    measured_output,
-    measured_state,
-)
+from fpirhc.controllers.path import ACTED, MEASURED_TIME, NOW, measured_output, measured_state
 from fpirhc.controllers.reference_states import with_reference
 from fpirhc.controllers.seeing import check_believed, seeing_blocks
 from fpirhc.errors import InvalidProblem
@@ -52,7 +44,7 @@ def _composed(built: Built) -> Composite:
     seeing, seen = seeing_blocks(built.problem)
     time, *others = _reads(built).signals
     reads = Layout((time, *built.states, built.raw, *others[1 + len(measured_signals(built.plant)) :]))
-    return _informed(built, reads, [*seeing, *_with_measured(built.plant, blocks)], [*delays, *seen])
+    return _informed(built, reads, [*seeing, *_at_once(built.plant, blocks)], [*delays, *seen])
 
 
 def _reads(built: Built) -> Layout:
@@ -72,7 +64,7 @@ def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
     if ahead:
         reads = _reads(built) + Layout(_measured_reads(built.plant, blocks))
         return _informed(built, reads, blocks, delays, ahead=True)
-    return _informed(built, _reads(built), _with_measured(built.plant, blocks), delays)
+    return _informed(built, _reads(built), _at_once(built.plant, blocks), delays)
 
 
 def dependencies_of_command(step: Composite) -> frozenset[str]:
@@ -133,25 +125,21 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
     return Block(name, Layout(reads), *inside)
 
 
+def _measured(plant: Plant) -> dict[str, tuple[Signal, Signal]]:
+    """What is measured, by name, where a controller may act on predictions, and what is given in its place where none does."""
+    now = replace(time_signal(plant), name=MEASURED_TIME)
+    every = (measured_state(plant), plant.state), (measured_output(plant), plant.output), (now, time_signal(plant))
+    return {one.name: (one, given) for one, given in every}
+
+
 def _measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
     """The signals of the measured state and outputs and of their time, as far as some blocks read them."""
-    every = measured_state(plant), measured_output(plant), replace(time_signal(plant), name=MEASURED_TIME)
     read = {name for block in blocks for name in block.reads.names}
-    return tuple({s.name: s for s in every if s.name in read}.values())
+    return tuple(one for name, (one, _) in _measured(plant).items() if name in read)
 
 
-def _with_measured(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """The blocks behind one that writes the measured state or outputs, and their time, where a block reads them."""
-    writes = _measured_reads(plant, blocks)
-    if not writes:
-        return list(blocks)
-    sources = {MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
-    named = {w.name: sources[w.name].name for w in writes}
-    reads = {sources[name].name: sources[name] for name in named}
-    copy = Block(
-        "measured",
-        Layout(tuple(reads.values())),
-        Layout(writes),
-        lambda s: {to: getattr(s, name) for to, name in named.items()},
-    )
-    return [copy, *blocks]
+def _at_once(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
+    """The blocks with the state, outputs and time that are given in place of the measured ones."""
+    for name, (_, given) in _measured(plant).items():
+        blocks = [fed(block, name, given) for block in blocks]
+    return list(blocks)
