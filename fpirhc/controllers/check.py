@@ -181,7 +181,7 @@ _CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same cont
 def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
     """Return the resolved controller, checked against the problem.
 
-    A controller with live numbers is checked with the numbers of the build, and returned as it is.
+    A controller with open numbers is checked with the numbers of the build, and returned as it is.
 
     Args:
         numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.

@@ -73,7 +73,7 @@ def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
 def _least_pole(product: float, uncertainty: float) -> float:
     """The least pole that the theorem allows for a product g of gain and plant in (0, 2) and a dead time wrong by m cycles.
 
-    p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4, here without cancellation; the product may be live.
+    p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4, here without cancellation; the product may be open.
     """
     bound = product * (2 + product) * uncertainty**2 / 4
     return 2 * bound / (2 * bound + 1 + sqrt(4 * bound + 1))

@@ -53,7 +53,7 @@ class OptimalControl:
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
-        settings: paths of the live settings, whose numbers are among the data.
+        settings: paths of the open settings, whose numbers are among the data.
         inner: of a plant with outputs, for every state its place in the reference, or -1 and a value of its own; else empty.
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).

@@ -244,7 +244,7 @@ class Sensing(Checked):
         quantum = expressed(sensor.quantum, value)
         quanta = quantum * ca.floor(value / quantum + 0.5)
         # The same number, but CasADi would multiply a quantum that is a constant by the weights of the estimator behind it: that
-        # rounds otherwise than a live quantum does, and a last place of a sample is now and then a whole one of the next.
+        # rounds otherwise than an open quantum does, and a last place of a sample is now and then a whole one of the next.
         return ca.copysign(ca.fabs(quanta), quanta)
 
     def lost(self, column: Expression) -> Expression | None:

@@ -59,7 +59,7 @@ class Block:
 
     @cached_property
     def inputs(self) -> Layout:
-        """The signals that are read, and the live settings in the step."""
+        """The signals that are read, and the settings that are open in the step."""
         return self._built[1]
 
     @cached_property
@@ -88,9 +88,9 @@ class Block:
         open_symbols = ca.symvar(ca.veccat(*results)) if self.opaque else ca.symvar(ca.vertcat(*results))
         entries = {v.name() for v in ca.symvar(ca.vertcat(*columns))} if columns else set()
         entries -= {signal.name for signal in arguments}  # those of vectors, which are declared
-        live = {v.name(): v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in entries}
-        columns = [live.pop(signal.name, v) for signal, v in zip(arguments, columns, strict=True)]
-        settings = list(live.values())
+        found = {v.name(): v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in entries}
+        columns = [found.pop(signal.name, v) for signal, v in zip(arguments, columns, strict=True)]
+        settings = list(found.values())
         inputs = self.reads + Layout(tuple(scalar(v.name()) for v in settings))
         at = len(self.reads.signals)
         columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidShape, InvalidValue, NotSupported
+from fpirhc.errors import InvalidShape, InvalidValue
 
 
 class _Buffer(Protocol):
@@ -183,10 +183,10 @@ class Latest(threading.local, Generic[T]):
 
 
 def _equal(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
-    """Whether they are equal; a live number, which refuses to be compared, equals no other."""
+    """Whether they are equal; an open number, which has no truth value, equals no other."""
     try:
         return one == other
-    except NotSupported:
+    except RuntimeError:
         return False
 
 

@@ -123,7 +123,7 @@ class IntegralLaw(Tracking):
         """Return the law with these largest responses, unless the user has set them."""
         if self.largest:
             return self
-        other = copy(self)  # not `replace`, which would check numbers that are live
+        other = copy(self)  # not `replace`, which would check numbers that are open
         object.__setattr__(other, "largest", tuple(largest))
         return other
 

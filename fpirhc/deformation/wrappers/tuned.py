@@ -111,7 +111,7 @@ def examples(inner: Deformation) -> tuple[Deformation, ...]:
 
 
 def _mean_sign(product: float, components: int) -> float:
-    """The mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2; the product may be live.
+    """The mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2; the product may be open.
 
     I is the regularised incomplete beta function; the proof stands in docs/theory.md.
     """

@@ -72,7 +72,7 @@ class KalmanFilter(StateObserver):
     def memory(self, model: Model) -> Layout:
         """The believed state, its covariance column by column, and the variances of the noises.
 
-        The variances are constants of a run. As data they enter the same operations whether they are live or not.
+        The variances are constants of a run. As data they enter the same operations whether they are open or not.
         """
         state = model.plant.state
         first = np.diag([self.start.get(e, 0.0) ** 2 for e in state.elements])
@@ -115,7 +115,7 @@ class KalmanFilter(StateObserver):
         return [*self.noise.values(), *self.measured.values()]
 
     def _variances(self, remembered: Expression) -> tuple[Expression, Expression]:
-        """Variances of the noises and of the sensors; those of live settings, else the remembered ones."""
+        """Variances of the noises and of the sensors; those that are open, else the remembered ones."""
         every = overlaid(remembered, [d * d for d in self._deviations])
         return ca.vertcat(*every[: len(self.noise)]), ca.vertcat(*every[len(self.noise) :])
 
