@@ -76,18 +76,20 @@ def start_memory(
         problem: the problem of the loop, or one that differs from it in the exact parameters only.
         numbers: of all live settings, by path; None: those of the build.
     """
-    remembered, mover = [], moving(problem)
-    if not problem.sees_plant:
-        sensing = sensing_blocks(mover, given_response(problem, controller), predicts=False)
-        remembered += [s for block in sensing for s in block.memory.signals]
-    remembered += [delay.now for delay in _plant_delays(mover, controller.plant_model(problem))]
-    starts = {s.name: s.start_vector() for s in remembered}
-    if numbers:
-        live = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
-        starts |= {name: value for name, value in live.items() if name in loop.memory}
+    mover, whole = moving(problem), loop.memory.start()
+    sensing = [] if problem.sees_plant else sensing_blocks(mover, given_response(problem, controller), predicts=False)
+    signals = [s for block in (*sensing, *seeing_blocks(problem)[0]) for s in block.memory.signals]
+    signals += [delay.now for delay in _plant_delays(mover, controller.plant_model(problem))]
     if INNER in loop.memory and plans_exactly(loop, problem, controller):
-        starts[INNER] = compose_with_sensing(build(problem, controller)).memory.start()
-    return loop.memory.pack(starts | _first_estimates(loop, problem, starts))
+        whole[loop.memory.slice(INNER)] = compose_with_sensing(build(problem, controller)).memory.start()
+    # A graph has the estimator's memory inside the controller's one signal.
+    places = {column.removeprefix(f"{INNER}."): k for k, column in enumerate(loop.memory.columns)}
+    for signal in signals:
+        whole[[places[column] for column in signal.columns]] = signal.start_vector()
+    for path, value in (numbers or {}).items():
+        if PREFIX + path in places:
+            whole[places[PREFIX + path]] = value
+    return whole
 
 
 def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
@@ -96,18 +98,6 @@ def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> 
         return False
     model = controller.plant_model(problem)
     return not np.array_equal(loop.memory["parameters"].start_vector(), model.parameters(model.plant))
-
-
-def _first_estimates(loop: Composite, problem: Problem, starts: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What the estimator remembers at the start of this problem; a graph has it inside the controller's one signal."""
-    own = [s for block in seeing_blocks(problem)[0] for s in block.memory.signals]
-    if not own or own[0].name in loop.memory:
-        return {s.name: s.start_vector() for s in own}
-    whole = loop.memory[INNER]
-    start, places = starts.get(INNER, whole.start_vector()).copy(), {c: k for k, c in enumerate(whole.elements)}
-    for s in own:
-        start[[places[c] for c in s.columns]] = s.start_vector()
-    return {INNER: start}
 
 
 def _plant_delays(mover: Mover, model: PlantModel) -> list[Delay]:
