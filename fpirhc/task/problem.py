@@ -50,7 +50,7 @@ _WHOLE = 1e-6  # cycles by which a duration may miss a whole number of them
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
 # Cached properties that depend on the exact parameters.
-_OF_EXACT = ("truth", "real_start", "start_output", "of_equations")
+_OF_EXACT = ("truth", "real_start", "start_output", "first_shown", "of_equations")
 _INSTANTS = 101  # at which signals from outside are tried before a run
 
 
