@@ -523,7 +523,7 @@ def export(
     if to not in targets():
         raise InvalidName(f"the target '{to}' is unknown.{nearest(to, [*targets(), 'lab'])}")
     target = targets()[to]
-    device = device_of(task.problem, chosen, controller, name=name, live=live or [], cycles=2000)
+    device = device_of(task.problem, chosen, controller, name=name, live=live or [])
     for file in write(device, target, folder):
         print(f"wrote {file}")
 

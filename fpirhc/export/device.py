@@ -48,7 +48,6 @@ class Device:
     controller: Controller  # as the problem file has it
     # of the controller; compiled where there is a compiler, so that its numbers are those of C to the last bit
     stepper: Stepper
-    cycles: int  # number of cycles that are recorded for a replay
 
     @cached_property
     def inputs(self) -> Layout:

@@ -12,6 +12,7 @@ from fpirhc.task.problem import Problem
 
 _OFFSET, _PRIME, _MASK = 0xCBF29CE484222325, 0x100000001B3, (1 << 64) - 1
 _NAN = 0x7FF8000000000000
+_CYCLES = 2000  # of a record
 
 
 def recorded(device: Device) -> bytes:
@@ -22,7 +23,7 @@ def recorded(device: Device) -> bytes:
     Samples are those of a run, again from its beginning where it is too short; a plant outside is not run, but its model is.
     """
     stepper = device.stepper
-    rows = with_faults(_samples(device), device.problem)[: device.cycles]
+    rows = with_faults(_samples(device), device.problem)[:_CYCLES]
     exact = stepper.compiled or stepper.function.is_a("SXFunction")
     head = struct.pack("<4i", len(rows), rows.shape[1], device.problem.plant.input.size, exact)
     memory, parts = stepper.start(), [head]
@@ -83,7 +84,7 @@ def _samples(device: Device) -> np.ndarray:
     run = simulate(problem.of_equations, device.controller, seed=0)
     parts = (run.time if name == "time" else run[name] for name in device.inputs.names)
     rows = np.hstack([np.asarray(part, dtype=float).reshape(len(run.time), -1) for part in parts])
-    wanted = device.cycles + sum(missing for _, missing in _GAPS)
+    wanted = _CYCLES + sum(missing for _, missing in _GAPS)
     rows = np.vstack([rows] * -(-wanted // len(rows)))[:wanted]
     rows[:, 0] = device.problem.period * np.arange(len(rows))
     return rows

@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import InvalidName, NotSupported, OutputError, nearest, not_writable
+from fpirhc.errors import NotSupported, OutputError, not_writable
 from fpirhc.export.device import Device, check_name, default_name, in_comment
 from fpirhc.members import within
 from fpirhc.simulation.stepper import Stepper
@@ -20,17 +20,10 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of place where a controller runs.
+    """A kind of place where a controller runs."""
 
-    Args:
-        name: word after --to.
-        summary: what comes out, in one line.
-        files: function of a device that returns the contents of all files by name.
-    """
-
-    name: str
-    summary: str
-    files: Callable[[Device], Mapping[str, str | bytes]]
+    name: str  # word after --to
+    files: Callable[[Device], Mapping[str, str | bytes]]  # contents of all files by name
 
 
 @cache
@@ -40,34 +33,17 @@ def targets() -> dict[str, Target]:
     return {target.name: target for target in sorted(members, key=lambda one: one.name)}
 
 
-def target_called(name: str) -> Target:
-    """Return a target."""
-    if name not in targets():
-        raise InvalidName(f"the target '{name}' is unknown.{nearest(name, list(targets()))}")
-    return targets()[name]
-
-
 def device_of(
-    problem: Problem,
-    controller: Controller,
-    title: str,
-    *,
-    name: str | None = None,
-    live: Sequence[str] = (),
-    cycles: int = 2000,
+    problem: Problem, controller: Controller, title: str, *, name: str | None = None, live: Sequence[str] = ()
 ) -> Device:
-    """Return a controller for a device.
-
-    Args:
-        name: prefix of everything in C; None: made of the title.
-    """
+    """Return a controller for a device; `name` is the prefix of everything in C, None: made of the title."""
     whole = f"{problem.name} {title}"
     chosen = default_name(whole) if name is None else name
     check_name(chosen)
     try:
         # A solver without a bound of its time is refused below, for what it is.
         stepper = Stepper(problem, controller, live=live, bounded=False)
-        device = Device(chosen, in_comment(whole), problem, controller, stepper, cycles)
+        device = Device(chosen, in_comment(whole), problem, controller, stepper)
         _ = device.sources, device.bounds
     except NotSupported as error:
         raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None
@@ -76,27 +52,19 @@ def device_of(
 
 def write(device: Device, target: Target, folder: Path) -> list[Path]:
     """Write the files of a target into a new or empty folder, and return their paths."""
-    _check_empty(folder)
-    contents = target.files(device)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        contents = {} if taken else target.files(device)
         for name, content in contents.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    except OSError as error:
-        raise not_writable(folder, error, "--out") from None
-    return [folder / name for name in contents]
-
-
-def _check_empty(folder: Path) -> None:
-    try:
-        taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
     except OSError as error:
         raise not_writable(folder, error, "--out") from None
     if taken:
         raise OutputError(
             f"'{folder}' is not an empty folder, and nothing in it is replaced; choose another one with --out"
         )
+    return [folder / name for name in contents]
 
 
 def _instead(controller: Controller) -> str:

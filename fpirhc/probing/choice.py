@@ -46,14 +46,12 @@ from fpirhc.task.reality import Reality
 
 _ASKED = 0.5, 0.1  # shares of the deadbeat gain that a review is asked about; it tries a half to four times as much
 _POLES = (0.0, 0.5, 0.8)  # of the filter
-_LARGEST_PRODUCT = 1.99
 _STEPS, _OF_RANGE = 1.5, 0.02  # largest step of a command: times that of the controller alone, or of the input's range
 _WORTH, _WORSE = 0.95, 1.03  # error that is worth an adaptation; largest one of any coordinate
 _LONGEST = 2000  # cycles of a trial
 _STEP, _CLEARLY = 1.6, 0.97  # ratio of the gains of two trials; of their errors, from which the larger one counts
 MARGIN, _LARGER = 1.4, 1.5  # times its gain that what is kept has to bear, and the ratio of the errors then
-_SEEDS = 3  # of these runs
-_BEGUN = 0.2  # share of a run from which errors count
+_SEEDS, _BEGUN = 3, 0.2  # of these runs; share of a run from which errors count
 _CYCLES = 300  # of a run, where the problem has as many and the record is shorter
 
 
@@ -63,7 +61,7 @@ def forms(estimates: Estimates, share: float, pole: float) -> dict[str, Deformat
     likely = np.where(high > low, np.ceil((low + high) / 2), value)
     late, cycles, lag = bool(likely.any()), _one(likely), _one(estimates.lag[1])
     wrong = float(max((high - likely).max(), (likely - low).max(), 1.0))
-    leak = default_pole(min(max(1 / estimates.largest, 1.0), _LARGEST_PRODUCT), wrong) if late else None
+    leak = default_pole(min(max(1 / estimates.largest, 1.0), 1.99), wrong) if late else None
     one = _map(share / estimates.largest, pole)
     found: dict[str, Deformation] = {
         "referenced": ModelReferenced(one, cycles=cycles, lag=lag, pole=None if leak is None else _rounded(leak)),
@@ -82,21 +80,14 @@ def _map(gain: float, pole: float, weights: tuple[tuple[float, ...], ...] | None
     return Filtered(one, pole=pole) if pole else one
 
 
-def _times(one: Deformation, factor: float) -> Deformation:
-    return one.with_effective_gain(_rounded(factor * one.effective_gain()))
-
-
 class Choice:
     """The choice for one problem and controller."""
 
-    def __init__(
-        self, problem: Problem, bare: Controller, estimates: Estimates, chatter: Mapping[str, float] | None
-    ) -> None:
+    def __init__(self, problem: Problem, bare: Controller, estimates: Estimates, chatter: Mapping[str, float]) -> None:
         """Build the plants that the record allows, a cycle later, and run the controller alone on the estimate."""
         self._given, self._bare, self._estimates = problem, bare, estimates
-        self._names, self._chatter = weighed(problem, bare), chatter or {}
-        noise = [one.noise for one in estimates.channels]
-        middle = estimates.dead[1], estimates.lag[1]
+        self._names, self._chatter = weighed(problem, bare), chatter
+        middle, noise = (estimates.dead[1], estimates.lag[1]), [one.noise for one in estimates.channels]
         self.problem = estimated_problem(problem, estimates.gains, *middle, estimates.drift, noise)
         self._alone = _run(self.problem, bare)
         ends = {(one.cycles, one.lags): one for one in estimates.ends}.values()
@@ -138,7 +129,9 @@ class Choice:
 
     def compared(self, problem: Problem, alone: Run, run: Run, *, loud: bool = False) -> Trial:
         """Return what a run shows beside that of the controller alone; `loud`: whether steps of any size are calm."""
-        pair, (own, before) = errors_of(problem, (alone, run), self._names), map(steps_of, (run, alone))
+        pair, sent = errors_of(problem, (alone, run), self._names), (run["command"], alone["command"])
+        # Rms step of every command, the transient left out.
+        own, before = (np.sqrt(np.mean(np.diff(c[len(c) // 10 :], axis=0) ** 2, axis=0)) for c in sent)
         plant = self._given.plant
         lower, upper = self._given.limits.input_bounds(plant)
         width = np.where(np.isfinite(upper - lower), upper - lower, 0.0)
@@ -148,10 +141,7 @@ class Choice:
         return Trial(math.sqrt(np.mean(np.square(ratios))), max(ratios), sound=loud or bool((own <= room).all()))
 
     def tried(self, shortlist: dict[str, Deformation], notes: list[str], seed: int) -> dict[str, Trial]:
-        """Return trials on the plant: of the shortlist, and of other gains of the best one, which are added to it.
-
-        The best one has to bear 1.4 times its gain, with other seeds too; else it and larger gains of its form do not count.
-        """
+        """Return trials of the shortlist and of other gains of the best one, which has to bear 1.4 times its gain."""
         task, alone, results = shortened(self._given, _LONGEST), dict[int, Run](), dict[str, Trial]()
         places = {name: (name, 0) for name in shortlist}  # form, and by how many steps its gain is larger
 
@@ -187,6 +177,10 @@ class Choice:
             results, waiting = results | {n: replace(results[n], sound=False) for n in lost}, []
 
 
+def _times(one: Deformation, factor: float) -> Deformation:
+    return one.with_effective_gain(_rounded(factor * one.effective_gain()))
+
+
 def _run(problem: Problem, controller: Controller, seed: int = 0) -> Run:
     return simulator(problem, controller, compiled=False).run(seed=seed)
 
@@ -198,7 +192,7 @@ class Trial:
     error: float  # rms error over that of the controller alone, in the mean over the coordinates
     worst: float  # of any coordinate
     sound: bool = (
-        True  # whether commands keep the budget of chatter, and runs with a larger gain pass as far as there are some
+        True  # whether commands keep the budget of chatter, and runs with a larger gain pass where there are some
     )
 
     @property
@@ -212,12 +206,6 @@ def best(trials: Mapping[str, Trial]) -> str | None:
     return min((name for name, one in trials.items() if one.passes), key=lambda name: trials[name].error, default=None)
 
 
-def steps_of(run: Run) -> np.ndarray:
-    """Return the rms step of every command, the transient left out."""
-    command = np.asarray(run["command"])
-    return np.sqrt(np.mean(np.diff(command[len(command) // 10 :], axis=0) ** 2, axis=0))
-
-
 def _rounded(value: float) -> float:
     return float(f"{float(value):.3g}")
 
@@ -228,20 +216,10 @@ def _one(values: np.ndarray) -> float | tuple[float, ...]:
 
 
 def estimated_problem(
-    problem: Problem,
-    gains: np.ndarray,
-    cycles: Sequence[float],
-    lags: Sequence[float],
-    drift: np.ndarray | None = None,
-    noise: Sequence[float] = (),
-) -> Problem:
-    """Return the problem with the estimated plant as its reality.
-
-    Args:
-        gains: Lambda, shape (n, n).
-        drift: w by cycle, shape (cycles, n), which ends with its last value; None: there is none.
-        noise: rms of the measured response, by controlled coordinate; empty: there is none.
-    """
+    problem: Problem, gains: np.ndarray, cycles: Sequence[float], lags: Sequence[float],
+    drift: np.ndarray | None = None, noise: Sequence[float] = (),
+) -> Problem:  # fmt: skip
+    """Return the problem whose reality has gains Lambda, a drift w by cycle that stays in the end, and noise of the response."""
     plant, signals = _plant(problem.plant, gains, drifts=drift is not None)
     own, period = problem.of_model, problem.period
     shortest = min((tau for tau in lags if tau > 0), default=math.inf)

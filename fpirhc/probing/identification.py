@@ -17,7 +17,6 @@ from scipy.signal import lfilter
 
 from fpirhc.errors import InvalidValue
 
-LEAST_CYCLES = 40
 _ENOUGH = 5.0  # difference of 2 log L, with which a dead time or a lag is still in its interval
 _WIDER = 1.5  # factor of all intervals: no body is exactly of this form
 _MOST_DEAD = 10  # cycles that are searched first
@@ -71,9 +70,9 @@ def identify(measured: np.ndarray, modelled: np.ndarray, period: float, usable: 
 
 def require_cycles(cycles: int) -> None:
     """Raise if these are too few."""
-    if cycles < LEAST_CYCLES:
+    if cycles < 40:
         raise InvalidValue(
-            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least {LEAST_CYCLES}, 300 are usual"
+            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least 40, 300 are usual"
         )
 
 
@@ -104,13 +103,10 @@ def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> C
     noise = math.sqrt(best.innovation * root * (2 if best.noise[1] else 1))
     drift = _smoothed(f - delayed(m, best.dead, best.lag, period) @ best.gains, *best.noise, 10.0**best.ratio)
     moved = float(np.sqrt(np.mean(np.diff(drift[_SETTLED:]) ** 2) / period))
-    ends = [
-        best,
-        *(_likeliest(one for one in fits if one.dead == end) for end in (dead.low, dead.high)),
-        *(_likeliest(one for one in fits if one.lag == end) for end in (lag.low, lag.high)),
-    ]
+    at = [("dead", dead.low), ("dead", dead.high), ("lag", lag.low), ("lag", lag.high)]
+    ends = (best, *(_likeliest(one for one in fits if getattr(one, what) == end) for what, end in at))
     edge = "dead time" if dead.high >= most else "lag" if lag.high >= lags[-1] else ""
-    return Channel(gains, dead, lag, noise, drift, moved, edge, tuple(ends))
+    return Channel(gains, dead, lag, noise, drift, moved, edge, ends)
 
 
 def delayed(m: np.ndarray, dead: int, lag: float, period: float) -> np.ndarray:
@@ -205,11 +201,7 @@ class End:
 
 
 class Estimates:
-    """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them.
-
-    `ends` are the best estimate, then the likeliest plants at both ends of the dead times, and of the lags, of all inputs.
-    `dead` and `lag` have the least, the estimated and the greatest of every input, shape (3, n).
-    """
+    """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them."""
 
     def __init__(self, channels: Sequence[Channel], seed: int) -> None:
         """Take the channels and the seed of the draws."""
@@ -222,12 +214,12 @@ class Estimates:
         self.smallest = float(np.quantile(real.min(axis=1), _QUANTILE))
         self.largest_real = float(np.quantile(real.max(axis=1), 1 - _QUANTILE))
         self.largest = _largest(draws)
-        self.dead, self.lag = (
+        self.dead, self.lag = (  # the least, the estimated and the greatest of every input, shape (3, n)
             np.array([(one.low, one.value, one.high) for one in some]).T
             for some in zip(*((one.dead_time, one.lag) for one in channels), strict=True)
         )
         self.drift = np.column_stack([one.drift for one in channels])  # by cycle, shape (cycles, n)
-        self.ends = tuple(
+        self.ends = tuple(  # the best, then the likeliest plants at both ends of dead times and of lags
             End(tuple(float(f.dead) for f in fits), tuple(f.lag for f in fits), np.array([f.gains for f in fits]))
             for fits in zip(*(one.ends for one in channels), strict=True)
         )

@@ -22,43 +22,28 @@ from fpirhc.probing.recording import excited, read_recording
 from fpirhc.summary import line, number
 from fpirhc.task.problem import Problem
 
-_USUAL = 300  # cycles
-
 
 @dataclass(frozen=True, eq=False)
 class Probe(FoundByName):
-    """What a probe has found.
+    """What a probe has found, by controlled quantity or by input."""
 
-    Args:
-        gain: lambda by response and model response, both by controlled quantity: 1 where the model is right.
-        dead_time: by input, in control cycles beyond the one that every loop has: all of it, with that of the measurement, and also
-            where the problem states some.
-        lag: by input, the dominant one, in the problem's unit of time; all of it too.
-        noise: by controlled quantity, rms of the measured response.
-        drift: by controlled quantity, rms change of what the model does not have, per square root of the unit of time.
-        deformation: the adaptation to use; None: no adaptation.
-        why: it is this one, or none.
-        trials: by name of the candidate, errors on the plant over those of the controller alone; empty where none were made.
-        candidates: by the same names.
-        problem: the problem with the estimated plant as its reality, to be reviewed or swept; None: it has no equations.
-        notes: what to know beside.
-        units: of responses, by controlled quantity.
-        time_unit: of the problem.
-    """
-
-    gain: Mapping[str, Mapping[str, Interval]]
-    dead_time: Mapping[str, Interval]
-    lag: Mapping[str, Interval]
-    noise: Mapping[str, float]
-    drift: Mapping[str, float]
-    deformation: Deformation | None
-    why: str
-    trials: Mapping[str, Trial] = field(default_factory=dict)
-    candidates: Mapping[str, Deformation] = field(default_factory=dict)
-    problem: Problem | None = None
-    notes: tuple[str, ...] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
-    time_unit: str = "s"
+    gain: Mapping[str, Mapping[str, Interval]]  # lambda by response and model response: 1 where the model is right
+    dead_time: Mapping[
+        str, Interval
+    ]  # by input, in cycles beyond the one that every loop has; all of it, stated or not
+    lag: Mapping[str, Interval]  # by input, the dominant one, in the problem's unit of time; all of it too
+    noise: Mapping[str, float]  # rms of the measured response
+    drift: Mapping[str, float]  # rms change of what the model does not have, per square root of the unit of time
+    deformation: Deformation | None  # the adaptation to use; None: no adaptation
+    why: str  # it is this one, or none
+    trials: Mapping[str, Trial] = field(default_factory=dict)  # by name of the candidate; empty where none were made
+    candidates: Mapping[str, Deformation] = field(default_factory=dict)  # by the same names
+    problem: Problem | None = (
+        None  # with the estimated plant as its reality, to be reviewed or swept; None: it has no equations
+    )
+    notes: tuple[str, ...] = ()  # what to know beside
+    units: Mapping[str, str] = field(default_factory=dict)  # of responses
+    time_unit: str = "s"  # of the problem
 
     @property
     def lines(self) -> str:
@@ -81,10 +66,9 @@ class Probe(FoundByName):
     def facts(self) -> tuple[tuple[str, str], ...]:
         """Every estimate as two texts."""
         gains = [
-            (f"gain of {row}" + (f" by {column}" if len(entries) > 1 else ""), _interval(one))
-            for row, entries in self.gain.items()
-            for column, one in entries.items()
-        ]
+            (f"gain of {row}{f' by {column}' if len(entries) > 1 else ''}", _interval(one))
+            for row, entries in self.gain.items() for column, one in entries.items()
+        ]  # fmt: skip
         dead = [(f"dead time of {name}, cycles", _interval(one)) for name, one in self.dead_time.items()]
         lags = [(f"lag of {name}, {self.time_unit}", _interval(one)) for name, one in self.lag.items()]
         noise = [(f"noise of {name}, {self.units[name]}", number(one)) for name, one in self.noise.items()]
@@ -138,21 +122,21 @@ def probe(
             raise InvalidValue(
                 f"{setting} is of an excitation, and a recording has been excited: leave one of them out"
             )
-    cycles = _USUAL if cycles is None else cycles
+    cycles = 300 if cycles is None else cycles
     require_cycles(cycles)
     bare = without_deformation(resolved(problem, controller))
-    if recording is None:
-        record = excited(problem, bare, cycles=cycles, amplitude=amplitudes, seed=seed)
-    else:
-        record = read_recording(Path(recording), problem)
+    listened = recording is None
+    record = (
+        excited(problem, bare, cycles, amplitudes, seed) if listened else read_recording(Path(str(recording)), problem)
+    )
     estimates = Estimates(identify(record.measured, record.modelled, problem.period, record.usable), seed)
-    trying, notes = trials and recording is None, [f"the run ended early: {record.stop}"] if record.stop else []
+    trying, notes = trials and listened, [f"the run ended early: {record.stop}"] if record.stop else []
     estimated, shortlist, results, name = None, dict[str, Deformation](), dict[str, Trial](), None
     why = estimates.refused or ("" if trying else estimates.unbounded)
     if not why:
         notes += filter(None, [estimates.unbounded])
         try:
-            choice = Choice(problem, bare, estimates, budget)
+            choice = Choice(problem, bare, estimates, budget or {})
             estimated, shortlist = choice.problem, choice.shortlist()
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"

@@ -100,14 +100,9 @@ def sequence(cycles: int, channels: int, seed: int) -> np.ndarray:
 
 
 def excited(
-    problem: Problem, controller: Controller, *, cycles: int, amplitude: Mapping[str, float] | None, seed: int
+    problem: Problem, controller: Controller, cycles: int, amplitude: Mapping[str, float] | None, seed: int
 ) -> Record:
-    """Return the record of a run under the controller without its deformation, excited.
-
-    Args:
-        amplitude: in the unit of the response, by controlled coordinate; None: twice the noise of a silent run of
-            the same length and a tenth of the deviation of its desired response.
-    """
+    """Return the record of a run without deformation, excited; amplitude None: twice the noise and a tenth of what is desired."""
     short, bare = replace(problem, duration=cycles * problem.period, measure_from=0.0), without_deformation(controller)
 
     def run_with(amplitude: tuple[float, ...]) -> tuple[Run, Record]:
@@ -130,12 +125,7 @@ def excited(
 
 
 def read_recording(path: Path, problem: Problem) -> Record:
-    """Return the record in a CSV file.
-
-    Its columns are "time", every input by name (the command that is sent at this time;
-    "input NAME" where a coordinate has the same name), the elements of the model's state, and the
-    responses ("q1''"); a response without a column is the difference of its lower derivative over a cycle.
-    """
+    """Return the record in a CSV file; a response without a column is the difference of its lower derivative over a cycle."""
     table = _table(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
     missing = [n for n in ("time", *input_columns(plant), *plant.state.elements) if n not in table]

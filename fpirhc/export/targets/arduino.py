@@ -30,7 +30,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     }
 
 
-TARGET = Target("arduino", "a library folder of the Arduino IDE, in float, with an example", _files)
+TARGET = Target("arduino", _files)
 
 
 def _pace(device: Device, unit: str) -> str:

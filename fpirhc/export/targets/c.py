@@ -54,7 +54,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     }
 
 
-TARGET = Target("c", "C99 without heap, files and globals: header, controller, layout, replay, CMake file", _files)
+TARGET = Target("c", _files)
 
 
 def filled(device: Device, file: str, **more: str) -> str:

@@ -67,7 +67,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     return {f"{device.name}.fmu": _archive(contents)}
 
 
-TARGET = Target("fmu2", "FMI 2.0 unit for co-simulation", _files)
+TARGET = Target("fmu2", _files)
 
 
 # Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest

@@ -46,6 +46,4 @@ def _listed(layout: Layout) -> str:
     return ", ".join(f"`{name}` [{unit}]" for name, unit in zip(layout.columns, layout.units, strict=True))
 
 
-TARGET = Target(
-    "library", "a shared library whose functions take arrays, for LabVIEW, MATLAB, ctypes and others", _files
-)
+TARGET = Target("library", _files)

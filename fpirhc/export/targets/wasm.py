@@ -30,4 +30,4 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     }
 
 
-TARGET = Target("wasm", "WebAssembly with a wrapper in JavaScript", _files)
+TARGET = Target("wasm", _files)
