@@ -265,11 +265,6 @@ def like(signal: Signal, name: str) -> Signal:
     return Signal(name, signal.elements, signal.units)
 
 
-def bounded(built: Built, tracking: Tracking) -> Tracking:
-    """Return the law with its memory bounded by what the problem's limits can need."""
-    return tracking.within(built.largest)
-
-
 def desired_blocks(built: Built, tracking: Tracking) -> list[Block]:
     """Return the blocks reference, target, nominal and tracking: together they write 'desired'."""
     plant = built.plant
@@ -277,7 +272,7 @@ def desired_blocks(built: Built, tracking: Tracking) -> list[Block]:
         reference_block(built),
         rename("target", like(plant.output, "reference"), like(plant.output, "_target")),
         rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-        bounded(built, tracking).law(plant, built.period),
+        tracking.within(built.largest).law(plant, built.period),
     ]
 
 
@@ -300,5 +295,5 @@ def _between(
 ) -> tuple[list[Block], list[Delay]]:
     """The blocks between those of the desired response and the update of the tracking law."""
     plant, (blocks, delays) = built.plant, closing
-    update = bounded(built, tracking).update(plant, built.period)
+    update = tracking.within(built.largest).update(plant, built.period)
     return [*desired_blocks(built, tracking), *blocks, update], [*delays, *tracking.delays(plant)]

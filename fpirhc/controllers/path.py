@@ -43,9 +43,6 @@ ACTED, NOW = "_signals_acted", "_parameters_now"  # what a model is told of the 
 MEASURED, MEASURED_OUTPUT, MEASURED_TIME = "_measured_state", "_measured_output", "_measured_time"
 
 
-# ---- what a model is told, and what acted -----------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class Told:
     """What a model is told of signals from outside."""
@@ -172,9 +169,6 @@ def stated_path(problem: Problem) -> Path:
     return Path(problem, "observer", last, waits, whole(late.measurement / period))
 
 
-# ---- the parallel model -----------------------------------------------------------------------------------------------------
-
-
 class Answers(NamedTuple):
     """The responses that a model gives."""
 
@@ -295,9 +289,6 @@ def _drift(motion: Signal, time: float) -> np.ndarray:
     return np.array([[time**k / math.factorial(k) if k >= 0 else 0.0 for k in row] for row in powers])
 
 
-# ---- the observer -----------------------------------------------------------------------------------------------------------
-
-
 def believe_block(problem: Problem, raw: Signal, shown: np.ndarray) -> Block:
     """Block (raw measurements, parameters, last command) -> (state, [output], realised).
 
@@ -342,9 +333,6 @@ def observed_model(problem: Problem) -> Model:
 def believed_integrator(problem: Problem) -> Integrator:
     """Return the integrator of the model: the problem's, or a Runge-Kutta step where that is a call without Jacobian."""
     return RungeKutta4() if problem.integrator.opaque else problem.integrator
-
-
-# ---- the learner ------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,9 +410,6 @@ class Pairs:
         late, period = self.dead_time, self.problem.period
         waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
         return Queue(tuple(whole(wait / period + self._delay) for wait in waits))
-
-
-# ---- what is measured, where a controller acts on what is predicted -------------------------------------------------------------
 
 
 def measured_state(plant: Plant) -> Signal:

@@ -65,6 +65,18 @@ def test_null_with_a_measured_response_and_dead_time(wait):
     assert change(problem, fp.Predicted(law, **ahead), fp.Predicted(adaptive, **ahead)) <= 1e-9
 
 
+def test_a_part_of_a_cycle_is_believed_as_the_nearest_whole_one():
+    """Of a plant that is late by 3.3 cycles: the same commands as where 3 are stated, and others than with 4."""
+    late = fp.DeadTime(inputs={"Q1": 3.3e-3, "Q2": 3.3e-3})
+    problem = short(replace(tasks.two_mass.problem, dead_time=late), 50)
+    forms = (fp.ModelReferenced(SIGMOID, cycles=cycles) for cycles in (None, 3, 4))
+    own, three, four = (
+        fp.simulate(problem, fp.ComputedTorque(LAW, f), seed=0, compiled=False)["command"] for f in forms
+    )
+    assert np.array_equal(own, three)
+    assert not np.array_equal(own, four)
+
+
 @pytest.mark.parametrize("order", [1, 3, 4])
 def test_null_at_other_orders(order):
     problem = fp.Problem(

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, bounded, closing_blocks, desired_blocks, fed, like
+from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks, fed, like
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.path import MEASURED_TIME, Pairs
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
@@ -79,7 +79,7 @@ class AdaptiveInverseDynamics(Controller):
             *([_earlier_targets(built)] if self._remembers(built) else []),
             self._learn_block(built),
             *(fed(block, "parameters", believed) for block in closing),
-            bounded(built, self.tracking).update(plant, built.period),
+            self.tracking.within(built.largest).update(plant, built.period),
         ]
         return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
 
