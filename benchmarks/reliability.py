@@ -80,15 +80,6 @@ def files() -> str:
     return f"{_table(rows)}\n\n{_what_went(wrong)}"
 
 
-def strangers() -> str:
-    """Libraries that another user may have planted."""
-    from helpers.attack.strangers import planted_and_run
-
-    with tempfile.TemporaryDirectory() as folder:
-        ran = planted_and_run(Path(folder))
-    return _table([["planted in the cache", "code of others run"], *([way, str(int(run))] for way, run in ran.items())])
-
-
 def problems() -> str:
     """Problem files with mistakes."""
     import pytest
@@ -105,7 +96,6 @@ def problems() -> str:
 SECTIONS: dict[str, tuple[str, Callable[[], str]]] = {
     "loop": ("The loop", loop),
     "files": ("Files and processes", files),
-    "strangers": ("Other users", strangers),
     "problems": ("Problem files", problems),
 }
 

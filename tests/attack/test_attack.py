@@ -1,14 +1,11 @@
 """A machine survives what sensors, actuators, clocks and disks do: a share of the attacks here, all of them with `-m slow`."""
 
-import os
-
 import pytest
 from helpers.attack.artefacts import ARTEFACTS, flipped
 from helpers.attack.commands import prepared, random_line, raw_end
 from helpers.attack.faults import FAULTS
 from helpers.attack.files import flipped_bits, killed_compilations
 from helpers.attack.harness import PROBLEMS, Bench, shipped
-from helpers.attack.strangers import planted_and_run
 from helpers.machine import needs_compiler
 
 import fpirhc as fp
@@ -56,13 +53,6 @@ def test_flipped_bits_of_files_are_noticed(name, flips, tmp_path):
     """A saved run with a flipped bit is refused by name, or reads as it was written."""
     result = flipped(name, tmp_path / "flips", flips, seed=flips)
     assert (result.raw, result.unnoticed) == ((), 0)
-
-
-@needs_compiler
-@pytest.mark.skipif(os.name != "posix", reason="owners and modes of files are those of POSIX")
-def test_no_planted_library_runs(tmp_path):
-    """In whatever way another user could have written it."""
-    assert {way: ran for way, ran in planted_and_run(tmp_path).items() if ran} == {}
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])

@@ -160,7 +160,9 @@ def test_damaged_library_is_built_again(cache, damage):
 
 @needs_compiler
 @needs_posix
-@pytest.mark.parametrize("who", ["open to others", "of another user", "a link", "a pipe for a checksum"])
+@pytest.mark.parametrize(
+    "who", ["open to others", "open to a group", "of another user", "a link", "checksum open", "checksum a link", "checksum a pipe"]
+)  # fmt: skip
 def test_library_that_others_may_have_written_is_not_run(cache, who):
     """One that computes with another number, with a fitting checksum: it would differ from the virtual machine."""
     number = 4.512345678901
@@ -172,16 +174,17 @@ def test_library_that_others_may_have_written_is_not_run(cache, who):
     path.unlink()
     path.write_bytes(planted)
     checksum.write_text(hashlib.sha256(planted).hexdigest())
-    if who == "a link":
-        path.rename(path.with_name("elsewhere"))
-        path.symlink_to(path.with_name("elsewhere"))
-    elif who == "a pipe for a checksum":
-        checksum.unlink()
-        os.mkfifo(checksum)
+    one = checksum if who.startswith("checksum") else path
+    if who.endswith("a link"):
+        one.rename(one.with_name("elsewhere"))
+        one.symlink_to(one.with_name("elsewhere"))
+    elif who.endswith("a pipe"):
+        one.unlink()
+        os.mkfifo(one)
     elif who == "of another user" and os.geteuid() == 0:  # only root can give a file away
-        os.chown(path, 65534, 65534)
+        os.chown(one, 65534, 65534)
     else:
-        path.chmod(0o777)
+        one.chmod(0o775 if who == "open to a group" else 0o777)
     assert other_process(cache, number).wait() == 0
     assert path.read_bytes() != planted
     for one in (path, checksum):
