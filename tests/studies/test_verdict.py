@@ -157,12 +157,8 @@ def test_what_counts_and_what_comes_first():
     mine = fp.Metric("mine", lambda problem, run: float(run.controller.startswith("A+")) + 1, better="larger", unit="h")
     own = [*tasks.two_mass.metrics, mine]
     found = compared(cases, headline=("B", "B+FPI"), metrics=own, headline_metric="mine").findings
-    assert [(f.pair[1], str(f.outcome)) for f in found if f.pair] == [
-        ("B+FPI", "no difference"),
-        ("A+FPI", "better"),
-        ("B+FPI", "better"),
-        ("A+FPI", "better"),
-    ]
+    assert [f.pair[1] for f in found if f.pair] == ["B+FPI", "A+FPI"] * 2
+    assert [str(f.outcome) for f in found[:2]] == ["no difference", "better"]
     assert any(f.text.startswith("The smallest rms error is that of B+FPI: ") for f in found)
     broken = fp.Metric("mine", lambda problem, run: 1 / 0)
     [told] = compared({"A": cases["A"]}, metrics=[*tasks.two_mass.metrics, broken])["A"].metrics.broken.values()
