@@ -4,8 +4,6 @@ Each case changes a correct file (`first_files`) and runs a command on it. The m
 expected, and a fix; all mistakes of one file stand in it; the exit code is that of bad input, or of a review that answers no.
 """
 
-from __future__ import annotations
-
 import re
 import shlex
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The step inside counts its cycles, sums what it is given, and commands the sum. 
 shows in one number. Scalar code and a graph have two ways through the gate, and keep the same rules.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A controller or a map of a user's own that lacks what its contract asks for is told so by name, in the line that makes it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, cast

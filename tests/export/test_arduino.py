@@ -1,7 +1,5 @@
 """A library folder of the Arduino IDE: its sources compute in float, and a step's time is told beside the period."""
 
-from __future__ import annotations
-
 import subprocess
 
 import pytest

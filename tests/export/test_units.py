@@ -1,7 +1,5 @@
 """Controllers as units of FMI 2.0: valid by FMPy, equal to the stepper and to a run, and strict about what a master may do."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path

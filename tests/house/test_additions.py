@@ -1,7 +1,5 @@
 """A package of somebody else adds one member of each kind, one file each, and everything works with them."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Every shipped member of a family keeps the public laws, and every law catches a class that breaks it."""
 
-from __future__ import annotations
-
 import math
 import random
 from dataclasses import dataclass, replace

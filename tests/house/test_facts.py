@@ -1,7 +1,5 @@
 """Generic code asks objects for facts: what a user adds is treated as what ships, a wrapper of a wrapper as what it is made of."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

@@ -6,8 +6,6 @@ What belongs to a machine (times, versions, paths) is left out. What no kept tex
 width, and names that a user chose are shown as they are.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import replace

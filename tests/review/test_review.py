@@ -1,7 +1,5 @@
 """The table of a review: its keys and names, its exit code, and what it asks of whom."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -4,8 +4,6 @@ A case has a problem, controllers, and what is said of them: verdicts by name an
 Truths are closed forms or runs by `fpirhc.simulate` of another start, gain or model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The verdict: outcomes and ratios of errors that are played exactly, flags, remarks, and plants of others."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Controllers that break the contract, each in one thing, and the right one that they are made from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
