@@ -106,6 +106,14 @@ def _of_typer(error: Any) -> str:
     if type(error).__name__ == "NoSuchOption":
         valid = [name for one in context.command.get_params(context) for name in one.opts if name.startswith("--")]
         text = f"the option '{error.option_name}' is unknown.{nearest(error.option_name, valid)}".rstrip(".")
+    if getattr(getattr(error, "param", None), "name", "") == "controller" and context.params.get("problem"):
+        from fpirhc.errors import FpirhcError, listed
+        from fpirhc.problem_files.problem_file import load_problem
+
+        try:
+            text = f"{text}: one of {listed([*load_problem(context.params['problem']).controllers])}"
+        except FpirhcError as wrong:  # in the file
+            return str(wrong)
     return f"{text}. See {context.command_path} --help"
 
 

@@ -159,8 +159,6 @@ def nearest(name: object, valid: Iterable[str]) -> str:
     near = _near(name, names) if isinstance(name, str) else []
     quote = '"' if near and "'" in near[0] else "'"
     hint = f" Did you mean {quote}{near[0]}{quote}?" if near else ""
-    if quote != '"' and "_" in str(name) and (of := _base(str(name), "'")) in names:
-        hint = f" A derivative is v.{of} in equations of motion, and {of}' elsewhere."
     if len(names) <= _MANY:
         return f"{hint} Valid: {listed(names)}."
     shown = get_close_matches(str(name), names, n=_SHOWN, cutoff=0)
@@ -189,15 +187,16 @@ def _near(name: str, names: Sequence[str]) -> list[str]:
     """Valid names that may be meant, the likeliest first."""
     elsewhere = [one for one in OF_OTHER_TOOLS.get(name, ()) if one in names]
     for primes in _DERIVATIVES:
-        if (of := _base(name, primes)) is not None:
-            elsewhere += [one for one in names if one == (of or one.rstrip("'")) + primes]
+        if (of := derivative_of(name, primes)) is not None:
+            meant = [(of or one.rstrip("'")) + primes for one in names]
+            elsewhere += [one for one, own in zip(names, meant, strict=True) if one == own or one.endswith(f".{own}")]
     same = [one for one in names if one.casefold() == name.casefold()]
     inside = [one for one in names if len(name) > _LETTER and name.casefold() in one.casefold()]
     return [*elsewhere, *same, *get_close_matches(name, names, n=1, cutoff=0.5), *inside]
 
 
-def _base(name: str, primes: str) -> str | None:
-    """What a name is a derivative of, by the spellings of others; '' where it does not say."""
+def derivative_of(name: str, primes: str = "'") -> str | None:
+    """Return what a name is a derivative of, by the spellings of others, '' where it does not say; None where it is none."""
     found = re.fullmatch(_DERIVATIVES[primes], name, re.IGNORECASE)
     return found and "".join(filter(None, found.groups()))
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fpirhc.errors import InvalidName, InvalidValue, nearest
+from fpirhc.errors import InvalidName, InvalidValue, derivative_of, nearest
 from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric
 from fpirhc.simulation.simulate import JUDGING
@@ -82,20 +82,24 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> 
     """
     if name is None or name in (RELATIVE_ERROR, "error"):
         return Objective()
+    names: dict[str | None, Any] = {
+        None: (),
+        "coordinate": followed_units(problem.plant),
+        "input": problem.plant.inputs,
+    }
     for metric in metrics:
         element = name.removeprefix(metric.name).removeprefix(".")
-        if name != metric.key(element) or (element and metric.by is None):
+        if name != metric.key(element) or (element and element not in names.get(metric.by, (element,))):
             continue
         if metric.by is not None and not element:
-            raise InvalidValue(
-                f"metric '{metric.name}' has a number for every {metric.by}; give one: '{metric.name}.NAME'"
-            )
+            own = ", ".join(map(metric.key, names.get(metric.by, ("NAME",))))
+            raise InvalidValue(f"metric '{metric.name}' has a number for every {metric.by}; give one: {own}")
         if metric.by == "term" and (problem.cost is None or problem.horizon is None):
             raise InvalidValue(f"metric '{name}' needs Problem(horizon=..., cost=...), and this problem lacks one")
-        elements = {"coordinate": followed_units(problem.plant), "input": problem.plant.inputs}.get(metric.by or "", ())
-        if elements and element not in elements:
-            raise InvalidName(f"metric '{name}' is unknown.{nearest(name, [metric.key(one) for one in elements])}")
         if metric.better == "neither":
             raise InvalidValue(f"metric '{name}' has no better direction, so nothing can be judged by it")
         return Objective(metric, element, metric.unit_of(problem, element))
-    raise InvalidName(f"metric '{name}' is unknown.{nearest(name, [RELATIVE_ERROR, *(m.name for m in metrics)])}")
+    own = f"state.{derivative_of(name.rpartition('.')[2])}'"
+    rate = f' For a derivative: metrics = [fp.figures.Largest("{own}")].' if own[6:-1] in names["coordinate"] else ""
+    valid = [metric.key(one) for metric in metrics for one in names.get(metric.by) or ("",)]
+    raise InvalidName(f"metric '{name}' is unknown.{rate}{nearest(name, [RELATIVE_ERROR, *valid])}")

@@ -23,8 +23,7 @@ from fpirhc.studies.variants import CasesOf, Draws, Variants
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, written_out
 
-_TAIL = 0.025  # on either side of an interval
-_MOVES = "total_variation."  # by input
+_TAIL, _MOVES = 0.025, "total_variation."  # on either side of an interval; the metric of movement
 _ABREAST, _EVEN = 2, 1e-6  # panels of a picture; by how much equal steps of an axis differ
 _CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than"}
 

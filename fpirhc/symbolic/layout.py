@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, derivative_of, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, column
 
 __all__ = ["Expression", "Kind", "Layout", "Named", "Signal", "discrete", "scalar", "vector"]
@@ -125,6 +125,8 @@ class Named:
             number = (
                 f" Entries have names, such as .{self._elements[0]}, and no numbers." if isinstance(name, int) else ""
             )
+            if (of := derivative_of(str(name))) in self._elements:
+                number = f" The derivative of {of} is v.{of}."
             raise InvalidName(f"{self._what} '{name}' is unknown.{number}{nearest(name, self._elements)}") from None
 
     def __iter__(self) -> Iterator[str]:

@@ -112,6 +112,8 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     ],
     "run": [
         (None, "run line.py CTC --no-compile --out kept", 0, ""),
+        (None, "run line.py", 2, "fpirhc: Missing argument 'CONTROLLER': one of CTC, CTC+FPI"),
+        (None, "run lime.py", 2, "fpirhc: no file at 'lime.py'. Did you mean 'line.py'?"),
         (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
         (DIVERGING, "run line.py CTC --no-compile", 4, ""),
     ],

@@ -206,7 +206,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a parameter twice": (of_case({"exact.b": 1.0, "known.b": 2.0}), r"'known.b' and 'exact.b' set the same number"),
     "a misspelt headline": (
         lambda t: fp.study(t, fp.Draws(1), headline="rms_eror.y", compiled=False),
-        "Did you mean 'rms_error'",
+        "Did you mean 'rms_error.y'",
     ),
     "a headline without a better": (
         lambda t: fp.study(t, fp.Draws(1), headline="effort.u", compiled=False),
