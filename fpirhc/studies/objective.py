@@ -82,11 +82,7 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> 
     """
     if name is None or name in (RELATIVE_ERROR, "error"):
         return Objective()
-    names: dict[str | None, Any] = {
-        None: (),
-        "coordinate": followed_units(problem.plant),
-        "input": problem.plant.inputs,
-    }
+    names: Any = {None: (), "coordinate": followed_units(problem.plant), "input": problem.plant.inputs}
     for metric in metrics:
         element = name.removeprefix(metric.name).removeprefix(".")
         if name != metric.key(element) or (element and element not in names.get(metric.by, (element,))):
