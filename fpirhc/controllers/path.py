@@ -373,8 +373,8 @@ class Pairs:
 
     @property
     def late(self) -> float:
-        """How long before the cycle the response was realised, in units of time."""
-        return self.dead_time.measurement + self._delay * self.problem.period
+        """How long before the cycle the state of a pair was that of the plant, in units of time."""
+        return self.dead_time.measurement + whole(self._delay) * self.problem.period
 
     @property
     def memory(self) -> tuple[Signal, ...]:

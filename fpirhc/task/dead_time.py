@@ -204,8 +204,9 @@ class Queue:
         return ca.vertcat(*entries)
 
     def at(self, queue: Expression, size: int, cycles: Expression) -> Expression:
-        """Return what was pushed so many cycles ago, all entries alike; the number is known at run time."""
-        return ca.vertcat(*(self._read(queue[j::size], cycles) for j in range(size)))
+        """Return what was pushed the nearest whole number of cycles ago, all entries alike; the number is known at run time."""
+        place = ca.floor(cycles + 0.5 - WHOLE)
+        return ca.vertcat(*(entry_at(queue[j::size], place) for j in range(size)))
 
     def driven(
         self, step: ca.Function, state: Expression, queue: Expression, size: int, held: Sequence[Expression]
@@ -223,12 +224,6 @@ class Queue:
         columns = ca.horzcat(*(queue[size * k : size * (k + 1)] for k in reversed(range(longest))))
         repeated = (ca.repmat(v, 1, longest) for v in held)
         return step.mapaccum("fpirhc_driven", longest)(state, columns, *repeated)[:, -1]
-
-    def _read(self, past: Expression, cycles: Expression) -> Expression:
-        """What was pushed a number of cycles ago that is known at run time, interpolated."""
-        whole = ca.floor(cycles + WHOLE)
-        part = ca.if_else(whole < ca.ceil(cycles - WHOLE), ca.fmax(cycles - whole, 0), 0)
-        return entry_at(past, whole) * (1 - part) + entry_at(past, whole + 1) * part
 
     def _height(self, j: int) -> float:
         """Of the triangle, `j` cycles from its middle."""
