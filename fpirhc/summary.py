@@ -131,7 +131,7 @@ def behind_equals(value: float, digits: int = 4) -> str:
 
 def in_percent(share: float) -> str:
     """Return a share in percent, in three digits; what is below a thousandth of a percent is said to be so."""
-    return "less than 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{100 * share:.3g} %"
+    return "less than 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{written_out(100 * share)} %"
 
 
 def beside(value: float, scale: float) -> str:

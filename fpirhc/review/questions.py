@@ -133,8 +133,8 @@ def _saturates(case: Case) -> Fact | None:
     if held <= SATURATED and used[at] < UNUSED:
         change = "State the limits that the actuator has: tolerances of plans are shares of them."
         return Fact(Verdict.CAUTION, numbers, names[at], change)
-    change = "The reference needs less than the limits: mend what else is a no." if needed <= 1 else ""
-    lost = held > MOSTLY and (bench.share(run) > GOOD or 1 < needed < math.inf)
+    change = "It needs less: {slower}, shorten the period, or state the dead time." if needed <= 1 else ""
+    lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
     return Fact(Verdict.NO if lost else graded(held, SATURATED, math.inf), numbers, names[at], change)
 
 
@@ -464,11 +464,11 @@ QUESTIONS = (
              "Mend the loop without adaptation first: {settings}, limits, period."),
     Question("input_limits", "Do the input limits fit the task?", _saturates,
              "a command at a limit in {at_a_limit:%} of the cycles of {whole}"
-             "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| the reference needs {needed:%} of it",
-             "Slow the reference, or widen the limits: it needs more than they allow."),
+             "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the model the reference needs {needed:%}",
+             "Slow the reference, widen the limits, or mend the model: by it they do not reach."),
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
-             "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:4} per cycle"
-             "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:4}"
+             "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle"
+             "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}"
              "| commands change by {mean_step:%} of their range a cycle", "{slower}, shorten the period, or state the dead time."),
     Question("horizon", "Is the horizon long enough?", _horizon,
              "relative rms error {error:%} ({half})| {error_with_twice_the_horizon:%} with twice the stages",
