@@ -458,7 +458,7 @@ QUESTIONS = (
              "| {error_at_four_times:%} at four times| {error_turned:%} with the other sign| recommended gain {recommended_gain:4}"
              "| total variation of {of} {movement:r} ({start})| {movement_recommended:r} as recommended"
              "| {movement_without:r} without adaptation",
-             "There is no reserve: twice this gain is lost.", "adaptive"),
+             "There is no reserve: with twice this gain it does not come back, or moves the command twice as much.", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows,
              "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}",
              "Mend the loop without adaptation first: {settings}, limits, period."),
@@ -478,8 +478,8 @@ QUESTIONS = (
              "| relative rms error {error:%} ({start})", "Narrow the range of the parameters, or {slower}."),
     Question("input_gain", "Does it bear half and twice the gain of the inputs?", _gains,
              "it comes back at {least} to {most} times their gain", "{slower}: with more gain of the inputs it is lost."),
-    Question("latency", "Does it bear three cycles of latency?", _latency, "{cycles_borne} of 3 ({time_borne} {time})"
-             "| with {cycles_tried} cycles: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
+    Question("latency", "Does it bear three cycles of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
+             "| with {cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
              "| commands change by {mean_step:%} of their range per cycle| {mean_step_without:%} without latency"
              "| {left:%} of a push left after {pushed}", "Measure the latency and state it: Problem(dead_time=...)."),
     Question("limits", "Do states, rates and paths keep their limits?", _left,
