@@ -192,7 +192,11 @@ def said(name: str) -> dict[tuple[str, str], Any]:
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
-@pytest.mark.parametrize("name", CASES)
+LONG = ("two pendulums", "a servo", "an own map")  # four seconds and more
+LANES = [pytest.param(name, marks=pytest.mark.slow if name.startswith(LONG) else ()) for name in CASES]
+
+
+@pytest.mark.parametrize("name", LANES)
 def test_what_is_said_is_true(name):
     """It prints the table: pytest -k is_true -rP."""
     case, found = CASES[name], said(name)
@@ -206,7 +210,7 @@ def test_what_is_said_is_true(name):
     assert {key: found[key].change for key in case.changes} == case.changes
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", LANES)
 def test_a_yes_carries_no_growing_factor_and_no_advice(name):
     for (_, key), answer in said(name).items():
         if answer.verdict == "yes":
