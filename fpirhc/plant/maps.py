@@ -17,6 +17,7 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.plant.motion import Motion, sampling
 from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.open import nominal
 
 _Motion = TypeVar("_Motion", bound=Motion)
 _WHOLE = 1e-6  # share of a step by which a cycle may differ from a whole number of steps
@@ -193,7 +194,7 @@ def check_modes(law: object, plant: Motion, gains: Sequence[float]) -> None:
     if plant.step is None or not gains:
         return
     cycle = sampling(plant)
-    poles = 1 + cycle * np.roots([1.0, *reversed([float(g) for g in gains])])
+    poles = 1 + cycle * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
     if np.abs(poles).max() >= 1:
         worst = complex(poles[int(np.abs(poles).argmax())])
         shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"

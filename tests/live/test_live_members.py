@@ -6,6 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers.forms import FORMS
 from helpers.on_problem import named, on_problem
 
 import fpirhc as fp
@@ -155,6 +156,21 @@ def test_a_quantum_is_live_behind_every_estimator(estimator):
     paths = [f"sensing.sensors.{name}.quantum" for name in quanta]
     tried = check_live(problem, fp.ComputedTorque(TRACKING, fp.Identity()), paths=paths, cycles=200)
     assert all(t.factor for t in tried), tried
+
+
+OBSERVED = [("believed", "noise.w", "measured.y"), ("believed map", "noise.z", "measured.y")]
+
+
+@pytest.mark.parametrize(("form", "noise", "sensor"), OBSERVED)
+def test_every_number_of_an_observer(form, noise, sensor):
+    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.2))
+    tried = check_live(FORMS[form][0], controller, paths=[f"sensing.observer.{n}" for n in (noise, sensor)], cycles=30)
+    assert all(t.factor for t in tried), tried
+
+
+def test_the_poles_of_a_law_on_a_map_are_live():
+    task = fp.load_problem("fishery")
+    assert check_live(task.problem, task.controllers["CTC"], paths=["tracking.poles"], cycles=12)[0].factor
 
 
 def test_a_noise_changes_during_a_run():

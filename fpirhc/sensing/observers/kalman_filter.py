@@ -26,7 +26,7 @@ from fpirhc.sensing.base import (
     values_of,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import overlaid
+from fpirhc.symbolic.open import nominal, overlaid
 
 _STATE, _COVARIANCE, _VARIANCES = "observer_state", "observer_covariance", "observer_variances"
 
@@ -81,7 +81,9 @@ class KalmanFilter(StateObserver):
             (
                 Signal(_STATE, state.elements, state.units, tuple(map(float, model.start))),
                 Signal(_COVARIANCE, entries, start=tuple(map(float, first.ravel()))),
-                Signal(_VARIANCES, (*self.noise, *self.measured), start=tuple(float(d**2) for d in self._deviations)),
+                Signal(
+                    _VARIANCES, (*self.noise, *self.measured), start=tuple(nominal(d) ** 2 for d in self._deviations)
+                ),
             )
         )
 
