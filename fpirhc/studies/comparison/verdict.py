@@ -184,7 +184,7 @@ FLAGS = (
     Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last| as in an unstable loop", True),
     Flag(_unsolved, 0.05, "{value:%} of its plans did not converge| give the optimiser more iterations", True),
-    Flag(_at_limit, 0.2, "its command stands at a limit in {value:%} of the cycles| where no adaptation can act", True),
+    Flag(_at_limit, 0.2, "its command stands at a limit in {value:%} of the cycles| no adaptation can act there", True),
     Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation| it chatters", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles| see the gain in fpirhc review"),
@@ -195,7 +195,7 @@ FLAGS = (
 def flags_of(pair: Pair) -> tuple[list[tuple[Flag, str]], str]:
     """Return the flags that are raised for a pair, each with its sentence, and what all of them measured."""
     every = [(flag, flag.measure(pair)) for flag in FLAGS]
-    raised = [(flag, in_words(flag.text, {"value": value}, {})) for flag, value in every if value > flag.least]
+    raised = [(f, in_words(f.text.replace("|", ":"), {"value": v}, {})) for f, v in every if v > f.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
     kept = [
         (f, v) for f, v in every if f.measure is not _chatters and (v > 0 or ":%" in f.text)
@@ -309,7 +309,7 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:
-            yield f"{exact.name}, exact, is no bound here. Smaller errors: {', '.join(beaten)}; their cost or rate is another."
+            yield f"{exact.name} is no bound here; smaller errors: {', '.join(beaten)}. Its cost or its rate is another."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
             lost = [n for n in entry.errors if yard.beyond(entry, n)]
