@@ -213,16 +213,7 @@ def answer_block(path: Path, answers: Answers | None = None) -> Block:
 
 
 def _twin(path: Path) -> Block:
-    """Block (what is measured, last command, parameters) -> the model's response behind sensors and estimator.
-
-    The model moves over a cycle to x^ = F(x, u). Outputs that it computes are not the measured ones, so it has an offset o, a
-    polynomial in y ... y^(r-1) as the plans have, and shows y^(x^) + o to the sensors. The estimator makes outputs and response of
-    that. What separates these outputs from the measured ones moves the offset and what the estimator remembers, so that the samples
-    stay on one path.
-
-    The next cycle begins at the state that is given. A state that outputs show is the model's own, moved as they are: a state that
-    is estimated is late and noisy. The offset takes up what x^ is away from that state.
-    """
+    """Block (what is measured, last command, parameters) -> the model's response behind sensors and estimator."""
     problem, plant, estimator = path.problem, path.problem.plant, path.problem.sensing.estimator
     names, calm, given = estimator.measures(plant), np.zeros(len(plant.names)), measured_output(plant)
     estimate = estimator.block(plant, problem.period, problem.start_output, Signal("_seen", names))
@@ -239,12 +230,16 @@ def _twin(path: Path) -> Block:
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, parameters, age, later = path.acted(s)
         at = ca.if_else(age < 0.5, s.mirror_state, advance(s.mirror_state, mean, parameters, calm))
+        # Outputs of the model are not the measured ones: the sensors are shown y^(x^) + o, with o a polynomial in y ... y^(r-1).
         offset = ca.if_else(age < 0.5, s.mirror_offset, ahead @ s.mirror_offset)
         past = [getattr(s, m.name) for m in own]
         shown, response, *memories = estimate.function(seen(at, end, parameters, offset), *past)
         measured, away = getattr(s, MEASURED), getattr(s, given.name) - shown
+        # What separates the outputs moves the offset and what the estimator remembers, so the samples stay on one path.
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
         told = ca.if_else(is_finite(measured), measured, at)
+        # The next cycle begins at the state that is given. One that outputs show is estimated, so it is late and noisy: there the
+        # model keeps its own, moved as the outputs are, and an exact model answers as the plant does, to rounding.
         begins = ca.vertcat(*(told[k] if place < 0 else at[k] + move[place] for k, place in shown_by))
         turn = outputs(at, end, parameters) - outputs(begins, end, parameters)
         later |= {"mirror_state_next": begins, "mirror_offset_next": offset + move + turn}
