@@ -29,13 +29,12 @@ from fpirhc.symbolic.driver import compiled_plans
 WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size of the task
 ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
-MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing of a loop
+MOSTLY, BUSY = 0.5, 2.0  # share of the cycles at a limit that shows no loop; times the movement without adaptation
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
 SATURATED, UNUSED = 0.2, 0.01  # share of the cycles at a limit; largest command as a share of its limit
-BUSY = 2.0  # times the total variation of commands without adaptation
 
 
-Errors = Mapping[str, float]  # by quantity
+Numbers = Mapping[str, float]
 
 
 class Verdict(StrEnum):
@@ -48,7 +47,7 @@ class Fact(NamedTuple):
     """What was measured: numbers by fixed names, of one quantity; `change` in place of the row's sentence."""
 
     verdict: Verdict
-    numbers: Mapping[str, float]
+    numbers: Numbers
     of: str = ""
     change: str = ""
     unit: str = ""  # where it is no unit of a followed quantity or an input
@@ -78,9 +77,10 @@ def _turns(case: Case) -> Fact | None:
 
 
 def _posed(case: Case) -> Fact | None:
-    commands = needed_commands(case.problem, case.bench.nominal["plant_state"])
-    finite = np.isfinite(commands).all(axis=1)
-    return Fact(Verdict.YES if finite.all() else Verdict.NO, {"share_finite": finite.mean()}) if len(finite) else None
+    finite = np.isfinite(needed_commands(case.problem, case.bench.nominal["plant_state"])).all(axis=1)
+    by_run = min(case.problem.plant.equations.known_by_outputs) < 0  # it has states that are taken from the run
+    verdict = Verdict.YES if finite.all() else Verdict.CAUTION if by_run else Verdict.NO
+    return Fact(verdict, {"share_finite": finite.mean()}) if len(finite) else None
 
 
 def _orders(case: Case) -> Fact:
@@ -115,8 +115,8 @@ def _follows(case: Case) -> Fact:
 
 
 def _saturates(case: Case) -> Fact | None:
-    bench, run, names = case.bench, case.bench.nominal, list(case.problem.plant.inputs)
-    limits = np.array(bench.problem.limits.input_bounds(case.problem.plant))
+    bench, run, plant = case.bench, case.bench.nominal, case.problem.plant
+    limits, names = np.array(bench.problem.limits.input_bounds(plant)), list(plant.inputs)
     if not run.cycles or not np.isfinite(limits).any():
         return None
 
@@ -129,11 +129,11 @@ def _saturates(case: Case) -> Fact | None:
     at = int(bench.at_limits(run).mean(axis=0).argmax() if held > SATURATED else used.argmin())
     needed = of_limit(needed_commands(case.problem, run["plant_state"]))[at]
     numbers = {"at_a_limit": held, "largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
-    numbers |= {"needed": needed} if np.isfinite(needed) else {}
+    numbers |= {"needed": needed} if np.isfinite(needed) and min(plant.equations.known_by_outputs) >= 0 else {}
     if held <= SATURATED and used[at] < UNUSED:
         change = "State the limits that the actuator has: tolerances of plans are shares of them."
         return Fact(Verdict.CAUTION, numbers, names[at], change)
-    change = "It needs less: {slower}, shorten the period, or state the dead time." if needed <= 1 else ""
+    change = "It needs less: {slower}, or state the dead time." if numbers.get("needed", math.inf) <= 1 else ""
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
     return Fact(Verdict.NO if lost else graded(held, SATURATED, math.inf), numbers, names[at], change)
 
@@ -397,7 +397,7 @@ def gain_by_run(case: Case) -> Fact:
     return Fact(graded(largest, 2.0, 0.0) if good else Verdict.NO, numbers, of, change)
 
 
-def _added(case: Case, without: Errors, adapted: Errors, slight: float = 0.0) -> tuple[str, dict[str, float], float]:
+def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) -> tuple[str, dict[str, float], float]:
     """The quantity that is made worse with most added, its errors, and how many times; `slight` is a share of the task."""
     sizes = {n: s for n, s in case.plain.sizes.items() if s and n in adapted}
     added = {n: math.inf if adapted[n] == math.inf else (adapted[n] - without[n]) / s for n, s in sizes.items()}
@@ -465,7 +465,7 @@ QUESTIONS = (
     Question("input_limits", "Do the input limits fit the task?", _saturates,
              "a command at a limit in {at_a_limit:%} of the cycles of {whole}"
              "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the model the reference needs {needed:%}",
-             "Slow the reference, widen the limits, or mend the model: by it they do not reach."),
+             "Slow the reference, widen the limits, or mend the model."),
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
              "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle"
              "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}"
