@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from functools import cache, reduce
+from functools import cache
 from types import FunctionType
 from typing import TypeVar, cast
 from weakref import WeakValueDictionary
@@ -28,7 +28,6 @@ ANEW = "state it in the problem or the controller, and build a loop for each num
 PREFIX = "setting."  # of the names of the symbols, and of the signals that are settings
 T = TypeVar("T")
 Value = TypeVar("Value", ca.SX, ca.MX)
-Number = float | ca.SX  # a field that may be open
 _LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
 _PLAIN: WeakValueDictionary[int, object] = WeakValueDictionary()  # frozen values without open numbers, by address
 _BUILT: dict[int, tuple[ca.SX, float]] = {}  # every symbol with the number of its build
@@ -210,11 +209,6 @@ def smaller(x: float, y: float) -> float:
 def larger(x: float, y: float) -> float:
     """Return the larger of two numbers."""
     return ca.fmax(x, y) if isinstance(x, ca.SX) or isinstance(y, ca.SX) else max(x, y)
-
-
-def smallest(values: Iterable[float]) -> float:
-    """Return the smallest of some numbers."""
-    return reduce(smaller, values)
 
 
 def between(x: float, low: float, high: float) -> float:
