@@ -12,7 +12,7 @@ import pytest
 import fpirhc as fp
 from fpirhc.conformance import posed
 
-MANY = 200  # set-points of every plant: a thousand in all
+MANY = 40  # set-points of every plant
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def problem_of(name: str, at: float) -> fp.Problem:
 @pytest.mark.parametrize("optimiser", OPTIMISERS.values(), ids=OPTIMISERS)
 @pytest.mark.parametrize("name", PLANTS)
 def test_the_first_command_of_a_plan_at_rest_is_the_feedforward(name, optimiser):
-    """At two hundred set-points, to 1e-6 of the range, with status OK."""
+    """At forty set-points, to 1e-6 of the range, with status OK."""
     one = PLANTS[name]
     problem = problem_of(name, sum(one.places) / 2)
     ocp, _, table = posed(problem)
@@ -101,7 +101,7 @@ def test_the_first_command_of_a_plan_at_rest_is_the_feedforward(name, optimiser)
 
 
 @pytest.mark.parametrize("gap", [8e-3, 9e-3 - 1e-9, 9e-3, 9e-3 + 1e-9, 9.00001e-3, 12e-3, 14.75e-3])
-@pytest.mark.parametrize("iterations", [None, 1, 2, 5])
+@pytest.mark.parametrize("iterations", [None, 1])
 def test_a_loop_begins_with_the_feedforward(gap, iterations):
     """By the controller itself, whatever its iterations: a ball held at 9 mm fell with one, and at 9.00001 mm it did not."""
     optimiser = fp.FixedPoint(iterations=iterations, tolerance=None if iterations is None else 1e-2)

@@ -171,13 +171,13 @@ def test_random_linear_plants_have_the_optimum_of_a_quadratic_program():
     """Stable and unstable plants, boxes of states and inputs: the same cost to 1e-7; the status says where no plan fits."""
     met: list[bool] = []
 
-    @settings(deadline=None, derandomize=True, max_examples=60)
+    @settings(deadline=None, derandomize=True, max_examples=30)
     @given(seed=st.integers(0, 10**6))
     def law(seed):
         met.append(same_optimum(seed))
 
     law()
-    assert 20 < sum(met) < len(met)  # plants with a plan and plants without
+    assert 10 < sum(met) < len(met)  # plants with a plan and plants without
 
 
 def same_optimum(seed: int) -> bool:
@@ -235,7 +235,7 @@ def least_violation(ocp, first, data):
 def test_a_linear_horizon_is_infeasible_where_a_linear_program_says_so():
     """In both directions, also of unstable plants whose limits are violated by ten times their size and more."""
     told = set()
-    for seed in range(200, 250):
+    for seed in range(200, 225):
         ocp, first, data, _, numbers = drawn(seed)
         least = least_violation(ocp, first, data)
         assert numbers[4] == (fp.Status.INFEASIBLE if least > 1e-7 else fp.Status.OK), (seed, least)
@@ -299,7 +299,7 @@ def _run_in_units(cost=1.0, force=1.0, length=1.0, time=1.0):
     return np.ravel(run["command.F"]) / force, np.ravel(run["status"])
 
 
-@pytest.mark.parametrize("seed", slow_but(range(60), *range(8)))
+@pytest.mark.parametrize("seed", slow_but(range(60), *range(3)))
 def test_commands_do_not_depend_on_the_units(seed):
     """Random units of cost, force, length and time: what counts as kept and as solved is a share of the limits."""
     cost, force, length, time = 10.0 ** np.random.default_rng(seed).uniform([-6, -4, -6, -3], [6, 4, 6, 3])
