@@ -24,8 +24,8 @@ The error is only a distance from the thermostat's set-point, which no plan has 
     in three days      bill and discomfort [EUR]    bill [EUR]    outside the band [K h]    by 0.2 K [h]
     PI                                      21.9          21.7                      0.34             1.0
     RHC                                     23.3          19.4                       5.7            13.8
-    RHC+FPI                                 20.7          19.6                       2.4             2.2
-    RHC offset-free                         20.4          19.5                       2.0             2.0
+    RHC+FPI                                 20.6          19.6                       2.1             1.8
+    RHC offset-free                         20.4          19.5                       1.7             1.5
     RHC exact model                         20.6          19.5                       1.9             1.8
 
 A plan saves a tenth of the thermostat's bill, because it heats at noon for the evening; a plan for a wrong house is too cold when
