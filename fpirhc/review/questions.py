@@ -128,7 +128,9 @@ def _saturates(case: Case) -> Fact | None:
     used = np.where(largest > ROUNDING, largest, np.inf)
     at = int(bench.at_limits(run).mean(axis=0).argmax() if held > SATURATED else used.argmin())
     needed = of_limit(needed_commands(case.problem, run["plant_state"]))[at]
-    numbers = {"at_a_limit": held, "largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
+    numbers = {"at_a_limit": held}
+    if largest[at] > ROUNDING:  # else it stands at a limit of zero
+        numbers |= {"largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
     numbers |= {"needed": needed} if np.isfinite(needed) and min(plant.equations.known_by_outputs) >= 0 else {}
     if held <= SATURATED and used[at] < UNUSED:
         change = "State the limits that the actuator has: tolerances of plans are shares of them."
@@ -347,8 +349,9 @@ SAID = {TODAY: "error", TURNED: "error_turned", SMALLER[0]: "error_at_half", LAR
 
 def _tries(case: Case) -> dict[tuple[float, float], Try]:
     """Runs with other gains and filters: calm is what moves no command by more than is allowed or than today; good what helps."""
-    own, plain, tries, busy = case.bench, case.plain, dict[tuple[float, float], Try](), _busy(case)
-    useful, most, now = min(1.0, WORSE * plain.share(plain.counted) + SLIGHT), _allowed(case), own.moves(own.start)
+    own, tries, busy = case.bench, dict[tuple[float, float], Try](), _busy(case)
+    alone, most, now = case.plain.share(case.plain.counted), _allowed(case), own.moves(own.start)
+    useful = min(1.0, WORSE * alone + SLIGHT)
     most = most if busy else np.maximum(most, now)
 
     def tried(way: tuple[float, float]) -> bool:
@@ -364,7 +367,7 @@ def _tries(case: Case) -> dict[tuple[float, float], Try]:
     if not tried(TODAY):
         any(map(tried, SMALLER if busy else SMALLER[:2]))
     any(map(tried, FILTERS)) if busy else all(map(tried, LARGER))
-    if not any(one.good for one in tries.values()):  # is its sign wrong?
+    if not any(one.good and WORSE * one.error < alone for one in tries.values()):  # is its sign wrong?
         tried(TURNED)
     return tries
 
@@ -380,7 +383,10 @@ def gain_by_run(case: Case) -> Fact:
     good, now, fine = tries[TODAY].good, tries[TODAY].moves, [way for way, one in tries.items() if one.good]
     largest, calm = max(fine, default=TODAY)[0], [way for way in fine if tries[way].calm]
     best = min(calm, key=lambda way: tries[way].error, default=TODAY)
-    best = best if busy else max((way for way in calm if 2 * way[0] <= largest), default=best)
+    if not good and TURNED in calm and tries[TURNED].error <= WORSE * tries[best].error:
+        best = TURNED
+    elif not busy:
+        best = max((way for way in calm if 0 < 2 * way[0] <= largest), default=best)
     worst = int((now / np.maximum(before, 1e-300)).argmax())
     of, numbers = list(case.problem.plant.inputs)[worst], {"movement": now[worst], "movement_without": before[worst]}
     numbers |= {SAID[way]: one.error for way, one in tries.items() if way in SAID}
@@ -498,10 +504,10 @@ QUESTIONS = (
              "| one of {share_of_the_response:%} costs what adaptation gains| relative rms error {error:%} ({start})"
              "| {error_with_right_sensors:%} with right sensors", "Calibrate the sensor: a bias moves the plant.", "adaptive"),
     Question("model", "Does adaptation leave a right model alone?", _model, "model as the plant, without noise and disturbances: "
-             "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it| ({counted})",
+             "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
              "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
     Question("pays", "Does adaptation lower the error?", _pays, "rms error of {of} {error_without:u} without adaptation"
-             "| {error_with:u} with it| ({counted})| relative rms error {share_without:%} without| {share_with:%} with it"
+             "| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it ({counted})"
              "| divided by {divided_by}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...", "adaptive"),
 )  # fmt: skip
 ROOTS = ("turns", "posed", "plans", "gain")  # whose no is the cause of the others: their sentence stands there too

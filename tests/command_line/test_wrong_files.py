@@ -199,14 +199,14 @@ weights of states behind an output
 WRONG_TANKS = """
 start outside the limits
   start={"h1": 1.0 -> start={"h1": 3.0
-    no Do states, rates and paths keep their limits? ... (h1, beyond 0.50
+    no Do states, rates and paths keep their limits? ... h1 by at most 1.01 m, 50.5 % of its range
 limits reversed
   "pump1": (0.0, 2.0) -> "pump1": (2.0, 0.0)
   {"h1": (0.0, 2.0)} -> {"h1": (2.0, 0.0)}
     'pump1' has lower 2.0 above upper 0.0; swap them ... 'h1' has lower 2.0 above upper 0.0; swap them
 gain of the wrong sign
   gain=-0.7 -> gain=0.7
-    no Is the gain admissible? ... Use the recommended gain
+    no Is the gain admissible? ... Set the gain to -0.7
 """
 OTHERS = {
     "no input in the response": one(
@@ -332,7 +332,7 @@ review mine.py --controllers => '--controllers' requires an argument
 review mine.py --controllers RCH abc =>
     1. controller 'RCH' is unknown. Did you mean 'RHC'? ... 2. controller 'abc' is unknown. Valid: RHC, RHC+FPI.
 review mine.py --mismatch nan => expected percent of at least 0, such as 20%, got 'nan'
-study mine.py --draws 2 --headline rms_error => has a number for every coordinate; give one: 'rms_error.NAME'
+study mine.py --draws 2 --headline rms_error => has a number for every coordinate; give one: rms_error.angle
 study mine.py --draws 2 --headline '' => metric '' is unknown. Valid: relative error, cycles, rms_error
 study mine.py --draws 0 => '--draws'
 study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
