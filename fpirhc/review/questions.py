@@ -128,9 +128,8 @@ def _saturates(case: Case) -> Fact | None:
     used = np.where(largest > ROUNDING, largest, np.inf)
     at = int(bench.at_limits(run).mean(axis=0).argmax() if held > SATURATED else used.argmin())
     needed = of_limit(needed_commands(case.problem, run["plant_state"]))[at]
-    numbers = {"at_a_limit": held}
-    if largest[at] > ROUNDING:  # else it stands at a limit of zero
-        numbers |= {"largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
+    sizes = {"largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
+    numbers = {"at_a_limit": held} | (sizes if largest[at] > ROUNDING else {})  # it may stand at a limit of zero
     numbers |= {"needed": needed} if np.isfinite(needed) and min(plant.equations.known_by_outputs) >= 0 else {}
     if held <= SATURATED and used[at] < UNUSED:
         change = "State the limits that the actuator has: tolerances of plans are shares of them."
@@ -350,8 +349,8 @@ SAID = {TODAY: "error", TURNED: "error_turned", SMALLER[0]: "error_at_half", LAR
 def _tries(case: Case) -> dict[tuple[float, float], Try]:
     """Runs with other gains and filters: calm is what moves no command by more than is allowed or than today; good what helps."""
     own, tries, busy = case.bench, dict[tuple[float, float], Try](), _busy(case)
-    alone, most, now = case.plain.share(case.plain.counted), _allowed(case), own.moves(own.start)
-    useful = min(1.0, WORSE * alone + SLIGHT)
+    alone = case.plain.share(case.plain.counted)
+    useful, most, now = min(1.0, WORSE * alone + SLIGHT), _allowed(case), own.moves(own.start)
     most = most if busy else np.maximum(most, now)
 
     def tried(way: tuple[float, float]) -> bool:
@@ -507,7 +506,8 @@ QUESTIONS = (
              "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
              "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
     Question("pays", "Does adaptation lower the error?", _pays, "rms error of {of} {error_without:u} without adaptation"
-             "| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it ({counted})"
-             "| divided by {divided_by}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...", "adaptive"),
+             "| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "
+             "({counted})| divided by {divided_by}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...",
+             "adaptive"),
 )  # fmt: skip
 ROOTS = ("turns", "posed", "plans", "gain")  # whose no is the cause of the others: their sentence stands there too
