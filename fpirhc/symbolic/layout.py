@@ -190,6 +190,9 @@ class Layout:
         self.slice(name)
         return self.signals[self.names.index(name)]
 
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
     def __contains__(self, name: object) -> bool:
         return isinstance(name, str) and name in self._slices
 
