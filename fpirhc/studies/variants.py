@@ -107,8 +107,8 @@ class Draws(Variants):
     place = "plant"
 
     def __str__(self) -> str:
-        within = f"within {self.percent:g} % of the problem's"
-        return f"{self.count} plants of seed {self.seed}, exact parameters and dead times {within}"
+        within = f"exact parameters and dead times within {self.percent:g} % of the problem's"
+        return f"{self.count} plants of seed {self.seed}, {within if self.percent else 'drawn in noise and stated spreads alone'}"
 
     @property
     def same(self) -> Mapping[str, object]:

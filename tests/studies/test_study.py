@@ -69,6 +69,7 @@ def test_a_drawn_plant_is_its_number(task):
     assert len({seed for seed, _ in more}) == len({exact for _, exact in more}) == 20
     assert [seed for seed, _ in drawn(task, percent=10.0)] == [seed for seed, _ in some]
     assert all(one.problem is task.problem for one in fp.Draws(3).of(task))  # noise alone
+    assert str(fp.Draws(3)) == "3 plants of seed 0, drawn in noise and stated spreads alone"
 
 
 def test_factors_are_log_uniform():
