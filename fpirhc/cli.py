@@ -25,7 +25,7 @@ To begin:
 Exit codes:
   0  finished                      1  review answered no, or probe proposes nothing
   2  bad input                     3  a file or folder cannot be written
-  4  a run ended early, or a plan did not converge
+  4  the run of fpirhc run ended early, or a plan of compare --plans did not converge
   5  a metric changed (check)      6  a baseline is missing or unusable (check)
   7  a faulty installation (doctor)
   70 an error inside fpirhc        130 interrupted from the keyboard
@@ -299,7 +299,7 @@ def study(
         raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
-    if limits and (headline or processes or cluster):
+    if limits and (headline or (processes or 1) > 1 or cluster):
         raise typer.BadParameter(
             "--limits searches by the error, run after run: leave out --headline, --processes, --cluster"
         )
@@ -419,18 +419,28 @@ def check(
     ignore_below: Annotated[float, _given("PERCENT", "smaller changes than this count as none", parser=_percent)] = 0.0,
     baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
 ) -> None:  # fmt: skip
-    """Compare fresh results with their baselines. Exit code 5: a metric changed; 6: a baseline is missing or unusable."""
+    """Compare fresh results with their baselines. Exit code 5: a metric changed; 6: a baseline is missing or unusable; the highest
+    one of all problems counts, and one that cannot be run (2) stops no other.
+    """
+    from fpirhc.baselines.baseline import Judgement, problems_here
     from fpirhc.baselines.baseline import check as judge
-    from fpirhc.baselines.baseline import problems_here
+    from fpirhc.errors import FpirhcError
     from fpirhc.report.terminal import progress_bars, say
+    from fpirhc.summary import printable
 
     facts: dict[str, Any] = {"baselines": baselines, "processes": processes, "compiled": not no_compile}
+    found, broken = list[Judgement](), list[str]()
     with progress_bars() as progress:
-        names = problems or list(map(str, problems_here(Path())))
-        found = [judge(_task(one), ignore=ignore_below / 100, progress=progress, **facts) for one in names]
+        for name in problems or map(str, problems_here(Path())):
+            try:
+                found.append(judge(_task(name), ignore=ignore_below / 100, progress=progress, **facts))
+            except FpirhcError as error:
+                broken.append(str(error))
     for one in found:
         say(one.text, "" if one.holds else "bold red", wrap=False)
-    raise typer.Exit(6 if any(one.unusable for one in found) else 0 if all(one.holds for one in found) else 5)
+    for text in broken:
+        print(f"fpirhc: {printable(text)}", file=sys.stderr)
+    raise typer.Exit(max([2 * bool(broken), *(6 if one.unusable else 5 * (not one.holds) for one in found)]))
 
 
 @_command(

@@ -145,7 +145,7 @@ class Judgement:
 
     problem: str
     rows: pd.DataFrame  # controller, metric, expected, band, fresh, holds
-    stale: str = ""  # that the file is another one than that of the baseline
+    stale: str = ""  # that the file is not the one that was accepted
     unusable: str = ""  # why there is no comparison
 
     @property
@@ -164,7 +164,7 @@ class Judgement:
         if self.unusable:
             return f"{self.problem}: {self.unusable}"
         if self.holds:
-            return f"{self.problem}: {len(self.rows)} metrics hold"
+            return f"{self.problem}: {len(self.rows)} metrics hold{self.stale and f'; {self.stale}'}"
         head = f"{self.problem}: {self.stale}\n" if self.stale else ""
         changed = f"{len(self.changed)} of {len(self.rows)} metrics changed\n{self.changed.to_string(index=False)}"
         return f"{head}{self.problem}: {changed}"
@@ -202,7 +202,7 @@ def check(
         return Judgement(
             task.name, none, unusable=f"'{path.name}' is no whole baseline ({error!r}); measure it again: fpirhc accept"
         )
-    stale = "the problem file is another one than that of the baseline" if facts["file"] != file_hash(task.path) else ""
+    stale = "the problem file changed since it was accepted" if facts["file"] != file_hash(task.path) else ""
     fresh = run_variants(
         task, Repeats(seed), controllers=list(known), processes=processes, compiled=compiled, progress=progress
     )

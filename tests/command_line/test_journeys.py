@@ -116,13 +116,14 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "run lime.py", 2, "fpirhc: no file at 'lime.py'. Did you mean 'line.py'?"),
         (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
         (DIVERGING, "run line.py CTC --no-compile", 4, ""),
+        (None, "compare line.py --no-compile -c CTC CTC+FPI", 0, MASS),  # a comparison tells it as a result
     ],
     "study": [
         (None, "study line.py --draws 2 --mismatch 20% --no-compile", 0, "A mass on a line"),
         (None, "study line.py --draws 3 --mismatch 20% --no-compile --out twice", 0, "A mass on a line"),
         (None, "study line.py --draws 3 --mismatch 30% --no-compile --out twice", 3, "fpirhc: "),
         (None, "study line.py --over tracking.rate=2:6:3 exact.k=1:9:2:log -c CTC --no-compile", 0, "A mass on a line"),
-        (None, "study line.py --limits latency -c CTC --no-compile", 0, "A mass on a line"),
+        (None, "study line.py --limits latency --processes 1 -c CTC --no-compile", 0, "A mass on a line"),
         (WITH_CASES, "study line.py --cases soft --no-compile --json", 0, "{"),
         (None, "run line.py CTC --case soft --no-compile", 0, ""),
         (None, "run line.py CTC --case sof --no-compile", 2, "fpirhc: "),
@@ -140,7 +141,8 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "check --no-compile", 6, "line: there is no baseline"),
         (None, "accept line.py --reason first --no-compile --seeds 2", 0, "baseline: baselines/line.json"),
         (None, "check --no-compile", 0, "line: 10 metrics hold"),
-        (edited("2 * t", "3 * t"), "check line.py --no-compile", 5, "line: the problem file is another one"),
+        (edited("2 * t", "3 * t"), "check line.py --no-compile", 5, "line: the problem file changed"),
+        (lambda: Path("a.py").write_text("controllers = {"), "check --no-compile", 5, "line: the problem file changed"),
         (None, "accept line.py --reason faster --no-compile --seeds 2", 0, "baseline: baselines/line.json"),
         (None, "check line.py --no-compile", 0, "line: 10 metrics hold"),
         (lambda: Path("baselines/line.json").write_text("[]"), "check line.py --no-compile", 6, "line: 'line.json' is no whole"),
@@ -188,7 +190,8 @@ def test_options_are_few_and_explained(capsys):
 
 def test_run_saves_every_signal_and_compare_writes_what_it_prints(folder, capsys):
     assert main(["run", "line.py", "CTC+FPI", "--no-compile", "--out", "kept"]) == 0
-    assert fp.load_run(folder / "kept" / "CTC_FPI.npz")["deformed.y"].shape == (500,)
+    kept = fp.load_run(folder / "kept" / "CTC_FPI.npz")
+    assert {name: len(kept[name]) for name in kept.layout}["deformed"] == len(kept["deformed.y"]) == 500
     assert "virtual machine, more slowly, because --no-compile was given" in capsys.readouterr().err
     assert main(["compare", "line.py", "--json", "--seed", "3", "--no-compile"]) == 0
     facts = json.loads(capsys.readouterr().out)
@@ -318,6 +321,7 @@ def test_new_files_work_at_once(pytester, capsys):
         for n, c in task.controllers.items()
     }
     assert errors["RHC+FPI"] < 0.2 * errors["RHC"]
+    (pytester.path / "arms/left/baselines").mkdir()  # of another problem
     done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-W", "error", "-k", "not test_controller")
     done.assert_outcomes(passed=2, skipped=1, deselected=3)
 
