@@ -123,7 +123,7 @@ class Choice:
                 fact = gain_by_run(case)
             except FpirhcError:  # it cannot be composed
                 return 0.0
-            best = max(fact.numbers.get("recommended_times", 0.0), 0.0)
+            best = max(fact.numbers.get("recommended_times", float(fact.verdict == Verdict.CAUTION)), 0.0)  # it works
             admitted = min(admitted, best if fact.verdict == Verdict.YES else best / 2)
         return admitted if math.isfinite(admitted) else 0.0
 

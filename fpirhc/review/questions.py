@@ -325,10 +325,9 @@ def _allowed(case: Case) -> np.ndarray:
 
 
 def _busy(case: Case) -> bool:
-    """Whether noise moves a command by more than is allowed."""
-    own, moves = case.bench, case.bench.moves(case.bench.start)
-    most = np.maximum(_allowed(case), WORSE * own.moves(own.quiet)) if case.problem.sensing.drawn else np.inf
-    return bool((moves > most).any())
+    """Whether sensors move a command by more than is allowed."""
+    moves = case.bench.moves(case.bench.start)
+    return bool(case.problem.sensing.drawn) and bool((moves > _allowed(case)).any())
 
 
 class Try(NamedTuple):
@@ -342,6 +341,7 @@ class Try(NamedTuple):
 
 TODAY, TURNED = (1.0, 0.0), (-1.0, 0.0)  # times the gain, and pole of a filter
 SMALLER, LARGER, FILTERS = [(0.5**k, 0.0) for k in (1, 2, 3, 4)], [(2.0, 0.0), (4.0, 0.0)], [(1.0, 0.8), (1.0, 0.95)]
+NO_CALM = "No gain and no filter that was tried helps and moves commands less than twice as much as without adaptation:"
 SAID = {TODAY: "error", TURNED: "error_turned", SMALLER[0]: "error_at_half", LARGER[0]: "error_at_twice",
         LARGER[1]: "error_at_four_times"}  # fmt: skip
 
@@ -393,8 +393,9 @@ def gain_by_run(case: Case) -> Fact:
         change = "No gain that was tried helps: use another form, or leave the deformation out."
         return Fact(Verdict.UNKNOWN, numbers, of, change)
     (times, pole), (name, value) = best, own_gain(case.bench.controller.deformation)
-    numbers |= {"recommended_times": times, "recommended_gain": times * value}
-    change = "No smaller gain and no filter that was tried makes the command calm: {sensor}." if busy else ""
+    if best != TODAY or (largest >= 2 and not busy):  # else it is not calm, or has no reserve
+        numbers |= {"recommended_times": times, "recommended_gain": times * value}
+    change = f"{NO_CALM} {{sensor}}." if busy else ""
     if best != TODAY:
         numbers |= {"error_recommended": tries[best].error, "movement_recommended": tries[best].moves[worst]}
         told = f"Set the {name} to {times * value:.4g}."

@@ -92,6 +92,14 @@ def test_what_is_recommended_under_noise_is_calm_in_a_run(gain, remedy):
     assert calm[1] < without[1]
 
 
+def test_no_gain_is_recommended_where_none_is_calm():
+    """The least gain that is tried moves the command by more than twice as much as no adaptation."""
+    told = answers(noisy(1.0), torque())["gain"]
+    assert not [name for name in told.numbers if "recommended" in name]
+    assert told.change.startswith("No gain and no filter")
+    assert told.change.endswith(": measure the response with less noise.")
+
+
 def test_a_remedy_is_what_the_loop_has():
     """No gain is lowered and no map filtered where there is no map."""
     law = answers(noisy(0.02, "q'"), fp.ComputedTorque(fp.Exponential(rate=60.0)))
