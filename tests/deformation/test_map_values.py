@@ -35,6 +35,21 @@ def test_affine():
     assert one.with_effective_gain(0.3).effective_gain() == 0.3
 
 
+def test_filtered():
+    """g+ = p g + (1 - p) (f - d) and r+ = r + A_c / 2 g+."""
+    memory, error, r, f, d = (
+        {"filter_error": ca.SX([4.0, -2.0])},
+        np.array([4.0, -2.0]),
+        [1.0, 2.0],
+        [3.0, 5.0],
+        [2.0, 1.0],
+    )
+    for _ in range(2):
+        request, memory = fp.Filtered(fp.Affine(gain=-0.8), pole=0.7).step(ca.SX(r), ca.SX(f), ca.SX(d), memory)
+        error = 0.7 * error + 0.3 * np.subtract(f, d)
+        assert np.asarray(ca.evalf(request)).ravel() == pytest.approx(np.array(r) - 0.4 * error)
+
+
 @pytest.mark.parametrize(("offset", "sign"), [(50.5, -1), (-50.5, 1), (50.5, 1)])
 def test_robust_fixed_point_transformation(offset, sign):
     """r+ = (K_c + r) [1 + B_c tanh(A_c (f - d))] - K_c, and A = -K_c B_c A_c."""
