@@ -112,14 +112,15 @@ def whole_turns(problem: Problem) -> tuple[str, int] | None:
     return max(found, key=lambda one: one[1], default=None)
 
 
-def needed_commands(problem: Problem, run: np.ndarray) -> np.ndarray:
-    """Return the inputs that the model needs along the reference, shape (cycles, nu); what has none is where a run's states are."""
+def needed_commands(problem: Problem, run: np.ndarray, *, exact: bool = False) -> np.ndarray:
+    """Return the inputs that the model needs along the reference, shape (cycles, nu); states without one are those of a run."""
     plant, count = problem.plant, min(problem.cycles, len(run))
     outputs, responses = (rows[:count] for rows in reference(problem))
     states = filled(plant, outputs)
     if run.shape[1] == plant.state.size:
         states = np.where(np.isfinite(states), states, run[:count])
-    [table] = Evaluator(plant.equations.inverse.map(count))(states, responses, np.tile(plant.approximate, (count, 1)))
+    given = plant.exact if exact else plant.approximate
+    [table] = Evaluator(plant.equations.inverse.map(count))(states, responses, np.tile(given, (count, 1)))
     return table.reshape(count, -1)
 
 

@@ -124,10 +124,12 @@ def _saturates(case: Case) -> Fact | None:
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(commands == 0, 0.0, commands / np.where(commands < 0, *limits)).max(axis=0))
 
-    largest, held = of_limit(run["command"]), bench.held(run)
+    stuck = max(bench.draws, key=bench.held) if bench.problem.sensing.drawn else run
+    largest, held = of_limit(run["command"]), bench.held(stuck)
     used = np.where(largest > ROUNDING, largest, np.inf)
-    at = int(bench.at_limits(run).mean(axis=0).argmax() if held > SATURATED else used.argmin())
-    needed = of_limit(needed_commands(case.problem, run["plant_state"]))[at]
+    at = int(bench.at_limits(stuck).mean(axis=0).argmax() if held > SATURATED else used.argmin())
+    exact = (False,) if case.outside or case.problem.reality is not None else (False, True)
+    needed = max(of_limit(needed_commands(case.problem, run["plant_state"], exact=one))[at] for one in exact)
     sizes = {"largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
     numbers = {"at_a_limit": held} | (sizes if largest[at] > ROUNDING else {})  # it may stand at a limit of zero
     numbers |= {"needed": needed} if np.isfinite(needed) and min(plant.equations.known_by_outputs) >= 0 else {}
@@ -186,7 +188,7 @@ def _horizon(case: Case) -> Fact | None:
     lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
     longer = replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
     with compiled_plans(yes=False):  # a loop for one run
-        longer_one = Bench(replace(bench.problem, horizon=longer), bench.controller)
+        longer_one = Bench(replace(bench.problem, horizon=longer), bench.controller, seed=bench.seed)
         long = bench.share(longer_one.run(cycles=short.cycles))
     better = long < own / WORSE and own - long > SLIGHT
     verdict = Verdict.NO if own > BAD >= long else Verdict.CAUTION if better else Verdict.YES
@@ -199,7 +201,7 @@ def _box(case: Case) -> Fact | None:
         return None
     for exact in case.draws:
         if bench.built.controller.plant_model(case.problem).exact:  # it is told, and plans with it from the start
-            told = Bench(case.problem.with_exact(exact), bench.controller, short=True)
+            told = Bench(case.problem.with_exact(exact), bench.controller, short=True, seed=bench.seed)
             found.append((told.back.left, bench.share(told.start)))
             continue
         base = bench.run(exact=exact)
@@ -277,7 +279,8 @@ def _inner(case: Case) -> Fact | None:
 def _noise(case: Case) -> Fact | None:
     if not case.problem.sensing.drawn:
         return None
-    bench, noisy, quiet = case.bench, case.bench.start, case.bench.quiet
+    bench, quiet = case.bench, case.bench.quiet
+    noisy = max((run.first(bench.cycles) for run in bench.draws), key=bench.steps)
     count, (lower, upper) = min(noisy.cycles, quiet.cycles), case.problem.limits.input_bounds(case.problem.plant)
     steps = np.diff((noisy["command"][:count] - quiet["command"][:count])[bench.first(count) :], axis=0)
     span = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.ptp(quiet["command"], axis=0), 1e-300))
@@ -326,8 +329,7 @@ def _allowed(case: Case) -> np.ndarray:
 
 def _busy(case: Case) -> bool:
     """Whether sensors move a command by more than is allowed."""
-    moves = case.bench.moves(case.bench.start)
-    return bool(case.problem.sensing.drawn) and bool((moves > _allowed(case)).any())
+    return bool(case.problem.sensing.drawn) and bool((case.bench.moved > _allowed(case)).any())
 
 
 class Try(NamedTuple):
@@ -350,7 +352,7 @@ def _tries(case: Case) -> dict[tuple[float, float], Try]:
     """Runs with other gains and filters: calm is what moves no command by more than is allowed or than today; good what helps."""
     own, tries, busy = case.bench, dict[tuple[float, float], Try](), _busy(case)
     alone = case.plain.share(case.plain.counted)
-    useful, most, now = min(1.0, WORSE * alone + SLIGHT), _allowed(case), own.moves(own.start)
+    useful, most, now = min(1.0, WORSE * alone + SLIGHT), _allowed(case), own.moved
     most = most if busy else np.maximum(most, now)
 
     def tried(way: tuple[float, float]) -> bool:
@@ -358,6 +360,8 @@ def _tries(case: Case) -> dict[tuple[float, float], Try]:
         with suppress(FpirhcError):  # refused by a schedule of slots
             bench = own if way == TODAY else case.filtered(way[1]) if way[1] else own.at_gain(way[0])
             error, moves = bench.share(bench.counted), bench.moves(bench.start)
+            if way == TODAY:
+                error, moves = max(map(own.share, own.draws)), now
             calm = bool((moves <= most).all())
             good = error <= useful and (calm or bool((moves <= 2 * now).all())) and bench.back.left <= 1
             tries[way] = Try(error, moves, good, calm)
@@ -469,8 +473,9 @@ QUESTIONS = (
              "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}",
              "Mend the loop without adaptation first: {settings}, limits, period."),
     Question("input_limits", "Do the input limits fit the task?", _saturates,
-             "a command at a limit in {at_a_limit:%} of the cycles of {whole}"
-             "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the model the reference needs {needed:%}",
+             "a command or its change at a limit in {at_a_limit:%} of the cycles ({counted})"
+             "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit"
+             "| by the model or the plant the reference needs {needed:%}",
              "Slow the reference, widen the limits, or mend the model."),
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
              "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle"

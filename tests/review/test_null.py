@@ -111,10 +111,8 @@ def test_a_null_test_goes_on_until_errors_count():
     law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False, bumpless=False), fp.Affine(gain=-0.05))
     found = alone(problem, law)
     right = replace(problem, plant=replace(plant, parameters={"b": fp.Parameter(1.0, 1.0, "1")}))
-    pair = [
-        fp.measure(right, fp.simulate(right, one, seed=0, compiled=False)).rms_error["y"]
-        for one in (fp.ComputedTorque(law.tracking), law)
-    ]
+    both = fp.ComputedTorque(law.tracking), law
+    pair = [fp.measure(right, fp.simulate(right, one, seed=0, compiled=False)).rms_error["y"] for one in both]
     assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=1e-6)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.reviewed import PERIOD, answers, biased, mass, plans, torque
+from helpers.reviewed import PERIOD, answers, biased, heavy, mass, plans, torque
 
 import fpirhc as fp
 from fpirhc.__main__ import main
@@ -54,12 +54,13 @@ def test_a_mismatch_that_makes_no_sense_is_refused(wrong):
 
 
 def test_the_plants_of_the_box_are_drawn_by_its_mismatch():
-    """The same seed has the same answers; without a mismatch they are on the way to the model."""
-    one, same, none = (
-        {a.key: a for a in fp.review(mass(), {"it": torque()}, mismatch=wide, seed=1).answers["it"]}
-        for wide in (30.0, 30.0, 0.0)
+    """The same seed has the same answers, and another one other noise; without a mismatch they are on the way to the model."""
+    one, same, none, other = (
+        {a.key: a for a in fp.review(noisy(0.1), {"it": torque()}, mismatch=wide, seed=seed).answers["it"]}
+        for wide, seed in ((30.0, 1), (30.0, 1), (0.0, 1), (0.0, 2))
     )
     assert one == same
+    assert none["noise"].numbers != other["noise"].numbers
     assert one["box"] != none["box"]
     assert one["returns"] == none["returns"]
 
@@ -85,9 +86,11 @@ def test_what_is_recommended_under_noise_is_calm_in_a_run(gain, remedy):
     assert remedy in told.change
     poles = [float(one) for one in re.findall(r"pole=(.*)\)", told.change)] or [0.0]
     best = fp.Filtered(fp.Sigmoid(gain=told.numbers["recommended_gain"], scale=20.0), pole=poles[0])
-    laws = (replace(torque(gain), deformation=one) for one in (best, fp.Identity(), torque(gain).deformation))
+    laws = [replace(torque(gain), deformation=one) for one in (best, fp.Identity(), torque(gain).deformation)]
     made = [fp.measure(problem, fp.simulate(problem, law, seed=0, compiled=False)) for law in laws]
     calm, without, today = ((one["total_variation"]["u"], one.rms_error["q"]) for one in made)
+    shaken = [fp.measure(problem, fp.simulate(problem, laws[-1], seed=k, compiled=False)) for k in range(3)]
+    assert told.numbers["movement"] == pytest.approx(max(one["total_variation"]["u"] for one in shaken))
     assert calm[0] < 2 * without[0] < today[0]
     assert calm[1] < without[1]
 
@@ -108,16 +111,17 @@ def test_a_remedy_is_what_the_loop_has():
     assert not [one for one in (*law.values(), *plan.values()) if "the gain" in one.change or "Filtered" in one.change]
 
 
-@pytest.mark.parametrize(("limit", "verdict"), [(0.3, "no"), (20.0, "yes"), (2000.0, "caution")])
-def test_limits_of_inputs_that_do_not_fit_are_told(limit, verdict):
-    """Ten times too small, right, and a hundred times too large; shares are those of an own run."""
-    problem = mass(limits=fp.Limits(inputs={"u": (-limit, limit)}))
-    told, sent = answers(problem)["input_limits"], fp.simulate(problem, torque(), seed=0, compiled=False)["command.u"]
-    shares = (np.abs(sent) >= limit).mean(), np.abs(sent).max() / limit
-    assert (told.verdict, told.numbers["at_a_limit"], told.numbers["share_of_the_limit"]) == (
-        verdict,
-        *map(pytest.approx, shares),
-    )
+@pytest.mark.parametrize(
+    ("limit", "rate", "verdict"), [(0.3, 1e6, "no"), (20, 1e6, "yes"), (20, 2, "no"), (2e3, 1e6, "caution")]
+)
+def test_limits_of_inputs_that_do_not_fit_are_told(limit, rate, verdict):
+    """Ten times too small, right, too slow, and a hundred times too large; shares are those of an own run; 1.5 kg need more."""
+    limits = fp.Limits(inputs={"u": (-limit, limit)}, rates={"u": (-rate, rate)})
+    problem = mass(plant=heavy(1.0, 1.5, (10.0, 6.0)), limits=limits)
+    told, run = answers(problem)["input_limits"], fp.simulate(problem, torque(), seed=0, compiled=False)
+    shares = fp.measure(problem, run).at_limit, np.abs(run["command.u"]).max() / limit, 3.75 / limit
+    names = "at_a_limit", "share_of_the_limit", "needed"
+    assert (told.verdict, *map(told.numbers.get, names)) == (verdict, *map(pytest.approx, shares))
 
 
 def test_numbers_have_units_and_spans():
@@ -129,9 +133,8 @@ def test_numbers_have_units_and_spans():
 
 def test_an_optimiser_says_whether_it_has_iterations():
     """Two settings bound the work of the fixed point; one bounds IPOPT's."""
-    assert fp.FixedPoint(iterations=3, tolerance=1e-3).longer(4) == fp.FixedPoint(
-        iterations=12, tolerance=1e-3, most_iterations=400
-    )
+    more = fp.FixedPoint(iterations=12, tolerance=1e-3, most_iterations=400)
+    assert fp.FixedPoint(iterations=3, tolerance=1e-3).longer(4) == more
     assert fp.Ipopt(tolerance=1e-3).longer(2) == fp.Ipopt(tolerance=1e-3, iterations=400)
 
 

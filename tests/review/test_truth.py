@@ -302,11 +302,8 @@ def test_a_plant_outside_is_asked_by_its_model():
     for sensors, free in ((dict(list(ranges.items())[:1]), "x', x''"), (ranges, "")):
         told = fp.review(replace(problem, sensing=fp.Sensing(sensors)), plans(), mismatch=0.0, seed=0).answers
         [asked] = [a for a in told["problem"] if a.key == "ranges"]
-        assert (asked.verdict, asked.of, "Sensor(range=" in asked.change) == (
-            "caution" if free else "yes",
-            free,
-            bool(free),
-        )
+        verdict = "caution" if free else "yes"
+        assert (asked.verdict, asked.of, "Sensor(range=" in asked.change) == (verdict, free, bool(free))
     found = {a.key: a for a in told["RHC+FPI"]}
     assert found["pays"].verdict == "unknown"
     assert found["pays"].change == "The plant is outside: ask fpirhc compare."

@@ -308,10 +308,10 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     right = names <= {*sensing.measures(problem.plant)} - {n for n, sensor in sensing.sensors.items() if sensor.acts}
     if not right or not problem.equations_known or controller.deforms == "target" or run.stop is not None:
         return None
-    bench = Bench(problem, controller, short=True)
+    bench = Bench(problem, controller, short=True, seed=run.seed)
     quiet = run.first(bench.cycles)
     noise = np.random.default_rng(run.seed).standard_normal(quiet["realised"].shape) * np.ptp(quiet["realised"], axis=0)
-    other = bench.run(bias=NOISE * noise, seed=run.seed)
+    other = bench.run(bias=NOISE * noise)
     before, after = bench.errors(quiet), bench.errors(other)
     moves = float((bench.moves(other) / np.maximum(bench.moves(quiet), 1e-300)).max())
     ratios = {n: after[n] / max(e, 1e-300) for n, e in before.items()}

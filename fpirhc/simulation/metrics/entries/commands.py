@@ -28,6 +28,11 @@ def total_variation(problem: Problem, run: Run) -> dict[str, float]:
 
 def at_limit(problem: Problem, run: Run) -> float:
     """Return the share of the cycles in which a command, or its change, stands at a limit, clipped or planned there."""
+    return float(_mean(np.asarray(at_limits(problem, run).any(axis=1))))
+
+
+def at_limits(problem: Problem, run: Run) -> np.ndarray:
+    """Return whether every command, or its change, stands at a limit in every measured cycle, shape (cycles, inputs)."""
     measured = measured_cycles(problem, run)
     lower, upper = (end[measured] for end in _limits(problem, run))
     span = upper - lower
@@ -38,7 +43,7 @@ def at_limit(problem: Problem, run: Run) -> float:
     slack = 1e-6 * np.fmin(fastest, -slowest)
     moves, slack = np.diff(commands, axis=0, prepend=commands[:1]), np.where(np.isfinite(slack), slack, 0.0)
     stands |= (moves <= slowest + slack) | (moves >= fastest - slack)
-    return float(_mean(stands.any(axis=1)))
+    return np.asarray(stands)
 
 
 def _measured(problem: Problem, run: Run) -> np.ndarray:
