@@ -49,8 +49,9 @@ class Modes:
 class DisturbanceKalman(ParameterEstimator):
     """Estimate constant or slowly drifting disturbances of responses.
 
-    Only ratios of the deviations matter. Where the controller receives exact states, the measurement's deviations are a tuning: the
-    larger the drift, the faster and the noisier the estimate.
+    Only ratios of the deviations matter. With the noise s of one measured quantity, n - 1 integrators below its response, the
+    period T of its samples and the drift D the bandwidth is (D^2 / (s^2 T))^(1 / 2n); behind a dead time of tau it must stay below
+    1 / tau. A deviation of exact states is a tuning: the larger the drift, the faster and the noisier the estimate.
 
     Args:
         drift: coordinate -> deviation of the change of its disturbance in one second, response unit / s^0.5. Of a plant with
