@@ -197,9 +197,9 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
         # of a layer above, which is only asked when nothing else follows
         review = import_module("fpirhc.review.review")
         advice = review.recommended_for(problem, controller)
-        if advice is None:
+        if not advice:
             raise
-        raise NotContractive(error.fault, f"recommended effective gain {advice:.3g}") from None
+        raise NotContractive(error.fault, f"write {advice}") from None
 
 
 @contextmanager

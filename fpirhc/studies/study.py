@@ -57,11 +57,6 @@ class VariantStudy(Study):
     def view(self) -> View:
         title = f"{self.problem}: {self.count} variants"
         tables = [self._shown(name, some) for name, some in {title: self.summary, **self.groups}.items()]
-        failed = self.table.loc[self.table.outcome != "finished"].groupby("controller", sort=False).first()
-        lists = {
-            "Why runs failed": [f"{r.controller}, {r.variant}: {r.outcome} {r.why}".rstrip() for r in _rows(failed)],
-            "Worst runs": [*_commands(self)],
-        }
         facts = {
             "problem": self.problem,
             "variants": str(self.variants),
@@ -71,6 +66,7 @@ class VariantStudy(Study):
             "versions": self.versions,
         }
         shares = "" if self.figure.metric else " Errors are rms, in % of the range of the reference."
+        lists = {"Worst runs": [*_commands(self)]}
         return self.viewed([*_sentences(self)], f"{self.variants}.{shares}", tables, facts, lists=lists)
 
     def _shown(self, title: str, summary: pd.DataFrame) -> Table:
@@ -192,14 +188,12 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     aim, summary = result.figure, result.summary
     than, most = ("smaller", "smallest") if aim.sign > 0 else ("larger", "largest")
     for row in _rows(summary.iloc[1:]):
-        share = f"{than} in {row.better} of {row.variants}"
-        if math.isnan(row.low):  # too few for an interval
-            yield f"{row.controller} against {summary.index[0]} by {aim.column}: {share}.", None
-            continue
+        share = f"{than} in {row.better} of {row.variants}.{''.join(_moved(result, row.controller))}"
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
         clear = Outcome.BETTER if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
-        said = _CLEAR.get(clear, "is not clearly different from")
-        yield f"{row.controller} {said} {summary.index[0]} by {aim.column}: {share}.", clear
+        few = math.isnan(row.low)  # for an interval
+        said = "against" if few else _CLEAR.get(clear, "is not clearly different from")
+        yield f"{row.controller} {said} {summary.index[0]} by {aim.column}: {share}", None if few else clear
     axes = getattr(result.variants, "axes", {})
     for name, some in result.table.groupby("controller", sort=False) if axes else ():
         good = some.loc[some.outcome == "finished"]
@@ -207,12 +201,23 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
             best = int((aim.sign * good[aim.column]).to_numpy().argmin())
             number, place = aim.text(good[aim.column].iloc[best]), good.variant.iloc[best]
             yield f"{name}: the {most} {aim.column} is {number}, at {place}.", None
+    failed = result.table.loc[result.table.outcome != "finished"].groupby("controller").first()
+    why = {r.controller: f" The first, {r.variant}: {r.outcome}{r.why and ': '}{r.why}" for r in _rows(failed)}
     for row in _rows(summary):
         low, high = share_interval(row.failures, row.variants)
-        drawn = f"; of all plants drawn so {in_percent(low)} to {in_percent(high)} fail, with 95 % confidence"
-        if result.variants.random or row.failures:
-            sampled = drawn if result.variants.random else ""
-            yield f"{row.controller} fails in {row.failures} of {row.variants}{sampled}.", None
+        others = f"; of all plants drawn so {in_percent(low)} to {in_percent(high)} fail, with 95 % confidence"
+        drawn = others if result.variants.random else ""
+        if drawn or row.failures:
+            text = f"{row.controller} fails in {row.failures} of {row.variants}{drawn}."
+            yield text + why.get(row.controller, ""), None
+
+
+def _moved(result: VariantStudy, name: str) -> Iterator[str]:
+    """What a controller pays: the inputs that move more than twice as much as with the first controller."""
+    for column, moved in result.summary.filter(like=_MOVES).items():
+        if moved[name] > 2 * moved.iloc[0]:
+            what, unit = str(column).removeprefix(_MOVES), result.table.attrs["units"].get(column, "1")
+            yield f" Total variation of {what} {written_out(moved[name])} against {written_out(moved.iloc[0])} {unit}."
 
 
 def _rows(frame: pd.DataFrame) -> Iterator[Any]:

@@ -257,9 +257,10 @@ def test_a_summary_is_that_of_the_rows(task):
     assert found.summary.loc["CTC+FPI", ["low", "high"]].tolist() == pytest.approx(sorted(apart)[2:10:7], rel=1e-12)
     [(text, outcome)] = [(t, o) for t, o in found.view.sentences if t.startswith("CTC+FPI ")][:1]
     assert (str(outcome) == "better") == (found.summary.high["CTC+FPI"] < 0)
-    assert f"smaller in {(apart < 0).sum()} of 12" in text
-    few = fp.study(task, fp.Draws(4, 20.0, 5), compiled=False, controllers=["CTC", "CTC+FPI"])
-    assert few.view.sentences[0][1] is None
+    told = f"Total variation of u {moves['CTC+FPI']:.3g} against {moves['CTC']:.3g} N/s."
+    assert text.endswith(f"smaller in {(apart < 0).sum()} of 12. {told}")
+    few = fp.study(task, fp.Draws(4, 20.0, 5), compiled=False, controllers=["CTC+FPI", "CTC"])
+    assert few.view.sentences[0] == ("CTC against CTC+FPI by error: smaller in 0 of 4.", None)  # it moves less
 
 
 def test_failures_are_counted_and_worse_than_any_error(task):
@@ -271,7 +272,8 @@ def test_failures_are_counted_and_worse_than_any_error(task):
     found = fp.study(narrow, fp.CasesOf(), controllers=["CTC"], compiled=False)
     failed = int((found.table.outcome != "finished").sum())
     assert found.summary.failures["CTC"] == failed > 0
-    assert any(t == f"CTC fails in {failed} of 5." for t in sentences(found))
+    first = found.table.loc[found.table.outcome != "finished"].iloc[0]
+    assert f"CTC fails in {failed} of 5. The first, {first.variant}: {first.outcome}" in "\n".join(sentences(found))
 
 
 def test_the_command_of_a_worst_run_makes_it_again(task):

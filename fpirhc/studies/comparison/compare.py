@@ -60,8 +60,7 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            advice = "" if best is None else f"; recommended effective gain {best:.3g}"
-            mistakes.add(f"controller '{name}': {error}{advice}")
+            mistakes.add(f"controller '{name}': {error}{best and f'; write {best}'}")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     mistakes.raise_if_any()
@@ -317,10 +316,8 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     ratios = {n: after[n] / max(e, 1e-300) for n, e in before.items()}
     name = max(ratios, key=ratios.__getitem__)
     text = f"The response of {run.controller} is measured without noise: white noise of {in_percent(NOISE)} of its range, rms, "
-    text += (
-        f"multiplies the rms error of {name} by {written_out(ratios[name])} and the total variation of the command by "
-    )
-    return Finding(f"{text}{written_out(moves)} ({bench.since(quiet.cycles)}).", ratios=ratios)
+    text += f"multiplies the rms error of {name} by {written_out(ratios[name])} and the total variation of the command "
+    return Finding(f"{text}by {written_out(moves)} ({bench.since(quiet.cycles)}).", ratios=ratios)
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
