@@ -20,7 +20,15 @@ from fpirhc.errors import FpirhcError, InvalidField, InvalidName, Mistakes, NotS
 from fpirhc.fields.checked import FoundByName, checked_call, mistakes_in
 from fpirhc.fields.kinds import accepts, expected_by
 from fpirhc.fields.user_code import explained
-from fpirhc.problem_files.settings import TuningSpans, current_setting, is_own, of_problem, with_numbers, with_settings
+from fpirhc.problem_files.settings import (
+    TuningSpans,
+    current_setting,
+    is_own,
+    number_of_case,
+    of_problem,
+    with_numbers,
+    with_settings,
+)
 from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures.base import Picture
@@ -162,8 +170,14 @@ def _check_together(module: ModuleType, facts: dict[str, Any], mistakes: Mistake
     mistakes.unknown("tuning: controller", spans, controllers)
     for owner in (name for name in spans if name in controllers):
         for path in spans[owner]:
+            word, own = path.partition(".")[0], controllers[owner]
             with mistakes.caught(f"tuning: controller '{owner}': "):
-                current_setting(controllers[owner], path)
+                if not is_own(own, path) and number_of_case(facts["problem"], path) is not None:
+                    mend = f"; give this one its own, {word}=problem.{word}" if hasattr(own, word) else ""
+                    raise InvalidName(
+                        f"setting '{path}' is the problem's, and a search changes controllers alone{mend}"
+                    )
+                current_setting(own, path)
     with mistakes.caught():
         facts["metrics"] = with_own_metrics(facts.get("metrics", ()))
         names = [RELATIVE_ERROR, *(metric.name for metric in facts["metrics"])]

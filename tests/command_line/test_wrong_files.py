@@ -161,6 +161,9 @@ one controller
   {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> fp.RecedingHorizon(optimiser)
     line 36: controllers: expected {name: a Controller}, got a value of the class RecedingHorizon; write {'NAME':
     RecedingHorizon(...)}
+a search in the cost of the problem
+  controllers = { -> tuning = {"RHC": {"cost.deviation.torque": fp.LogSpan(1e-3, 1.0)}}; controllers = {
+    setting 'cost.deviation.torque' is the problem's, and ... changes controllers alone; give this one its own, cost=problem.cost
 controllers under another name
   controllers = { -> controller = {
     'controller' is one, so call it 'controllers'
