@@ -270,22 +270,23 @@ class ContractionReport:
         ]
 
 
-def check_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
+def check_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
     """Return the report of a deformation that converges on plants with these eigenvalues.
 
-    A gain between the sector and the linear limit is not refused: `within_sector` is False in its report.
+    A gain between the sector and the linear limit is not refused: `within_sector` is False in its report. Where the response is
+    late by some cycles, the limits are those without this delay, and the text says so.
 
     Raises:
         NotContractive: eigenvalues with real parts of both signs, or a gain that is zero, of the wrong sign, or beyond the linear
             limit; the message names the admissible gains.
     """
-    report = assess_gain(deformation, spectrum)
+    report = assess_gain(deformation, spectrum, late)
     if not report.contractive:
         raise NotContractive(report.fault, report.remedy)
     return report
 
 
-def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionReport:
+def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
     """Return the report of `check_gain`; where `check_gain` raises, a report with `contractive` False and the same text."""
     gain = deformation.effective_gain()
     name, own = own_gain(deformation)
@@ -300,7 +301,7 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum) -> ContractionRepo
     sector = sector_limit(deformation, spectrum.eigenvalues)
     own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
     contractive, within = linear[0] < gain < linear[1], sector[0] < gain < sector[1]
-    admissible = _admissible(name, own_linear, own_sector)
+    admissible = _admissible(name, own_linear, own_sector, late)
     what = with_its_gain(deformation)
     fault, remedy = ("", "") if contractive else (f"{what} {_fault(gain, linear, predicted)}", f"use {admissible}")
     return ContractionReport(
@@ -340,12 +341,13 @@ def _size(limit: tuple[float, float]) -> float:
     return max(abs(limit[0]), abs(limit[1]))
 
 
-def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float]) -> str:
+def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float], late: float) -> str:
     sign = "positive" if sum(linear) > 0 else "negative"
     bounds = f"0 < |{name}| < {_size(linear):.3g}"
     if not np.isclose(_size(linear), _size(sector)):
         bounds += f", and below {_size(sector):.3g} to converge from errors of any size"
-    return f"a {sign} {name}, {bounds}"
+    behind = f", without the response's delay of {late:.4g} cycles" if late else ""
+    return f"a {sign} {name}, {bounds}{behind}"
 
 
 def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:

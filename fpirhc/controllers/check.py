@@ -47,7 +47,7 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
         return
     spectrum = _at_start(problem, deformation)
     if spectrum is not None and sum(linear_limit(spectrum.eigenvalues)) * gain <= 0:
-        check_gain(deformation, spectrum)  # which raises, with the sign that would do
+        check_gain(deformation, spectrum, problem.response_delay)  # which raises, with the sign that would do
 
 
 def check_gain_size(problem: Problem, deformation: Deformation) -> None:

@@ -285,9 +285,9 @@ class _Rows:
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
     if not metrics.values.get("contraction.predicted"):
         return None
-    spectrum = sampled_spectrum(problem, run)
+    spectrum, late = sampled_spectrum(problem, run), problem.response_delay
     predicted, growing, measured = (metrics[f"contraction.{n}"][""] for n in ("predicted", "growing", "measured"))
-    return Contraction(predicted, growing, measured, assess_gain(controller.deformation, spectrum), spectrum)
+    return Contraction(predicted, growing, measured, assess_gain(controller.deformation, spectrum, late), spectrum)
 
 
 def _has_exact_model(problem: Problem, controller: Controller) -> bool:
