@@ -1,7 +1,6 @@
 """The questions of a review: a row for each, with a function that measures something and one sentence for what to do.
 
-The run decides: every answer about a loop is a difference of two runs of its own step, see `experiments`. Numbers have fixed names,
-which `fpirhc review --json` writes, and a fixed text that says of what they are, their unit and their span.
+The run decides: an answer about a loop is a difference of two runs of its own step. Numbers have fixed names, units and spans.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import relative_order, zero_dynamics
-from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked
+from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked, predictor
 from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
@@ -30,9 +29,9 @@ WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size
 ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
 MOSTLY, BUSY = 0.5, 2.0  # share of the cycles at a limit that shows no loop; times the movement without adaptation
+OFFSET = 0.8  # share of the rms error from which on its mean is most of it
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
 SATURATED, UNUSED = 0.2, 0.01  # share of the cycles at a limit; largest command as a share of its limit
-
 
 Numbers = Mapping[str, float]
 
@@ -110,8 +109,14 @@ def _ranges(case: Case) -> Fact | None:
 
 def _follows(case: Case) -> Fact:
     bench, (name, share) = case.bench, case.bench.worst(case.bench.nominal)
-    numbers = {"rms_error": bench.errors(bench.nominal)[name], "error": share, "size": bench.sizes[name]}
-    return Fact(graded(share, GOOD, BAD), numbers, name)
+    rms, errors, verdict = bench.errors(bench.nominal)[name], bench.nominal["true_error"], graded(share, GOOD, BAD)
+    numbers = {"rms_error": rms, "error": share, "size": bench.sizes[name]}
+    column, by = errors[bench.first(len(errors)) :, case.problem.judged_names.index(name)], predictor(bench.controller)
+    if by is None or by.residual_time or abs(column.mean()) <= OFFSET * rms or not 0.01 < share < math.inf:
+        return Fact(verdict, numbers, name)
+    change = "A wrong model in the prediction leaves an offset: Predicted(controller, by=ByModel(residual_time=...))."
+    numbers["mean_error"] = abs(column.mean())
+    return Fact(Verdict.CAUTION if verdict == Verdict.YES else verdict, numbers, name, change)
 
 
 def _saturates(case: Case) -> Fact | None:
@@ -136,7 +141,7 @@ def _saturates(case: Case) -> Fact | None:
     if held <= SATURATED and used[at] < UNUSED:
         change = "State the limits that the actuator has: tolerances of plans are shares of them."
         return Fact(Verdict.CAUTION, numbers, names[at], change)
-    change = "It needs less: {slower}, or state the dead time." if numbers.get("needed", math.inf) <= 1 else ""
+    change = "It needs less: {slower}, or {dead}." if numbers.get("needed", math.inf) <= 1 else ""
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
     return Fact(Verdict.NO if lost else graded(held, SATURATED, math.inf), numbers, names[at], change)
 
@@ -221,9 +226,7 @@ def _gains(case: Case) -> Fact | None:
 
     most, least = (([1.0, *takewhile(bears, side)])[-1] for side in GAINS)
     change = "With less gain of the inputs it is lost: only a faster loop bears that." if most == 2 else ""
-    return Fact(
-        Verdict.YES if (most, least) == (2.0, 0.5) else Verdict.CAUTION, {"most": most, "least": least}, "", change
-    )
+    return Fact(graded(most / least, 4.0, 0.0), {"most": most, "least": least}, "", change)
 
 
 def _latency(case: Case) -> Fact | None:
@@ -291,14 +294,14 @@ def _noise(case: Case) -> Fact | None:
     numbers["error_without_noise"] = bench.share(quiet)
     adapts, name = bench.built.controller.deformation.adapts, list(case.problem.plant.inputs)[worst]
     change = gain_by_run(case).change if adapts and _busy(case) else ""
+    if numbers["movement"] < numbers["movement_without_noise"]:
+        change = "Without noise the command moves more: a limit cycle of the quantum or of the window."
     return Fact(graded(numbers["rms_step"], 0.01, math.inf), numbers, name, change)
 
 
 def _bias(case: Case) -> Fact | None:
     bench, plain, base = case.bench, case.plain, case.bench.start
-    shown = (
-        bench.built.loop.reads[PROBE].size > 2 * len(case.problem.plant.inputs) + 1
-    )  # it estimates no response itself
+    shown = bench.built.loop.reads[PROBE].size > 2 * len(case.problem.plant.inputs) + 1
     if not shown or not case.asks_more():
         return None
     size = float(max(np.ptp(base["plant_realised"], axis=0).max(), 1e-2 * np.abs(base["plant_realised"]).max())) or 1.0
@@ -308,9 +311,8 @@ def _bias(case: Case) -> Fact | None:
     slopes = dict(zip(case.problem.judged_names, added / (0.01 * size), strict=True))
     alone = plain.errors(plain.nominal)
     name = max(alone, key=lambda n: slopes[n] / max(bench.sizes[n], 1e-300))
-    slope = slopes[name]
-    even = alone[name] / slope if slope > 1e-12 else math.inf
-    numbers = {"added_by_a_bias": 0.01 * size * slope}
+    even = alone[name] / slopes[name] if slopes[name] > 1e-12 else math.inf
+    numbers = {"added_by_a_bias": 0.01 * size * slopes[name]}
     numbers |= {"share_of_the_response": even / size} if even <= 10 * size else {}
     if case.problem.sensing.drawn:  # what the sensors have may be a bias
         right, own, most = bench.share(bench.quiet), bench.share(base), plain.share(plain.start)
@@ -470,7 +472,7 @@ QUESTIONS = (
              "| {movement_without:r} without adaptation",
              "There is no reserve: with twice this gain it does not come back, or moves the command twice as much.", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows,
-             "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}",
+             "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}| mean {mean_error:u}",
              "Mend the loop without adaptation first: {settings}, limits, period."),
     Question("input_limits", "Do the input limits fit the task?", _saturates,
              "a command or its change at a limit in {at_a_limit:%} of the cycles ({counted})"
@@ -480,7 +482,7 @@ QUESTIONS = (
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
              "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle"
              "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}"
-             "| commands change by {mean_step:%} of their range a cycle", "{slower}, shorten the period, or state the dead time."),
+             "| commands change by {mean_step:%} of their range a cycle", "{slower}, shorten the period, or {dead}."),
     Question("horizon", "Is the horizon long enough?", _horizon,
              "relative rms error {error:%} ({half})| {error_with_twice_the_horizon:%} with twice the stages",
              "Lengthen it, or weigh its end (LQRTerminal)."),
@@ -492,7 +494,7 @@ QUESTIONS = (
     Question("latency", "Does it bear three cycles of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
              "| with {cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
              "| commands change by {mean_step:%} of their range per cycle| {mean_step_without:%} without latency"
-             "| {left:%} of a push left after {pushed}", "Measure the latency and state it: Problem(dead_time=...)."),
+             "| {left:%} of a push left after {pushed}", "{late}."),
     Question("limits", "Do states, rates and paths keep their limits?", _left,
              "beyond a limit in {share_of_cycles:%} of the cycles of {whole}"
              "| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}",

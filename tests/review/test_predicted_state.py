@@ -54,6 +54,10 @@ def test_what_the_model_lacks_is_lacking_in_the_prediction(late, form, by, remov
     run = fp.simulate(problem, law(late, form, by), seed=0, compiled=False)
     expected = [FORCE / KP * (1 + KD * late + KP * late**2 / 2), FORCE / KP * (KD * late + KP * late**2 / 2), 0.0]
     assert run["true_error.q"][-1] == pytest.approx(expected[int(removed)], rel=0.01, abs=1e-6)
+    told = {a.key: a for a in fp.review(problem, {"it": law(late, form, by)}, mismatch=0.0, seed=0).answers["it"]}
+    assert ("residual_time" in told["follows"].change) == (by is None)
+    said = " ".join(a.change for a in told.values())
+    assert not [words for words in ("state it", "state the dead", "predict it") if words in said]
 
 
 def test_errors_of_a_body_outside_are_those_of_now():
