@@ -74,7 +74,7 @@ def left_alone(problem: Problem, seed: int) -> dict[str, float]:
 class Yardstick:
     """What errors are measured against, by judged coordinate."""
 
-    scales: Mapping[str, float]  # range of the reference, its start included; 1 where it does not move
+    scales: Mapping[str, float]  # range of the reference, or how far the start is from it where that is more
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
     moving: frozenset[str]  # coordinates whose references move by themselves
     resting: Mapping[str, float]  # size of the set-point, or that of the movement left alone where disturbances act
@@ -87,7 +87,7 @@ class Yardstick:
         rows = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[0].full())
         places = {n: plant.output.elements.index(n) for n in problem.judged_names}
         own = {n: float(np.ptp(rows[k])) for n, k in places.items()}
-        both = {n: float(np.ptp(np.append(rows[k], problem.start_output[k]))) for n, k in places.items()}
+        both = {n: max(own[n], abs(float(rows[k, 0] - problem.start_output[k]))) for n, k in places.items()}
         sizes, alone = {n: float(np.abs(rows[k]).max()) for n, k in places.items()}, left_alone(problem, seed)
         small = {n: max(ROUNDING * size, 1e-300) for n, size in sizes.items()}
         resting = {n: max(s, alone.get(n, 0.0)) if problem.disturbances or not s else s for n, s in sizes.items()}
@@ -303,9 +303,9 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     rows = {e.name: relative_error(e, yard, names) for e in entries}
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
     if fair:
-        best = min(fair, key=fair.__getitem__)
+        least, best = min((v, n) for n, v in fair.items())
         among = " of those with the wrong model" if any(e.exact for e in entries) else ""
-        yield f"The smallest rms error{among} is that of {best}: {in_percent(fair[best])} of the range ({yard.span})."
+        yield f"The smallest rms error{among} is that of {best}: {in_percent(least)} of the range of the reference ({yard.span})."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:
