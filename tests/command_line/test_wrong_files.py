@@ -164,6 +164,12 @@ one controller
 a search in the cost of the problem
   controllers = { -> tuning = {"RHC": {"cost.deviation.torque": fp.LogSpan(1e-3, 1.0)}}; controllers = {
     setting 'cost.deviation.torque' is the problem's, and ... changes controllers alone; give this one its own, cost=problem.cost
+headline of unknown names
+  controllers = { -> headline = ("MPC", "RHC+FPi"); controllers = {
+    'MPC' is unknown ... 'RHC+FPi' is unknown. Did you mean 'RHC+FPI'?
+headline of no pair
+  controllers = { -> headline = ("RHC+FPI", "RHC"); controllers = {
+    headline ('RHC+FPI', 'RHC') is no pair of a controller and the same one with adaptation: ('RHC', 'RHC+FPI')
 controllers under another name
   controllers = { -> controller = {
     'controller' is one, so call it 'controllers'
@@ -239,19 +245,6 @@ OTHERS = {
         "    horizon=fp.Horizon(stages=6, step=2e-2),\n",
         "",
         "no Does the controller fit the problem? RecedingHorizon needs Problem(horizon=...), which this problem does not have",
-    ),
-    "headline of unknown names": one(
-        PENDULUM,
-        "controllers = {",
-        'headline = ("MPC", "RHC+FPi")\ncontrollers = {',
-        "'MPC' is unknown",
-        "'RHC+FPi' is unknown. Did you mean 'RHC+FPI'?",
-    ),
-    "headline of no pair": one(
-        PENDULUM,
-        "controllers = {",
-        'headline = ("RHC+FPI", "RHC")\ncontrollers = {',
-        "headline ('RHC+FPI', 'RHC') is no pair of a controller and the same one with adaptation: ('RHC', 'RHC+FPI')",
     ),
     "mistakes all over the file": Wrong(
         PENDULUM,
