@@ -96,6 +96,8 @@ def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
     problem, law = late(sedated(hill(4.0))), fp.ComputedTorque(LAW)
     noise = {"C": 1e-3, "E": 1e-3}
     shift = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, "C": 0.01, "E": 0.01}, noise=noise)
+    assert "write Estimating(Predicted(" in fp.Predicted(fp.Estimating(law, shift), inputs=LATE).notes(problem)[-1]
+    assert fp.Estimating(fp.Predicted(law, inputs=LATE), shift).notes(problem) == ()
     inside = simulated(problem, fp.Predicted(fp.Estimating(law, shift), inputs=LATE))
     assert np.abs(inside["estimate"]).max() < 1e-3  # a right model has nothing to learn
     assert np.abs(inside["output_ahead.depth"] - inside["output.depth"]).max() > 0.5

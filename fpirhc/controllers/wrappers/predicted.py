@@ -165,8 +165,12 @@ class Predicted(ControllerWrapper):
     by: Predictor = field(default_factory=ByModel)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        notes = self.controller.notes(problem)
-        cycles = self._queue(problem).cycles
+        notes, cycles = self.controller.notes(problem), self._queue(problem).cycles
+        if self.controller.learns and self.by == ByModel() and cycles:
+            notes += (
+                "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
+                "error leaves an offset; write Estimating(Predicted(controller, ...), ...)",
+            )
         if not given_signals(problem) or not cycles:
             return notes
         late = f"{cast(float, cycles) * problem.period:g} {problem.time_unit}"
