@@ -482,7 +482,7 @@ QUESTIONS = (
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
              "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle"
              "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}"
-             "| commands change by {mean_step:%} of their range a cycle", "{slower}, shorten the period, or {dead}."),
+             "| commands change by {mean_step:%} of what they cover a cycle", "{slower}, shorten the period, or {dead}."),
     Question("horizon", "Is the horizon long enough?", _horizon,
              "relative rms error {error:%} ({half})| {error_with_twice_the_horizon:%} with twice the stages",
              "Lengthen it, or weigh its end (LQRTerminal)."),
@@ -493,7 +493,7 @@ QUESTIONS = (
              "it comes back at {least} to {most} times their gain", "{slower}: with more gain of the inputs it is lost."),
     Question("latency", "Does it bear three cycles of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
              "| with {cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
-             "| commands change by {mean_step:%} of their range per cycle| {mean_step_without:%} without latency"
+             "| commands change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency"
              "| {left:%} of a push left after {pushed}", "{late}."),
     Question("limits", "Do states, rates and paths keep their limits?", _left,
              "beyond a limit in {share_of_cycles:%} of the cycles of {whole}"

@@ -96,9 +96,8 @@ def test_commands_at_a_limit_show_nothing():
 
 def test_a_null_test_goes_on_until_errors_count():
     """The input is too weak for the start, so the first cycles show nothing; the plain form disturbs a right model later."""
-    plant = fp.Plant(
-        {"y": "m"}, {"u": "m/s"}, {"b": fp.Parameter(1.0, 1.5, "1")}, lambda y, u, p: {"y": p.b * u.u}, order=1
-    )
+    strong = {"b": fp.Parameter(1.0, 1.5, "1")}
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, strong, lambda y, u, p: {"y": p.b * u.u}, order=1)
     problem = fp.Problem(
         plant=plant,
         reference=fp.Trajectory(lambda t: {"y": 0.1 * ca.sin(t)}),

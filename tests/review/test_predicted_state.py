@@ -73,13 +73,12 @@ def test_errors_of_a_body_outside_are_those_of_now():
             self.state = np.array([q + PERIOD * v + PERIOD**2 / 2 * command[0], v + PERIOD * command[0]])
             return self.state
 
-    problem = replace(
-        mass(0.0).with_exact(np.zeros(1)),
-        reality=fp.ExternalPlant(Body(), measures={"q": "m", "q'": "m/s"}),
-        sensing=fp.Sensing(estimator=fp.VelocityDifference()),
-        reference=fp.Trajectory(lambda t: {"q": ca.sin(t)}),
-        start={"q": 0.0, "q'": 1.0},
+    body, seen = (
+        fp.ExternalPlant(Body(), measures={"q": "m", "q'": "m/s"}),
+        fp.Sensing(estimator=fp.VelocityDifference()),
     )
+    motion = {"reference": fp.Trajectory(lambda t: {"q": ca.sin(t)}), "start": {"q": 0.0, "q'": 1.0}}
+    problem = replace(mass(0.0).with_exact(np.zeros(1)), reality=body, sensing=seen, **motion)
     run = fp.simulate(problem, law(0.08, by=fp.ByDesired()), seed=0, compiled=False)
     np.testing.assert_allclose(run["true_error.q"], np.sin(run.time) - run["state.q"], atol=1e-12)
     assert np.abs(run["reference.q"] - np.sin(run.time + 0.08)).max() < 1e-12

@@ -56,10 +56,9 @@ def test_a_mismatch_that_makes_no_sense_is_refused(wrong):
 
 def test_the_plants_of_the_box_are_drawn_by_its_mismatch():
     """The same seed has the same answers, and another one other noise; without a mismatch they are on the way to the model."""
-    one, same, none, other = (
-        {a.key: a for a in fp.review(noisy(0.1), {"it": torque()}, mismatch=wide, seed=seed).answers["it"]}
-        for wide, seed in ((30.0, 1), (30.0, 1), (0.0, 1), (0.0, 2))
-    )
+    ways = (30.0, 1), (30.0, 1), (0.0, 1), (0.0, 2)
+    told = [fp.review(noisy(0.1), {"it": torque()}, mismatch=wide, seed=seed).answers["it"] for wide, seed in ways]
+    one, same, none, other = ({a.key: a for a in some} for some in told)
     assert one == same
     assert none["noise"].numbers != other["noise"].numbers
     assert one["box"] != none["box"]

@@ -293,11 +293,8 @@ def test_a_plant_outside_is_asked_by_its_model():
         def step(self, _time: float, _command: Any) -> list[float]:
             raise AssertionError("a review does not run it")
 
-    problem = replace(
-        biased(0.0),
-        sensing=fp.Sensing(),
-        reality=fp.ExternalPlant(Body(), measures={"x": "m", "x'": "m/s", "x''": "m/s^2"}),
-    )
+    outside = fp.ExternalPlant(Body(), measures={"x": "m", "x'": "m/s", "x''": "m/s^2"})
+    problem = replace(biased(0.0), sensing=fp.Sensing(), reality=outside)
     ranges = {name: fp.Sensor(range=(-10.0, 10.0)) for name in ("x", "x'", "x''")}
     for sensors, free in ((dict(list(ranges.items())[:1]), "x', x''"), (ranges, "")):
         told = fp.review(replace(problem, sensing=fp.Sensing(sensors)), plans(), mismatch=0.0, seed=0).answers
