@@ -21,8 +21,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.problem import OptimalControl
-
 _names = itertools.count()
 _generated = tempfile.TemporaryDirectory(prefix="acados")
 
@@ -58,7 +56,7 @@ def choices(stages: int) -> list[tuple[str, int]]:
     return [*interior, ("FULL_CONDENSING_DAQP", stages)] if has_daqp else interior
 
 
-def acados_plans(ocp: OptimalControl, kind: str, choice: tuple[str, int], flags: str) -> Callable[..., Any]:
+def acados_plans(ocp: Any, kind: str, choice: tuple[str, int], flags: str) -> Callable[..., Any]:
     """A warm-started SQP or RTI: (s0, data, cold=False) -> (inputs, seconds).
 
     Args:
@@ -93,7 +91,7 @@ def acados_plans(ocp: OptimalControl, kind: str, choice: tuple[str, int], flags:
     return solve
 
 
-def _built(ocp: OptimalControl, kind: str, quadratic: str, blocks: int, flags: str) -> Any:
+def _built(ocp: Any, kind: str, quadratic: str, blocks: int, flags: str) -> Any:
     from acados_template import AcadosModel, AcadosOcp, AcadosOcpSolver
 
     model, made = AcadosModel(), AcadosOcp()

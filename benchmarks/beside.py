@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
+from fpirhc.contracts import Controller
 
 Step = Callable[[float, np.ndarray], np.ndarray]  # time and measured state -> command
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 import sys
 from collections import namedtuple
 from dataclasses import replace
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from foreign import FOREIGN
 
 import fpirhc as fp
-from fpirhc.certificate.limits import LimitsCertificate
 
 ROUNDING = 1e-9  # of the integrators: the theorem is about the exact motion
 
@@ -66,7 +66,7 @@ def drawn(box: dict[str, tuple[float, float]], count: int) -> np.ndarray:
     return ends[:, 0] + shares * (ends[:, 1] - ends[:, 0])
 
 
-def runs(name: str, stated: LimitsCertificate, plants: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def runs(name: str, stated: Any, plants: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States (cycles + 1, nx, plants), commands and response errors; plans are those of one run."""
     problem, a, plant = stated.problem, LOOPS[name].gain, stated.problem.plant
     plans = fp.simulate(problem, stated.controller, seed=0)
@@ -95,7 +95,7 @@ def runs(name: str, stated: LimitsCertificate, plants: np.ndarray) -> tuple[np.n
     return np.array(states), np.array(commands), np.array(errors)
 
 
-def violating(stated: LimitsCertificate, found: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+def violating(stated: Any, found: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
     """Whether a plant leaves what is stated, one entry a plant."""
     states, commands, errors = found
     least, most = (end[:, None] for end in stated.problem.limits.state_bounds(stated.problem.plant))

@@ -14,19 +14,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
+import by_hand
 import numpy as np
+from table import write_table
 
 import fpirhc as fp
-from fpirhc.simulation.loop import close_loop
-from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.native import native
-from fpirhc.symbolic.program import chained
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-import by_hand
-from table import write_table
 
 REPEATS = 40
 TASK, CONTROLLER = by_hand.TASK, by_hand.CONTROLLER
@@ -46,10 +39,9 @@ def best(work: Callable[[], object], repeats: int = REPEATS, clock: Callable[[],
 
 def simulated(compiled: bool) -> Callable[[], object]:
     """The accumulated loop as `simulate` runs it, without its set-up: chunks, log, finiteness check."""
-    loop = close_loop(TASK.problem, CONTROLLER)
-    chunk = 500
-    function = native(loop.function, calls=chunk).function if compiled else chained(loop.function, chunk, 5)
-    evaluator = Evaluator(function)
+    made = fp.simulator(TASK.problem, CONTROLLER, compiled=compiled)
+    loop, evaluator = made.loop, made.evaluator
+    chunk = evaluator.results[1].size // loop.trace.size
     log = np.empty((CYCLES, loop.trace.size))
 
     def work() -> None:
@@ -65,7 +57,7 @@ def simulated(compiled: bool) -> Callable[[], object]:
 
 def plain_calls() -> None:
     """A Python loop around an ordinary Function call, as most tools do; a tenth of the cycles."""
-    loop = close_loop(TASK.problem, CONTROLLER)
+    loop = fp.simulator(TASK.problem, CONTROLLER, compiled=False).loop
     memory = loop.memory.start()
     for _ in range(CYCLES // 10):
         memory, _trace = loop.function(memory)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Foreign:
     before: dict[str, float] = field(default_factory=dict)  # inputs of the stage before
     spread: dict[str, float] = field(default_factory=dict)  # of random first states, where limits do not say it
 
-    def first(self, ocp: OptimalControl, state: np.ndarray) -> np.ndarray:
+    def first(self, ocp: Any, state: np.ndarray) -> np.ndarray:
         """The horizon's first state for this state of the plant."""
         before = [self.before.get(i, 0.0) for i in self.plant.inputs]
         return np.asarray(ocp.start(state, before).full()).ravel()

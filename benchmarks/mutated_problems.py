@@ -1,11 +1,18 @@
-"""Problem files with one to three random mistakes of the kinds that people make, from a seed."""
+"""Problem files with one to three random mistakes of the kinds that people make, from a seed, and what these raise inside."""
 
 from __future__ import annotations
 
 import ast
 import copy
 import random
+import traceback
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import fpirhc as fp
+from fpirhc.controllers.check import checked
+from fpirhc.errors import ProblemFileError
 
 SOURCE = '''"""A cart with everything that a problem file can have."""
 import casadi as ca
@@ -73,6 +80,31 @@ def mutated(seed: int) -> str:
     for _ in range(random_numbers.choice((1, 1, 1, 2, 3))):
         random_numbers.choice((_replace, _replace, _replace, _rename, _drop, _swap, _misspell))(tree, random_numbers)
     return ast.unparse(ast.fix_missing_locations(tree))
+
+
+def raw_error(path: Path, seed: int) -> str:
+    """The Python error that a random mistake raises inside the library; empty where it is refused by name, or accepted."""
+    path.write_text(mutated(seed), encoding="utf-8")
+    try:
+        task = fp.load_problem(str(path))
+        for controller in task.controllers.values():
+            with suppress(fp.FpirhcError):
+                checked(task.problem, controller)
+    except ProblemFileError as refused:
+        # An error of the file itself, such as a misspelt name, is shown as Python has it; one from our own lines is not.
+        inside = refused.__context__
+        wrapped = inside is not None and not isinstance(inside, fp.FpirhcError) and not _from_file(inside, path)
+        return f"seed {seed}: {inside!r}" if wrapped else ""
+    except Exception as error:  # noqa: BLE001 -- what is looked for
+        return f"seed {seed}: {error!r}"
+    return ""
+
+
+def _from_file(error: BaseException, path: Path) -> bool:
+    """Whether the innermost line of the file or of the package is the file's."""
+    names = [frame.filename for frame in traceback.extract_tb(error.__traceback__)]
+    own = [name == str(path) for name in names if name == str(path) or "/fpirhc/" in name]
+    return own[-1:] == [True] or isinstance(error, SyntaxError)
 
 
 def _replace(tree: ast.Module, numbers: random.Random) -> None:

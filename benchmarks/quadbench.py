@@ -19,14 +19,13 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.controllers.contract import Controller
-from fpirhc.problem_files.problem_file import Task
-from fpirhc.studies.variants import CasesOf
+from fpirhc.contracts import Controller
 
 FOLDER = Path(__file__).parents[1] / "problems" / "outside" / "quadbench"
 sys.path.insert(0, str(FOLDER))
@@ -110,23 +109,23 @@ _TURNED = ca.Function("turned", [_Q], [vehicle.turned(_Q)])
 RIVALS = {"SE3": Geometric, "INDI": Rival}
 
 
-def with_numbers(task: Task, numbers: Mapping[str, float]) -> Task:
+def with_numbers(task: Any, numbers: Mapping[str, float]) -> Any:
     """Return the task with numbers of the body that hold in every case."""
     more = {f"exact.{name}": value for name, value in numbers.items()}
     return replace(task, cases=fp.Cases({name: {**case, **more} for name, case in task.cases.changes.items()}))
 
 
-def ours(task: Task, patterns: Sequence[str]) -> dict[str, np.ndarray]:
+def ours(task: Any, patterns: Sequence[str]) -> dict[str, np.ndarray]:
     """Return the errors by controller, m; nan where a trial was not flown."""
     if not task.controllers:
         return {}
     with tempfile.TemporaryDirectory() as folder:
-        table = fp.study(task, CasesOf(tuple(patterns)), folder=Path(folder), compiled=False).table
+        table = fp.study(task, fp.CasesOf(tuple(patterns)), folder=Path(folder), compiled=False).table
         distance = next(column for column in table if column.startswith("distance"))
         return {name: rows[distance].to_numpy(float) for name, rows in table.groupby("controller", sort=False)}
 
 
-def theirs(task: Task, patterns: Sequence[str], names: Sequence[str]) -> dict[str, np.ndarray]:
+def theirs(task: Any, patterns: Sequence[str], names: Sequence[str]) -> dict[str, np.ndarray]:
     """The same of the benchmark's controllers."""
     errors: dict[str, list[float]] = {name: [] for name in names}
     for case in task.cases.matching(patterns):
@@ -149,9 +148,7 @@ def motion(problem: fp.Problem) -> Callable[[float], np.ndarray]:
     return at
 
 
-def trials(
-    task: Task, numbers: Mapping[str, float], patterns: Sequence[str], regime: str, names: Sequence[str]
-) -> None:
+def trials(task: Any, numbers: Mapping[str, float], patterns: Sequence[str], regime: str, names: Sequence[str]) -> None:
     """Print median errors by family and over all trials, how many were flown, and in how many each beats INDI."""
     task = with_numbers(replace(task, controllers={n: c for n, c in task.controllers.items() if n in names}), numbers)
     errors = {**theirs(task, patterns, [n for n in RIVALS if n in {*names, "INDI"}]), **ours(task, patterns)}
@@ -183,7 +180,7 @@ def _median(errors: np.ndarray) -> float:
     return 100 * value if value < LOST else np.nan
 
 
-def circle(task: Task) -> None:
+def circle(task: Any) -> None:
     """Print the mean distance from 3 to 8 s on the circle in a wind of 3 m/s, with latencies that the model lacks."""
     print("circle in 3 m/s wind, mean distance 3 to 8 s, m: " + CIRCLE)
     late = [("", {}), *((f"thrust {t} ms", {"late_thrust": t / 1e3}) for t in (10, 20, 30, 40, 50))]
@@ -206,16 +203,13 @@ def circle(task: Task) -> None:
 
 def halved(controller: Controller) -> Controller:
     """Return the controller with half the gain of its deformation."""
-    return controller.with_deformation(
-        controller.deformation.with_effective_gain(controller.deformation.effective_gain() / 2)
-    )
+    own = controller.deformation
+    return controller.with_deformation(own.with_effective_gain(own.effective_gain() / 2))
 
 
-def _circled(task: Task, name: str, controller: Controller | None, told: Mapping[str, float]) -> float:
-    first, speed = (
-        (2.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        float(np.sqrt(vehicle.BENCHMARK["mass"] * 9.81 / 4 / vehicle.BENCHMARK["k_eta"])),
-    )
+def _circled(task: Any, name: str, controller: Controller | None, told: Mapping[str, float]) -> float:
+    first, body = (2.0, 0.0, 0.0, 0.0, 0.0, 0.0), vehicle.BENCHMARK
+    speed = float(np.sqrt(body["mass"] * 9.81 / 4 / body["k_eta"]))
     numbers = {n: value for n, (value, _) in draws.NUMBERS.items()} | {"wind_x": 3.0} | told
     round_it = fp.Trajectory(lambda t: {"x": 2 * ca.cos(TURN * t), "y": 2 * ca.sin(TURN * t), "z": 0 * t})
     outside = replace(

@@ -82,12 +82,11 @@ def files() -> str:
 
 def problems() -> str:
     """Problem files with mistakes."""
-    import pytest
-    from raw_errors import raw_error
+    from mutated_problems import raw_error
 
     warnings.simplefilter("ignore")
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        ends = [raw_error(Path(folder) / "mine.py", 1000 + k, patch) for k in range(MISTAKES)]
+    with tempfile.TemporaryDirectory() as folder:
+        ends = [raw_error(Path(folder) / "mine.py", 1000 + k) for k in range(MISTAKES)]
     wrong = [end for end in ends if end]
     rows = [["problem files with one to three mistakes", "raw errors"], [str(MISTAKES), str(len(wrong))]]
     return f"{_table(rows)}\n\n{_what_went(wrong)}"

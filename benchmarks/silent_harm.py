@@ -24,7 +24,6 @@ import joblib
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.errors import FpirhcError
 from fpirhc.simulation.model_as_plant import behind_actuators
 from fpirhc.simulation.trials import weighed
 from fpirhc.symbolic.driver import compiled_plans
@@ -156,7 +155,7 @@ def asked(seed: int, loud: bool = False) -> tuple[str, str, list[str], str]:
     warnings.simplefilter("ignore")
     with compiled_plans():
         for attempt in itertools.count():
-            with suppress(FpirhcError):  # refused: another one is drawn
+            with suppress(fp.FpirhcError):  # refused: another one is drawn
                 name, told, moves, pair, untold = variant(seed, attempt)
                 ratio, good, errors = judged(moves, pair)
                 break

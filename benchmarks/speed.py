@@ -26,17 +26,18 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
+import acados_plans
 import casadi as ca
 import numpy as np
+from table import write_table
 
 import fpirhc as fp
-from fpirhc.horizon.problem import OptimalControl, rollout
-from fpirhc.horizon.stage_data import stage_data
-from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import Optimiser
+from fpirhc.conformance import compiled as in_c
+from fpirhc.conformance import posed
+from fpirhc.contracts import Optimiser
+from fpirhc.horizon.problem import rollout
 from fpirhc.optimisers.nlp import (
     MultipleShooting,
     interleave,
@@ -47,20 +48,14 @@ from fpirhc.optimisers.nlp import (
     sizes,
 )
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.native import native
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-import acados_plans
-from table import write_table
 
 COLD = "--cold" in sys.argv
 PLANS, PASSES, SPENT = 100, 10, 1.0  # a solver makes PASSES passes, or as many as begin within SPENT seconds
 FLAGS = ["-O3", "-march=native"]
 LARGE = 500  # instructions of a stage; above it CasADi's solvers are compiled with -O1, else that takes minutes
 JIT = {"jit": True, "compiler": "shell", "jit_temp_suffix": True}
-Solve = Callable[
-    ..., tuple[np.ndarray, float]
-]  # (s0, data, cold=False) -> inputs (nu, N), seconds; NaN where it has no plan
+# (s0, data, cold=False) -> inputs (nu, N), seconds; NaN where it has no plan
+Solve = Callable[..., tuple[np.ndarray, float]]
 OURS, ONCE, IPOPT = "FixedPoint()", "one iteration", "IPOPT"
 
 
@@ -132,20 +127,19 @@ class Loop:
     right: bool
 
     @property
-    def ocp(self) -> OptimalControl:
-        p = self.problem
-        return transcribe(p.plant, p.reference, p.horizon, p.cost, p.limits)
+    def ocp(self) -> Any:
+        return posed(self.problem)[0]
 
     def flown(self, solve: Solve) -> tuple[list[tuple[np.ndarray, np.ndarray]], float]:
         """(s0, data) of every plan, and the rms error of the controlled coordinates in the last three quarters of the run."""
         p, ocp = self.problem, self.ocp
-        data_of, names = stage_data(p.plant, p.reference, p.horizon, p.cost), p.plant.state.elements
+        names = p.plant.state.elements
         real = p.plant.approximate if self.right else p.plant.exact
         advance = fp.RungeKutta4(4).step(p.plant, p.horizon.step)
         state, before, found, errors = p.start_state, np.zeros(ocp.input.size), [], []
         place = {n: k for k, n in enumerate(p.plant.output.elements)}
         for k in range(PLANS):
-            data = np.asarray(data_of(k * p.horizon.step, p.plant.approximate).full())
+            data = posed(p, time=k * p.horizon.step)[2]
             s0 = np.asarray(ocp.start(state, before).full()).ravel()
             wanted = data[ocp.data.slice("reference"), 0]
             errors.append([state[names.index(n)] - wanted[place[n]] for n in p.plant.controlled or p.plant.names])
@@ -182,9 +176,9 @@ _clock_itself = 0
 _clock_itself = int(1e9 * np.median([clock(lambda: None) for _ in range(2000)]))
 
 
-def ours(optimiser: Optimiser, ocp: OptimalControl) -> Solve:
+def ours(optimiser: Optimiser, ocp: Any) -> Solve:
     """A warm-started loop around a compiled step."""
-    evaluator, layout = Evaluator(native(optimiser.step(ocp), required=True).function), optimiser.memory(ocp)
+    evaluator, layout = Evaluator(in_c(optimiser.step(ocp))), optimiser.memory(ocp)
     remembered = ca.MX.sym("m", layout.size)
     shift = ca.Function("later", [remembered], [optimiser.shifted(ocp, remembered)])
     s0_, data_, lower, upper, memory = evaluator.arguments
@@ -199,7 +193,7 @@ def ours(optimiser: Optimiser, ocp: OptimalControl) -> Solve:
     return solve
 
 
-def shooting(optimiser: MultipleShooting, ocp: OptimalControl, *, compiled: bool = True) -> Solve:
+def shooting(optimiser: MultipleShooting, ocp: Any, *, compiled: bool = True) -> Solve:
     """The same around CasADi's solver alone, with its shifted variables and multipliers."""
     flags = FLAGS if ocp.dynamics.n_instructions() < LARGE else ["-O1"]
     how = {**JIT, "jit_options": {"flags": flags, "verbose": False}} if compiled else {}
@@ -241,7 +235,7 @@ def shooting(optimiser: MultipleShooting, ocp: OptimalControl, *, compiled: bool
     return solve
 
 
-def condensed(ocp: OptimalControl) -> Solve:
+def condensed(ocp: Any) -> Solve:
     """DAQP on the condensed program of a linear plant: bounds of all inputs, rows for limited states."""
     import daqp
 
@@ -282,7 +276,7 @@ def condensed(ocp: OptimalControl) -> Solve:
     return solve
 
 
-def acados(ocp: OptimalControl, horizons: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Solve]:
+def acados(ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Solve]:
     """Its RTI and its SQP, with the condensing QP solver with which SQP is quickest on these horizons."""
     taken, solvers = {}, {}
     for choice in acados_plans.choices(ocp.stages):
@@ -293,7 +287,7 @@ def acados(ocp: OptimalControl, horizons: list[tuple[np.ndarray, np.ndarray]]) -
     return {"acados RTI": acados_plans.acados_plans(ocp, "RTI", best, " ".join(FLAGS)), "acados SQP": solvers[best]}
 
 
-def ways(name: str, ocp: OptimalControl, horizons: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Solve]:
+def ways(name: str, ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Solve]:
     """Every solver, warm-started."""
     once = fp.FixedPoint(iterations=1, most_iterations=1 if ocp.bounds_states else 100)
     found = {OURS: ours(fp.FixedPoint(), ocp), ONCE: ours(once, ocp)}
@@ -326,7 +320,7 @@ def timed(solvers: dict[str, Solve], horizons: list[tuple[np.ndarray, np.ndarray
     return plans, {name: np.nanquantile(each, 0.25, axis=0) for name, each in seconds.items()}
 
 
-def active(ocp: OptimalControl, horizons: list[tuple[np.ndarray, np.ndarray]], plans: list[np.ndarray]) -> np.ndarray:
+def active(ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]], plans: list[np.ndarray]) -> np.ndarray:
     """Whether a limit is met in these plans, to 1e-4 of its range."""
     predict, boxes = rollout(ocp), ((ocp.state_lower, ocp.input_lower), (ocp.state_upper, ocp.input_upper))
     low, high = (np.concatenate(box)[:, None] for box in boxes)
@@ -363,9 +357,8 @@ def cells(both: list[tuple[dict, dict]], best: list[np.ndarray], chosen: np.ndar
     found, unit = {}, [np.median(seconds[OURS][chosen]) for _, seconds in both]
     for way, plans in both[0][0].items():
         middle = [np.median(seconds[way][chosen]) for _, seconds in both]
-        away = np.array([float(np.abs(p - b).max() / np.abs(b).max()) for p, b in zip(plans, best, strict=True)])[
-            chosen
-        ]
+        away = [float(np.abs(p - b).max() / np.abs(b).max()) for p, b in zip(plans, best, strict=True)]
+        away = np.array(away)[chosen]
         us, ratio = ([f"{m:.3g}" for m in values] for values in (1e6 * np.array(middle), np.divide(middle, unit)))
         text = f"{us[0]} and {us[1]} us" if way == OURS else f"{us[0]} us, {ratio[0]} and {ratio[1]}"
         far = int((~(away < 1e-2)).sum())
