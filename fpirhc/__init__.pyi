@@ -104,7 +104,7 @@ from .studies.tune import tune as tune
 from .studies.variants import CasesOf as CasesOf
 from .studies.variants import Draws as Draws
 from .studies.variants import Grid as Grid
-from .symbolic.open import signed_power as signed_power
+from .symbolic.expression import signed_power as signed_power
 from .task.cases import Cases as Cases
 from .task.dead_time import DeadTime as DeadTime
 from .task.disturbance import ColouredNoise as ColouredNoise

@@ -158,7 +158,7 @@ def _refused_alone(problem: Problem, controller: Controller, path: str) -> bool:
 def number_paths(problem: Problem, controller: Controller) -> Iterator[str]:
     """Yield the path of every number of a controller, and of the problem's cost and limits where these are its own."""
     yield from _paths(controller, "")
-    for name in ("cost", "limits", "dead_time"):
+    for name in ("cost", "limits"):
         if getattr(problem, name) is not None and getattr(controller, name, None) is None:
             yield from _paths(getattr(problem, name), f"{name}.")
 

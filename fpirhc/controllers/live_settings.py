@@ -21,21 +21,19 @@ from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import described, real_number
-from fpirhc.symbolic.block import Block, Composite, Delay, open_settings
+from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
-from fpirhc.symbolic.layout import Layout, scalar
-from fpirhc.symbolic.open import ANEW, PREFIX, copied, not_live, open_number
+from fpirhc.symbolic.open import ANEW, Opened, copied, not_live
 from fpirhc.symbolic.paths import Copy, changed_at, content_at, entry, mapped, names_in, paths_to, validated
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
-OF_PROBLEM = ("cost", "limits", "dead_time", "reference", "sensing", "disturbances")
+OF_PROBLEM = ("cost", "limits", "reference")
 _ALWAYS_DATA = (
     "Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes exact.NAME, "
     "approximate.NAME and start.NAME"
 )
-_IN_TABLES = ("sensing.", "disturbances.")  # of what Python makes tables before a run
 _SMALLEST = 1e-3
 _OF_BUILD = (ArithmeticError, AttributeError, FpirhcError, NotImplementedError, RuntimeError, TypeError, ValueError)
 _PACKAGE = str(Path(__file__).parents[1])
@@ -60,24 +58,15 @@ class LiveSettings:
         """The numbers of the build by path."""
         return {path: float(self._content(path)) for path in self.paths}
 
-    @property
-    def signals(self) -> Layout:
-        """One signal per setting, with the number of the build as its start."""
-        return Layout(tuple(scalar(PREFIX + path, start=value) for path, value in self.start.items()))
-
-    def planted(self) -> tuple[Problem, Controller]:
-        """Return problem and controller with open numbers in place of the settings."""
+    def _with(self, contents: Mapping[str, object], copy: Copy) -> tuple[Problem, Controller]:
+        """Problem and controller with other contents, by path."""
         problem, controller = self.problem, self.controller
-        for path, value in self.start.items():
-            problem, controller = self._at(problem, controller, path, open_number(path, value), copied)
+        for path, content in contents.items():
+            if self._owner(path) is self.problem:
+                problem = changed_at(problem, path, content, copy)
+            else:
+                controller = changed_at(controller, path, content, copy)
         return problem, controller
-
-    def _at(
-        self, problem: Problem, controller: Controller, path: str, content: object, copy: Copy
-    ) -> tuple[Problem, Controller]:
-        if self._in_problem(path):
-            return changed_at(problem, path, content, copy), controller
-        return problem, changed_at(controller, path, content, copy)
 
     def composed(self, compose: Callable[[Problem, Controller], Composite]) -> Composite:
         """Return what `compose` makes of problem and controller with open numbers.
@@ -85,16 +74,16 @@ class LiveSettings:
         Raises:
             NotSupported: a number that the loop does not read, or with which Python computes while the loop is built.
         """
+        opened = Opened(self.start)
         try:
-            composite = compose(*self.planted())
+            composite = compose(*self._with(opened.symbols, copied))
         except _OF_BUILD as error:
             interruption = unwrapped(error)
             if not isinstance(interruption, Exception):
                 raise interruption from None
             raise self._refusal(error, compose) from None
-        read = {s.name for b in composite.blocks for s in b.inputs.signals}
         for path in self.paths:
-            if PREFIX + path not in read and not (self._in_problem(path) and path.startswith(_IN_TABLES)):
+            if path not in opened.read:
                 loop = f"the loop of {type(self.controller).__name__}"
                 raise not_live([path], f"{loop} does not use it, or uses only what was computed from it before; {ANEW}")
         for block in composite.blocks:
@@ -118,29 +107,18 @@ class LiveSettings:
         where = f"{Path(place.filename).stem}.{place.name}"
         return not_live(self.paths, f"{where} needs its number while the loop is built; {ANEW}", " here")
 
-    def held(self, blocks: Sequence[Block]) -> list[Delay]:
-        """Return the settings that some blocks read, as constants of a memory with the numbers of the build."""
-        read = open_settings(blocks)
-        return [Delay(s, s.name) for s in self.signals.signals if s.name in read]
-
     def changed(self, numbers: Numbers) -> tuple[Problem, Controller, dict[str, float]]:
         """Return problem and controller with other numbers, checked, and the numbers of all settings by path.
 
         `numbers`: by path, a pair for an interval; settings that are not named have the numbers of the build.
         """
         values = self.start | self.flat(numbers)
-        problem, controller = self.problem, self.controller
         for path, value in values.items():
             if not math.isfinite(value):  # whether there is a limit decides what is compiled
                 raise InvalidValue(
                     f"setting '{path}' cannot become {value}: the compiled loop has this number in its code; use a large one"
                 )
-            if value != self._content(path):
-                problem, controller = self._at(problem, controller, path, value, validated)
-        if [s.elements for s in problem.sensing.drawn] != [s.elements for s in self.problem.sensing.drawn]:
-            raise InvalidValue(
-                "whether a sensor loses samples decides what the loop is made of: expected a dropout above 0, as in the build"
-            )
+        problem, controller = self._with({p: v for p, v in values.items() if v != self.start[p]}, validated)
         return problem, checked(problem, controller, numbers_only=True), values
 
     def bounds(self, path: str, reach: float = math.inf) -> Interval:
@@ -197,11 +175,11 @@ class LiveSettings:
                 raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
         return [(name, both[name]) for name in ends]
 
-    def _in_problem(self, path: str) -> bool:
-        return _owner(self.problem, self.controller, path) is self.problem
+    def _owner(self, path: str) -> Problem | Controller:
+        return _owner(self.problem, self.controller, path)
 
     def _content(self, path: str) -> float:
-        return cast(float, content_at(_owner(self.problem, self.controller, path), path))
+        return cast(float, content_at(self._owner(path), path))
 
 
 def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:

@@ -31,9 +31,8 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Evidence, Model, values_of
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.expression import Signals, is_finite, left_after, left_in_mean
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.open import left_after, left_in_mean, numbers, stays
 from fpirhc.task.dead_time import DeadTime, Queue, every, whole
 from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
 from fpirhc.task.problem import Problem
@@ -127,7 +126,7 @@ class Path:
         mean, parameters = end, s.parameters
         if self._lags:
             taus, period = every(self.lag), self.problem.period
-            left, share = (numbers([f(period, t) for t in taus], end) for f in (left_after, left_in_mean))
+            left, share = (ca.vertcat(*(f(period, t) for t in taus)) for f in (left_after, left_in_mean))
             away = getattr(s, f"{self.name}_actuators") - end
             end, mean = end + left * away, end + share * away
             later[f"{self.name}_actuators_next"] = end
@@ -147,7 +146,7 @@ class Path:
 
     @property
     def _lags(self) -> bool:
-        return not all(stays(t, 0.0) for t in every(self.lag))
+        return any(every(self.lag))
 
     @cached_property
     def _told(self) -> Told:

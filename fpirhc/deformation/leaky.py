@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 
+import casadi as ca
+
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
-from fpirhc.symbolic.open import between, smaller, sqrt
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
@@ -23,7 +24,7 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
     if pole is not None:
         return pole
     error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
-    return default_pole(between(abs(gain), 1.0, _LARGEST_PRODUCT), error)
+    return default_pole(ca.fmin(ca.fmax(abs(gain), 1.0), _LARGEST_PRODUCT), error)
 
 
 def default_uncertainty(cycles: float) -> float:
@@ -35,7 +36,7 @@ def default_pole(product: float, uncertainty: float) -> float:
     """The pole of the theorem and a little more, below one; 0 where the dead time is certain."""
     least = _least_pole(product, uncertainty)
     factor, amount = _BEYOND
-    return smaller(factor * least + amount, 0.5 * (1 + least)) if uncertainty > 0 else 0.0
+    return ca.fmin(factor * least + amount, 0.5 * (1 + least)) if uncertainty > 0 else 0.0
 
 
 def check_cycles(owner: str, cycles: Cycles, name: str = "cycles") -> None:
@@ -76,4 +77,4 @@ def _least_pole(product: float, uncertainty: float) -> float:
     p = (2 c + 1 - sqrt(4 c + 1)) / (2 c) with c = g (2 + g) m^2 / 4, here without cancellation; the product may be open.
     """
     bound = product * (2 + product) * uncertainty**2 / 4
-    return 2 * bound / (2 * bound + 1 + sqrt(4 * bound + 1))
+    return 2 * bound / (2 * bound + 1 + ca.sqrt(4 * bound + 1))

@@ -42,7 +42,9 @@ class ModelReferenced(Wrapper):
 
     cycles: Cycles | None = field(default=None, metadata={"of_problem": True, "structure": True})
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
-    lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"of_problem": True})
+    lag: NotNegative | tuple[NotNegative, ...] | None = field(
+        default=None, metadata={"of_problem": True, "structure": True}
+    )
     uncertainty: int | None = None
     pole: BelowOne | None = None
 

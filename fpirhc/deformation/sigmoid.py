@@ -20,7 +20,6 @@ from fpirhc.deformation.base import Deformation, RequestChange, smooth_norm
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import NotZero, Positive, Range
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.open import atanh, signed, sqrt, tanh
 
 # Beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits.
 _SHIFTS = Range("a number from -5 to 5, such as 0.3", low=-5.0, high=5.0)
@@ -71,14 +70,14 @@ class Sigmoid(Deformation):
 
     @cached_property
     def _tanh_fixed_point(self) -> float:
-        """The root y = tanh(x*) of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
-        t = tanh(self.shift)
-        return 2 * t / (1 + sqrt(1 + 8 * (t * t)))
+        """The root y = tanh(x*) of 2 t y^2 + y = t with t = ca.tanh(D), in the form that has no 0/0 at D = 0."""
+        t = ca.tanh(self.shift)
+        return 2 * t / (1 + ca.sqrt(1 + 8 * (t * t)))
 
     @property
     def fixed_point(self) -> float:
         """x* = zeta(x*)."""
-        return atanh(self._tanh_fixed_point)
+        return ca.atanh(self._tanh_fixed_point)
 
     @property
     def slope(self) -> float:
@@ -134,7 +133,7 @@ class Sigmoid(Deformation):
         Raises:
             InvalidValue: the scale is still to be chosen.
         """
-        return self._chosen_scale() * (math.atanh(0.5) - signed(self.fixed_point, self.shift * self.gain))
+        return self._chosen_scale() * (math.atanh(0.5) - ca.copysign(self.fixed_point, self.shift * self.gain))
 
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -a / zeta'(x*)."""

@@ -19,7 +19,7 @@ from fpirhc.errors import InvalidName
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.open import PREFIX
+from fpirhc.symbolic.open import SETTINGS
 from fpirhc.symbolic.program import generate
 from fpirhc.task.problem import Problem
 
@@ -57,10 +57,9 @@ class Device:
 
     @cached_property
     def settings(self) -> Layout:
-        """Live settings, with their units as far as they are known, and what follows from them."""
-        own = self._read(lambda name: name.startswith(PREFIX)).signals
-        units = {s.name: unit_of_setting(s.name.removeprefix(PREFIX), self.problem) for s in own}
-        return Layout(tuple(replace(s, units=(units[s.name],) * s.size) for s in own))
+        """Live settings, with their units as far as they are known."""
+        own = self._read(lambda name: name == SETTINGS).signals
+        return Layout(tuple(replace(s, units=tuple(unit_of_setting(e, self.problem) for e in s.elements)) for s in own))
 
     @cached_property
     def data(self) -> Layout:

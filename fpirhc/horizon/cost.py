@@ -21,7 +21,7 @@ from fpirhc.fields.user_code import called
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named
-from fpirhc.symbolic.open import require_closed, stays
+from fpirhc.symbolic.open import stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +217,6 @@ class Quadratic(Cost):
         if isinstance(self.terminal, Mapping):
             return _squares(self.terminal, view.output, view.reference)
         error = view.state.vector[: plant.state.size] - view.reference.vector
-        require_closed("the terminal weight of LQRTerminal", self)
         weight = ca.SX(ca.DM(np.asarray(self.terminal.weight(self, plant, linearise()))))
         return ca.bilin(weight, error, error)
 

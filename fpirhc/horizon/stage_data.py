@@ -5,7 +5,7 @@ Where cost or limits have open numbers, the data of every stage end with these s
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
@@ -16,8 +16,7 @@ from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.open import PREFIX
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.reference import Reference
 
 
@@ -155,12 +154,6 @@ def offset_limits(plant: Plant, horizon: Horizon, layout: Layout) -> ca.Function
     offset = ca.repmat(state[places] - start[places], 1, nodes)
     table = ca.vertcat(data[: rows.start, :], offset, data[rows.stop :, :])
     return ca.Function("fpirhc_offset_limits", [data, start, state], [table])
-
-
-def settings_in(expressions: Iterable[Expression], known: Expression) -> list[ca.SX]:
-    """Return the symbols of settings in some expressions, in the order in which they appear."""
-    symbols = ca.symvar(ca.vertcat(known, *(ca.vec(ca.SX(e)) for e in expressions)))
-    return [s for s in symbols if s.name().startswith(PREFIX)]
 
 
 def setting_rows(paths: tuple[str, ...]) -> Layout:

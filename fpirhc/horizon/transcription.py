@@ -28,14 +28,14 @@ from fpirhc.horizon.cost import Cost, Linearisation, View
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along
-from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, settings_in, stage_data, with_rows
+from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data, with_rows
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
 from fpirhc.plant.motion import outside_of, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.open import PREFIX, nominal, number_of, open_numbers
+from fpirhc.symbolic.open import nominal, number_of, open_in, open_numbers
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -93,7 +93,7 @@ def _transcribed(
     dynamics, stage_cost, terminal_cost, soft_end = functions_of_stage
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
-    settings = tuple(s.name().removeprefix(PREFIX) for s in stage.settings)
+    settings = tuple(s.name() for s in stage.settings)
     bounds = limits.input_bounds(plant)
     values = {path: number_of(number) for path, number in open_numbers(cost, limits).items()}
     if settings:
@@ -202,7 +202,7 @@ def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cos
         raise InvalidProblem(f"cost: {error}") from None
     binding = hard(written, soft_names(limits, plant))
     _check_entries(plant, keeps_input, written)
-    settings = settings_in([x_next, *terms.values(), final, *(w.expression for w in binding)], theta)
+    settings = open_in(x_next, *terms.values(), final, *(w.expression for w in binding))
     if settings:
         theta = ca.vertcat(theta, *settings)
 

@@ -23,7 +23,6 @@ from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObser
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.open import expressed, stays
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.disturbance import Disturbance
 
@@ -57,7 +56,7 @@ class Sensor(Checked):
     @property
     def acts(self) -> bool:
         """Whether it changes what is measured."""
-        return self.noise is not None or self.quantum is not None or not stays(self.dropout, 0.0)
+        return self.noise is not None or self.quantum is not None or self.dropout > 0
 
 
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
@@ -241,8 +240,7 @@ class Sensing(Checked):
         sensor = self.sensors.get(name)
         if sensor is None or sensor.quantum is None:
             return value
-        quantum = expressed(sensor.quantum, value)
-        quanta = quantum * ca.floor(value / quantum + 0.5)
+        quanta = sensor.quantum * ca.floor(value / sensor.quantum + 0.5)
         # The same number, but CasADi would multiply a quantum that is a constant by the weights of the estimator behind it: that
         # rounds otherwise than an open quantum does, and a last place of a sample is now and then a whole one of the next.
         return ca.copysign(ca.fabs(quanta), quanta)
@@ -254,7 +252,7 @@ class Sensing(Checked):
 
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]
-        lossy = [(n, "lost", not stays(s.dropout, 0.0)) for n, s in self.sensors.items()]
+        lossy = [(n, "lost", s.dropout > 0) for n, s in self.sensors.items()]
         pairs = [p for both in zip(noisy, lossy, strict=True) for p in both]
         return tuple(f"{n} {what}" for n, what, there in pairs if there)
 

@@ -12,7 +12,7 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.errors import InvalidField, InvalidValue
 from fpirhc.fields.kinds import described, finite_number, named_entries
 from fpirhc.symbolic.block import Composite
-from fpirhc.symbolic.open import PREFIX
+from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
 
 Changes = Mapping[float, Numbers]  # by time, s
@@ -29,7 +29,6 @@ class InForce:
     patches: Sequence[tuple[int, np.ndarray, np.ndarray]]
     # what was in force when, as plain data: pairs of a time in s and {path: number}
     record: Sequence[tuple[float, Mapping[str, float]]]
-    later: Sequence[tuple[int, Problem]] = ()  # (first cycle, problem) of every change, for the tables of the run
 
 
 def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
@@ -44,17 +43,16 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
         return InForce(problem, live.controller, numbers, (), [(0.0, numbers)])
     ready, controller, numbers = first.changed(settings)
     record: list[tuple[float, Mapping[str, float]]] = [(0.0, numbers)] if numbers else []
-    patches, later, settings_now = [], [], dict(first.flat(settings))
+    patches, settings_now = [], dict(first.flat(settings))
     for time in sorted(changes):
         if not 0 <= time < problem.duration:
             raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
         settings_now |= first.flat(changes[time])
-        changed, _, values = first.changed(settings_now)
+        values = first.changed(settings_now)[2]
         cycle = int(np.ceil(time / problem.period - 1e-9))
-        later.append((cycle, changed))
         patches.append((cycle, *patch(loop, values)))
         record.append((cycle * problem.period, values))
-    return InForce(ready, controller, numbers, patches, record, later)
+    return InForce(ready, controller, numbers, patches, record)
 
 
 def _check_times(changes: Changes) -> None:
@@ -69,7 +67,6 @@ def _check_times(changes: Changes) -> None:
 
 
 def patch(loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return places in a loop's memory, and the values that these settings have there."""
-    held = {PREFIX + path: value for path, value in numbers.items() if PREFIX + path in loop.memory}
-    places = [loop.memory.slice(name).start for name in held]
-    return np.array(places, dtype=int), np.array(list(held.values()), dtype=float)
+    """Return places in a loop's memory, and the values that the settings have there."""
+    places = np.arange(loop.memory.size)[loop.memory.slice(SETTINGS)]
+    return places, np.array(list(numbers.values()), dtype=float)

@@ -29,10 +29,10 @@ from fpirhc.simulation.path import (
     sensing_blocks,
 )
 from fpirhc.simulation.replay import known_samples
-from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.open import PREFIX
+from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
 
 
@@ -45,12 +45,10 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
     `setpoints` only where the reference is given some.
     """
-    if live is not None:
-        return live.composed(lambda problem, controller: _closed(problem, controller, live))
-    return _closed(problem, controller, None)
+    return _closed(problem, controller) if live is None else live.composed(_closed)
 
 
-def _closed(problem: Problem, controller: Controller, live: LiveSettings | None) -> Composite:
+def _closed(problem: Problem, controller: Controller) -> Composite:
     built = build(problem, controller)
     mover, inner = moving(problem), compose_with_sensing(built)
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
@@ -62,7 +60,7 @@ def _closed(problem: Problem, controller: Controller, live: LiveSettings | None)
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(mover, disturbed)
     around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
-    constants = live.held(around) if live is not None else []
+    constants = [Delay(signal, signal.name) for signal in open_settings(around).signals]
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
     return compose("loop", reads, around, [*_plant_delays(mover, built.model), *constants], outputs=mover.sent)
 
@@ -86,9 +84,8 @@ def start_memory(
     places = {column.removeprefix(f"{INNER}."): k for k, column in enumerate(loop.memory.columns)}
     for signal in signals:
         whole[[places[column] for column in signal.columns]] = signal.start_vector()
-    for path, value in (numbers or {}).items():
-        if PREFIX + path in places:
-            whole[places[PREFIX + path]] = value
+    if numbers and SETTINGS in loop.memory:
+        whole[loop.memory.slice(SETTINGS)] = list(numbers.values())
     return whole
 
 

@@ -154,7 +154,7 @@ class Simulator:
         problem, controller = force.problem, force.controller
         start = start_memory(own.loop, problem, controller, force.numbers)
         rows, talk = _padded(problem, force.patches), moving(problem).exchange(seed)
-        tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints, later=force.later)
+        tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints)
         logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress, force.patches)
         layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)

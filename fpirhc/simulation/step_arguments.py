@@ -27,7 +27,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.open import PREFIX
+from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.checks import check_values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -135,7 +135,7 @@ class StepArguments:
 
     Attributes:
         evaluator: of the Function.
-        settings: arguments of the live settings, by the name of their signal.
+        settings: argument of the live settings; no entries without any.
         setpoints: argument of the set-points; no entries without any.
         time, memory, state, realised, output, taken, command: views; `state` is that of the raw measurements where they are read.
         memory_before, memory_next, trace, command_next: arrays of the memory that is read, and of what is written.
@@ -156,7 +156,7 @@ class StepArguments:
         arguments["parameters"][:] = parameters
         self.sample = arguments
         places = {name: k + 1 for k, name in enumerate(composite.reads.names)}  # after the memory
-        self.settings = {name: self.evaluator.arguments[places[name]] for name in composite.settings.names}
+        self.settings = arguments.get(SETTINGS, NOTHING)
         self.setpoints = np.zeros(0)
         for signal in given_signals(problem):
             self.setpoints = self.evaluator.arguments[places[signal.name]]
@@ -281,7 +281,7 @@ class NumbersNow:
 
     @property
     def settings(self) -> Layout:
-        """The live settings among `reads`, 'setting.PATH'."""
+        """The vector of the live settings among `reads`, 'settings'; an element is a path."""
         return self._composite.settings
 
     def bounds(self) -> dict[str, Interval]:
@@ -309,12 +309,8 @@ class NumbersNow:
         return ByName(values, "Stepper.setpoints")
 
     def _write(self, numbers: Mapping[str, float]) -> None:
-        """Write the settings and what follows from them into the arguments; nothing is written where something is refused."""
-        if not numbers:
-            return
-        values = {PREFIX + path: np.array([value]) for path, value in numbers.items()}
-        for name, argument in self._arguments.settings.items():
-            argument[:] = values[name]
+        if numbers:
+            self._arguments.settings[:] = list(numbers.values())
 
     def _refuse(self, error: FpirhcError) -> bool:
         self.refused, self.why_refused = self.refused + 1, str(error)

@@ -16,8 +16,8 @@ import casadi as ca
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, kind
-from fpirhc.symbolic.layout import Kind, Layout, Signal, scalar
-from fpirhc.symbolic.open import PREFIX as SETTING
+from fpirhc.symbolic.layout import Kind, Layout, Signal
+from fpirhc.symbolic.open import SETTINGS, with_settings
 
 Step = Callable[[Signals], Mapping[str, Value]]
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
@@ -85,15 +85,10 @@ class Block:
         function = ca.Function(name, columns, results, list(symbols), keys, {"allow_free": True})
         if not function.has_free():
             return function, self.reads
-        open_symbols = ca.symvar(ca.veccat(*results)) if self.opaque else ca.symvar(ca.vertcat(*results))
-        entries = {v.name() for v in ca.symvar(ca.vertcat(*columns))} if columns else set()
-        entries -= {signal.name for signal in arguments}  # those of vectors, which are declared
-        found = {v.name(): v for v in open_symbols if v.name().startswith(SETTING) and v.name() not in entries}
-        columns = [found.pop(signal.name, v) for signal, v in zip(arguments, columns, strict=True)]
-        settings = list(found.values())
-        inputs = self.reads + Layout(tuple(scalar(v.name()) for v in settings))
-        at = len(self.reads.signals)
-        columns[at:at], names = settings, [*self.reads.names, *_identifiers(settings), *self.memory.names]
+        results, column, signal = with_settings(self.name, results)
+        inputs = self.reads if signal.name in self.reads else self.reads + Layout((signal,))
+        names = [*inputs.names, *self.memory.names]
+        columns = [column if n == signal.name else symbols[n] for n in names]
         return ca.Function(name, columns, results, names, keys), inputs
 
     @cached_property
@@ -143,7 +138,7 @@ class Composite:
             PREFIX + self.name,
             [remembered, *inputs.values()],
             [ca.densify(ca.MX(r)) for r in returned],
-            ["memory", *_identifiers(inputs)],
+            ["memory", *inputs],
             ["memory_next", "trace", *self.outputs],
         )
 
@@ -154,7 +149,7 @@ class Composite:
 
     @property
     def settings(self) -> Layout:
-        """The signals of settings among the reads."""
+        """The signal of the settings, where it is read."""
         return _settings(self.reads.signals)
 
     @cached_property
@@ -219,7 +214,7 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
 
 
 def open_settings(blocks: Sequence[Block]) -> Layout:
-    """Return the signals of all settings that some blocks read."""
+    """Return the signal of the settings, where some blocks read it."""
     return _settings([s for b in blocks for s in b._built[1].signals])
 
 
@@ -253,14 +248,7 @@ def every(block: Block, cycles: int) -> Block:
 
 
 def _settings(signals: Iterable[Signal]) -> Layout:
-    """The settings among some signals, each once."""
-    return Layout((*{s.name: s for s in signals if s.name.startswith(SETTING)}.values(),))
-
-
-def _identifiers(names: Iterable[object]) -> list[str]:
-    """Names that CasADi accepts for arguments: those of settings have dots."""
-    texts = [name if isinstance(name, str) else cast(ca.SX, name).name() for name in names]
-    return [f"setting_{k}" if t.startswith(SETTING) else t for k, t in enumerate(texts)]
+    return Layout(tuple({s.name: s for s in signals if s.name == SETTINGS}.values()))
 
 
 def _ends(block: Block) -> list[int]:

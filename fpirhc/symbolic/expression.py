@@ -20,6 +20,7 @@ from fpirhc.errors import nearest
 
 Expression: TypeAlias = ca.SX  # a CasADi SX, MX or DM
 Value: TypeAlias = ca.SX | ca.DM | float  # a result of a step: numbers become expressions
+T = TypeVar("T")
 Matrix = TypeVar("Matrix", ca.SX, ca.MX, ca.DM)  # for functions whose result is of the same kind as their argument
 
 # Numbers of the type that computes. In C they are those of its own type: see `driver.OF_TYPE`.
@@ -107,3 +108,29 @@ def _has_nan(function: ca.Function) -> bool:
         return any(math.isnan(function.instruction_constant(k)) for k in places)
     matrices = (function.instruction_MX(k).to_DM() for k in places)
     return any(bool(np.isnan(np.asarray(m.full())).any()) for m in matrices)
+
+
+SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero
+
+
+def signed_power(d: Expression, exponent: Expression | float) -> Expression:
+    """Return sign(d) |d|^exponent, rounded off within 1e-6 of zero so that its derivatives stay finite.
+
+    Computed as d (d^2 + 1e-12)^((exponent - 1)/2).
+    """
+    return d * ca.exp((exponent - 1) / 2 * ca.log(d * d + SMOOTHING**2))
+
+
+def power(base: T, exponent: int) -> T | float:
+    """Return base^exponent as a product, because the pow of Python and that of CasADi differ in the last digit; 1.0 for 0."""
+    return math.prod([base] * (exponent - 1), start=base) if exponent else 1.0  # type: ignore[call-overload]
+
+
+def left_after(period: float, time: float) -> float:
+    """Return e^(-T / tau), the share of a distance that is left after a period; 0 for the time constant 0."""
+    return ca.exp(-period / ca.fmax(time, TINY))
+
+
+def left_in_mean(period: float, time: float) -> float:
+    """Return the mean of what is left over a period, (tau / T) (1 - e^(-T / tau)); 0 for tau = 0."""
+    return time / period * -ca.expm1(-period / ca.fmax(time, TINY))

@@ -1,19 +1,17 @@
 """Numbers that stay open while a loop is built, so that a compiled loop takes other values: plain CasADi symbols.
 
-    gain = open_number("deformation.gain", -0.5)  # the symbol 'setting.deformation.gain', remembered with its number
+    opened = Opened({"deformation.gain": -0.5})  # symbols with the numbers of the build
+    opened.symbols["deformation.gain"], opened.signal
 
 The closed values are checked first; then a symbol is planted in place of each number, without another check
-(`fpirhc.controllers.live_settings`). A block whose step meets one reads it as a signal (`fpirhc.symbolic.block`). Python cannot
-compute with a symbol: where a build does, it is refused by its path and the place. Beside it stand functions of numbers that may be
-open; a power is a product, because the pow of Python and that of CasADi differ in the last digit.
+(`fpirhc.controllers.live_settings`). A block whose step meets one reads the vector `settings` of its loop. Python cannot compute
+with a symbol: where a build does, it is refused by its path and the place.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from functools import cache
 from types import FunctionType
 from typing import TypeVar, cast
 from weakref import WeakValueDictionary
@@ -21,23 +19,51 @@ from weakref import WeakValueDictionary
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
-from fpirhc.symbolic.layout import Expression
+from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.symbolic.layout import Expression, Signal
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
-PREFIX = "setting."  # of the names of the symbols, and of the signals that are settings
+SETTINGS = "settings"  # the signal of all open numbers of a loop
 T = TypeVar("T")
 Value = TypeVar("Value", ca.SX, ca.MX)
 _LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
 _PLAIN: WeakValueDictionary[int, object] = WeakValueDictionary()  # frozen values without open numbers, by address
-_BUILT: dict[int, tuple[ca.SX, float]] = {}  # every symbol with the number of its build
+_OPEN: dict[int, Opened] = {}  # of every symbol of both kinds
 
 
-def open_number(path: str, value: float) -> ca.SX:
-    """Return the symbol of a number."""
-    symbol = ca.SX.sym(PREFIX + path)
-    _BUILT[symbol.element_hash()] = symbol, float(value)
-    return symbol
+class Opened:
+    """The open numbers of one loop, by path: one vector."""
+
+    def __init__(self, numbers: Mapping[str, float]) -> None:
+        """Make their symbols; `numbers` are those of the build."""
+        self.numbers = dict(numbers)
+        self.symbols = {path: ca.SX.sym(path) for path in numbers}
+        self.graph = {path: ca.MX.sym(path) for path in numbers}  # the same in graphs of calls
+        self.read: set[str] = set()  # paths of those that some block needs
+        self.signal = Signal(SETTINGS, tuple(numbers), start=tuple(self.numbers.values()))
+        _OPEN.update({_key(one): self for kind in (self.symbols, self.graph) for one in kind.values()})
+
+
+def _key(symbol: ca.SX | ca.MX) -> int:
+    return symbol.element_hash() if isinstance(symbol, ca.SX) else hash(symbol)
+
+
+def open_in(*expressions: Expression) -> list[ca.SX]:
+    """Return the open symbols in some expressions, in the order in which they appear."""
+    return [s for s in ca.symvar(ca.veccat(*expressions)) if _key(s) in _OPEN]
+
+
+def with_settings(block: str, results: Sequence[Expression]) -> tuple[list[Expression], Expression, Signal]:
+    """Return results of a block with open symbols as functions of one column, that column, and its signal."""
+    found = open_in(*results)
+    if not found:
+        raise InvalidName(f"block '{block}' uses symbols that it does not read")
+    opened = _OPEN[_key(found[0])]
+    opened.read |= {s.name() for s in found}
+    if isinstance(found[0], ca.SX):
+        return list(results), ca.vertcat(*opened.symbols.values()), opened.signal
+    column = ca.MX.sym(SETTINGS, len(opened.numbers))
+    return ca.graph_substitute(list(results), list(opened.graph.values()), ca.vertsplit(column)), column, opened.signal
 
 
 def is_open(value: object) -> bool:
@@ -45,7 +71,7 @@ def is_open(value: object) -> bool:
     if not isinstance(value, ca.SX) or not value.is_scalar():
         return False
     symbols = ca.symvar(value)
-    return bool(symbols) and all(s.element_hash() in _BUILT for s in symbols)
+    return bool(symbols) and len(open_in(value)) == len(symbols)
 
 
 def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
@@ -66,7 +92,7 @@ def open_numbers(*values: object) -> dict[str, ca.SX]:
     found: dict[str, ca.SX] = {}
 
     def note(number: ca.SX) -> ca.SX:
-        found.update({s.name().removeprefix(PREFIX): s for s in ca.symvar(number)})
+        found.update({s.name(): s for s in ca.symvar(number)})
         return number
 
     for value in values:
@@ -77,7 +103,8 @@ def open_numbers(*values: object) -> dict[str, ca.SX]:
 def number_of(value: ca.SX) -> float:
     """Return the number of the build of an open number."""
     symbols = ca.symvar(value)
-    return float(ca.Function("fpirhc_number", symbols, [value])(*(_BUILT[s.element_hash()][1] for s in symbols)))
+    numbers = [_OPEN[_key(s)].numbers[s.name()] for s in symbols]
+    return float(ca.Function("fpirhc_number", symbols, [value])(*numbers))
 
 
 def nominal(value: T) -> T:
@@ -90,13 +117,8 @@ def expressed(value: float | ca.SX, beside: Value) -> Value:
     if not isinstance(value, ca.SX) or not isinstance(beside, ca.MX):
         return cast(Value, value)
     symbols = ca.symvar(value)
-    graph = [_in_graph(s.name()) for s in symbols]
+    graph = [_OPEN[_key(s)].graph[s.name()] for s in symbols]
     return graph[0] if value.is_symbolic() else ca.Function("fpirhc_open", symbols, [value])(*graph)
-
-
-@cache
-def _in_graph(name: str) -> ca.MX:
-    return ca.MX.sym(name)
 
 
 def copied(value: T, changes: Mapping[str, object]) -> T:
@@ -142,94 +164,11 @@ def _has_open(value: object) -> bool:
     return False
 
 
-# Functions of numbers that may be open
-
-
-SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero
-
-
-def signed_power(d: Expression, exponent: Expression | float) -> Expression:
-    """Return sign(d) |d|^exponent, rounded off within 1e-6 of zero so that its derivatives stay finite.
-
-    Computed as d (d^2 + 1e-12)^((exponent - 1)/2).
-    """
-    return d * ca.exp((exponent - 1) / 2 * ca.log(d * d + SMOOTHING**2))
-
-
-def power(base: T, exponent: int) -> T | float:
-    """Return base^exponent as a product; 1.0 for the exponent 0."""
-    return math.prod([base] * (exponent - 1), start=base) if exponent else 1.0  # type: ignore[call-overload]
-
-
-def _nearest_even(x: Expression) -> Expression:
-    upper = ca.floor(x + 0.5)
-    return upper - ca.logic_and(upper - x == 0.5, ca.fmod(upper, 2) != 0)
-
-
-def _of_any(number: Callable[[float], float], expression: Callable[..., object]) -> Callable[[float], float]:
-    """A function of a number, open or not."""
-    return lambda x: cast(float, expression(x)) if isinstance(x, ca.SX) else number(x)
-
-
-tanh, atanh, asin = _of_any(math.tanh, ca.tanh), _of_any(math.atanh, ca.atanh), _of_any(math.asin, ca.asin)
-exp, cos, sqrt = _of_any(math.exp, ca.exp), _of_any(math.cos, ca.cos), _of_any(math.sqrt, ca.sqrt)
-rounded = _of_any(round, _nearest_even)
-
-
-def signed(size: float, sign: float) -> float:
-    """Return the size of a number with the sign of another one."""
-    return (ca.if_else(sign < 0, -1, 1) if isinstance(sign, ca.SX) else math.copysign(1.0, sign)) * ca.fabs(size)
-
-
-def numbers(values: Sequence[float | ca.SX], beside: Expression | None = None) -> Expression:
-    """Return a column of numbers: constants, or an expression where some are open, of the kind of another one where it is given."""
-    if not open_numbers(values):
-        return cast(Expression, ca.DM(cast(list[float], list(values))))
-    return cast(Expression, ca.vertcat(*(values if beside is None else (expressed(value, beside) for value in values))))
-
-
-def overlaid(column: Expression, values: Sequence[float | ca.SX]) -> list[Expression]:
-    """Return the entries of a column that holds some numbers, with the open ones themselves in their places."""
-    return [expressed(v, column) if isinstance(v, ca.SX) else column[k] for k, v in enumerate(values)]
-
-
-def quotient(over: Expression, number: float | ca.SX) -> Expression:
-    """Return an expression divided by a number; zero where the number is zero."""
-    if not isinstance(number, ca.SX):
-        return over / number if number else 0 * over
-    under = expressed(number, over)
-    return ca.if_else(under == 0, 0 * over, over / ca.if_else(under == 0, 1, under))
-
-
-def smaller(x: float, y: float) -> float:
-    """Return the smaller of two numbers."""
-    return ca.fmin(x, y) if isinstance(x, ca.SX) or isinstance(y, ca.SX) else min(x, y)
-
-
-def larger(x: float, y: float) -> float:
-    """Return the larger of two numbers."""
-    return ca.fmax(x, y) if isinstance(x, ca.SX) or isinstance(y, ca.SX) else max(x, y)
-
-
-def between(x: float, low: float, high: float) -> float:
-    """Return a number moved to the nearer end of an interval where it is outside."""
-    return smaller(larger(low, x), high)
+def numbers(values: Sequence[float | ca.SX], beside: Expression) -> Expression:
+    """Return a column of numbers, of the kind of another one where some are open."""
+    return ca.vertcat(*(expressed(value, beside) for value in values))
 
 
 def stays(x: float, value: float) -> bool:
     """Return whether a number is a certain one in every run of the loop; an open one may become another."""
     return not isinstance(x, ca.SX) and x == value
-
-
-def left_after(period: float, time: float) -> float:
-    """Return e^(-T / tau), the share of a distance that is left after a period; 0 for the time constant 0."""
-    if isinstance(time, ca.SX):
-        return ca.if_else(time == 0, 0, ca.exp(-period / ca.if_else(time == 0, 1, time)))
-    return math.exp(-period / time) if time else 0.0
-
-
-def left_in_mean(period: float, time: float) -> float:
-    """Return the mean of what is left over a period, (tau / T) (1 - e^(-T / tau)); 0 for tau = 0."""
-    if isinstance(time, ca.SX):
-        return ca.if_else(time == 0, 0, time / period * -ca.expm1(-period / ca.if_else(time == 0, 1, time)))
-    return time / period * -math.expm1(-period / time) if time else 0.0

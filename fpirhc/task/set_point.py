@@ -22,9 +22,8 @@ from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.expression import Signals, expression, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import exp, power
 from fpirhc.task.reference import Reference, Steps, pairs
 
 _GIVEN = "setpoints"  # signal from outside: the set-points in force, then those of the next nodes
@@ -212,7 +211,7 @@ def _product(left: list[list[_Entry]], right: list[list[_Entry]]) -> list[list[_
 
 
 def _exp(value: _Entry) -> _Entry:
-    return ca.exp(value) if isinstance(value, ca.SX | ca.MX) else exp(value)
+    return ca.exp(value) if isinstance(value, ca.SX | ca.MX) else math.exp(value)
 
 
 _ON_TIME = 1e-12  # share of a change's time by which a time may be rounded

@@ -18,9 +18,8 @@ from fpirhc.fields.kinds import Positive, Range
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import power, require_closed
 from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
@@ -54,8 +53,8 @@ class Fractional(IntegralLaw):
         InvalidValue: a rate, order or memory outside its range; when the loop is built, a memory of more than 20 000 cycles.
     """
 
-    rate: Positive
-    order: Annotated[float, _ORDERS]
+    rate: Positive = field(metadata={"structure": True})
+    order: Annotated[float, _ORDERS] = field(metadata={"structure": True})
     memory: float | None = field(default=None, metadata={"structure": True})
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
@@ -99,7 +98,6 @@ class Fractional(IntegralLaw):
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))
         reads, writes = law_signals(plant)
-        require_closed("the weight of its past", self)
         column = ca.DM(self._row(cycles, period))
 
         def step(s: Signals) -> dict[str, Expression]:

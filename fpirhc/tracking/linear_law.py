@@ -20,9 +20,8 @@ from fpirhc.fields.kinds import Duration, Positive
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, total
+from fpirhc.symbolic.expression import Signals, power, total
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.open import power
 from fpirhc.tracking.base import Feedback, IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 _REAL = 1e-9  # share of an imaginary part that is rounding

@@ -122,7 +122,7 @@ def stepped(
 def settings_of(device: Exported) -> dict[str, float]:
     """The settings of the build, by path."""
     start = zip(device.stepper.reads.columns, device.stepper.reads.start().tolist(), strict=True)
-    return {column.removeprefix("setting."): value for column, value in start if column.startswith("setting.")}
+    return {column.removeprefix("settings."): value for column, value in start if column.startswith("settings.")}
 
 
 def back(device: Exported) -> None:

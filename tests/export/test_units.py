@@ -123,7 +123,7 @@ def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_
 def test_what_a_master_may_not_do(tmp_path):
     """Wrong settings, other steps, steps that begin elsewhere, numbers that are computed: refused, and the unit stays as it was."""
     device, path = of_case("torque", tmp_path)
-    period, gain = device.problem.period, "setting.deformation.gain"
+    period, gain = device.problem.period, "settings.deformation.gain"
     with master(path) as unit:
         start = unit.get([gain])[0]
         assert (unit.variables[gain].min, unit.variables[gain].max) == tuple(

@@ -87,16 +87,15 @@ def test_code_generation_of_ones_own_gives_the_stepper_bit_by_bit(name, tmp_path
 
 
 def test_a_setting_written_as_an_argument_acts_as_a_change():
-    """'setting.PATH' is an argument of the Function, for every setting and for nothing else."""
+    """'settings' is one argument of the Function, with every setting and nothing else."""
     stepper, rows = case("RHC+FPI")
     numbers = {"deformation.gain": -0.7, "cost.states.q1": 900.0}
-    assert {f"setting.{path}" for path in numbers} <= set(stepper.settings.names)
+    assert stepper.settings["settings"].elements == tuple(stepper.numbers)
     other = fp.Stepper(*_of("RHC+FPI"), live=list(numbers), compiled=False)
     assert other.change(numbers)
     row = rows[3].copy()
-    row[stepper.reads.slice("setting.deformation.gain")] = -0.7
-    row[stepper.reads.slice("setting.cost.states.q1")] = 900.0
-    assert set(stepper.settings.names) == {f"setting.{path}" for path in stepper.numbers}
+    for path, value in numbers.items():
+        row[stepper.reads.columns.index(f"settings.{path}")] = value
     command = stepper.function(other.start(), *stepper.reads.unpack(row).values())[2]
     assert same(command.full().ravel(), stepped(other, row, other.start())[0])
 

@@ -131,7 +131,7 @@ def test_time_stamps_are_read_where_their_age_counts():
 def test_live_settings_are_named_with_the_interval_that_a_device_may_accept():
     """Gains from that at which 1 - a J = -1, with J = 1.2, up to none; an attribute that is not there is named."""
     one = small(live=["deformation.gain"])
-    assert one.settings.names == ("setting.deformation.gain",)
+    assert one.settings.columns == ("settings.deformation.gain",)
     assert (one.parameters.columns, one.parameters.start().tolist()) == (("parameters.m",), [1.2])
     assert one.bounds()["deformation.gain"] == pytest.approx((-2 * 2 / 1.2, 0.0), abs=1e-5)
     assert small().settings.names == ()

@@ -15,9 +15,8 @@ from fpirhc.controllers.contract import Undeformed
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.expression import Signals, is_finite, left_after
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.open import left_after
 from fpirhc.tracking.base import Tracking
 
 

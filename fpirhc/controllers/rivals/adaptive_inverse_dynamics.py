@@ -22,7 +22,6 @@ from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import require_closed
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
@@ -90,7 +89,6 @@ class AdaptiveInverseDynamics(Controller):
     def _learn_block(self, built: Built) -> Block:
         plant, learning = built.plant, self._learning
         equation = equation_function(learning.regressor(built.problem))
-        require_closed("the row of the Lyapunov equation", self.tracking)
         weights = self.lyapunov_row()
 
         target, reads = self._target(built)

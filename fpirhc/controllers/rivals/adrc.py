@@ -21,9 +21,8 @@ from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes, step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, is_finite, total
+from fpirhc.symbolic.expression import Signals, is_finite, power, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.open import exp, power
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, own_errors
 
@@ -65,8 +64,8 @@ class ADRC(Undeformed):
         return blocks, [*delays, Delay(_states(plant, "_predicted"), "_predicted_later")]
 
     def corrections(self, plant: Plant, order: int, period: float) -> list[float]:
-        """Return l_1 ... l_{n+1} of z += l (y - z_1), for a coordinate of that relative order; all poles at exp(-w_o T)."""
-        return list(_corrections(plant, order, period, exp(-self.observer * period)))
+        """Return l_1 ... l_{n+1} of z += l (y - z_1), for a coordinate of that relative order; all poles at ca.exp(-w_o T)."""
+        return list(_corrections(plant, order, period, ca.exp(-self.observer * period)))
 
     def _observer_block(self, built: Built) -> Block:
         """Block (outputs, prediction, reference) -> (command, extended state)."""

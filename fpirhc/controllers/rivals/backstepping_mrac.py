@@ -22,7 +22,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, vector
-from fpirhc.symbolic.open import numbers
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 
@@ -86,8 +85,8 @@ class BacksteppingMRAC(Controller):
 
         def step(s: Signals) -> dict[str, Expression]:
             chains = [ca.vertcat(*chain) for chain in error_chains(plant, s.model - getattr(s, plant.output.name))]
-            nested = [ca.vertcat(*(ca.dot(numbers(row[:-1]), chain) for row in rows[:-1])) for chain in chains]
-            feedback = [ca.dot(numbers(rows[-1][:-1]), chain) for chain in chains]
+            nested = [ca.vertcat(*(ca.dot(ca.vertcat(*row[:-1]), chain) for row in rows[:-1])) for chain in chains]
+            feedback = [ca.dot(ca.vertcat(*rows[-1][:-1]), chain) for chain in chains]
             return {"nested": ca.vertcat(*nested), "desired": s.nominal + ca.vertcat(*feedback)}
 
         reads = Layout((plant.output, like(plant.output, "model"), plant.response_signal("nominal")))

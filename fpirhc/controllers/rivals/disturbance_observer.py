@@ -17,7 +17,6 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.open import exp
 from fpirhc.tracking.base import Tracking
 
 
@@ -38,7 +37,7 @@ class DisturbanceObserver(PairedAtOnce):
 
     def _observer_block(self, built: Built) -> Block:
         """Block (state, last command, realised, desired) -> (command, disturbance at the input)."""
-        plant, warm_up_cycles, pole = built.plant, built.warm_up, exp(-self.bandwidth * built.period)
+        plant, warm_up_cycles, pole = built.plant, built.warm_up, ca.exp(-self.bandwidth * built.period)
         response, inverse = plant.equations.controlled_response, plant.equations.inverse
         disturbance = like(plant.input, "input_disturbance")
 

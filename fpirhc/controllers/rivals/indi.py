@@ -17,7 +17,6 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, discrete, scalar
-from fpirhc.symbolic.open import cos, exp, sqrt
 from fpirhc.tracking.base import Tracking
 
 
@@ -39,8 +38,8 @@ class INDI(PairedAtOnce):
         """Return (c_1, c_2) of H for cycles of that period: y_k = (1 - c_1 - c_2) x_k + c_1 y_{k-1} + c_2 y_{k-2}."""
         if self.frequency is None:
             return 0.0, 0.0
-        decay = exp(-self.damping * self.frequency * period)
-        return 2 * decay * cos(self.frequency * period * sqrt(1 - self.damping * self.damping)), -decay * decay
+        decay = ca.exp(-self.damping * self.frequency * period)
+        return 2 * decay * ca.cos(self.frequency * period * ca.sqrt(1 - self.damping * self.damping)), -decay * decay
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         return law_blocks(built, self.tracking, self._increment_block(built))

@@ -25,7 +25,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.open import numbers
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, own_errors
 
@@ -71,7 +70,7 @@ class IntelligentPID(Undeformed):
         plant, length = built.plant, self.window
         names, size = plant.controlled_names, len(plant.controlled_names)
         weights = [window_weights(plant, order, length, built.period) for order in plant.response_orders.values()]
-        alpha, response = numbers([self.alpha[n] for n in names]), plant.equations.controlled_response
+        alpha, response = ca.vertcat(*(self.alpha[n] for n in names)), plant.equations.controlled_response
         places = tuple(f"{name}@{k}" for k in range(length) for name in names)
         memory = Layout((Signal("window_outputs", places), Signal("window_commands", places)))
         memory = memory + Layout((plant.response_signal("ultra_local_before"), discrete("window_filled")))

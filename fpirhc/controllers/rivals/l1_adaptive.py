@@ -16,9 +16,8 @@ from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.expression import Signals, is_finite, left_in_mean
 from fpirhc.symbolic.layout import Expression, Layout, discrete
-from fpirhc.symbolic.open import exp, left_in_mean
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, error_chains
 
@@ -54,7 +53,7 @@ class L1Adaptive(Undeformed):
     def _predictor_block(self, built: Built) -> Block:
         """Block (state or outputs, desired, response that the model expected of the last command) -> request."""
         plant, period = built.plant, built.period
-        left, pole = exp(-self.predictor * period), exp(-self.bandwidth * period)
+        left, pole = ca.exp(-self.predictor * period), ca.exp(-self.bandwidth * period)
         moves = period * left_in_mean(period, 1 / self.predictor)  # (1 - left) / a_s
         gain = left / moves
         names = ("predictor_error", "predictor_input", "measured_before", "disturbance_before")

@@ -21,9 +21,8 @@ from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, power
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
-from fpirhc.symbolic.open import numbers, power
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 
@@ -93,7 +92,7 @@ class LyapunovMRAC(Undeformed):
         def step(s: Signals) -> dict[str, Expression]:
             motion = getattr(s, seen.name)
             errors = error_chains(plant, s.reference - motion)
-            feedback = [ca.dot(numbers(decay_gains(rate, len(c))), ca.vertcat(*c)) for c in errors]
+            feedback = [ca.dot(ca.vertcat(*decay_gains(rate, len(c))), ca.vertcat(*c)) for c in errors]
             desired = s._reference_response + ca.vertcat(*feedback)
             begun = start(s.state, desired, s.parameters)
             first = ca.if_else(s.warm_up > 0.5, s._gains_first_before, begun)

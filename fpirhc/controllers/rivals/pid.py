@@ -20,7 +20,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
-from fpirhc.symbolic.open import numbers, quotient
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import (
     Useful,
@@ -115,7 +114,7 @@ class PID(Undeformed):
 
         Without a model the response that is cut off is not known, but every loop has its own input.
         """
-        gains = numbers([self.integral.get(name, 0.0) for name in plant.controlled_names])
+        gains = ca.vertcat(*(self.integral.get(name, 0.0) for name in plant.controlled_names))
 
         def step(s: Signals) -> dict[str, Expression]:
             return {_CUT_OFF: gains * (s.command_unclipped - s.command)}
@@ -138,7 +137,7 @@ class PID(Undeformed):
                 total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
             # The integral with which the first command is zero.
-            starts = [quotient(-d, k[0]) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
+            starts = [_quotient(-d, k[0]) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
             integral = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
             command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
             return {
@@ -164,6 +163,13 @@ _CUT_OFF = "_command_cut_off"
 
 def _cut_off(plant: Plant) -> Signal:
     return vector(_CUT_OFF, plant.controlled_names)
+
+
+def _quotient(over: Expression, number: float) -> Expression:
+    """A quotient; zero where the number, which may be open, is zero."""
+    if isinstance(number, ca.SX):
+        return ca.if_else(number == 0, 0 * over, over / number)
+    return over / number if number else 0 * over
 
 
 EXAMPLES = (

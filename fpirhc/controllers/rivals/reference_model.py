@@ -14,9 +14,8 @@ from fpirhc.controllers.base import like
 from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.expression import Signals, expression, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.open import numbers, power, require_closed
 from fpirhc.tracking.base import error_chains
 
 
@@ -41,7 +40,6 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     gains = [decay_gains(rate, len(chain)) for chain in chains]
     ends_of_steps = np.cumsum([0, *(len(g) ** 2 for g in gains)]).tolist()
 
-    require_closed("the step of the reference model", rate)
     fixed = np.concatenate([step_of(plant, companion(g), period).ravel(order="F") for g in gains])
     memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
     ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
@@ -53,7 +51,7 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
         deviation = ca.vertsplit(ca.if_else(s.warm_up > 0.5, s.model_deviation, first), ends)
         spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
         lag = ca.vertcat(*(spread.get(e, 0) for e in plant.output.elements))
-        pull = [ca.dot(numbers(g), d) for g, d in zip(gains, deviation, strict=True)]
+        pull = [ca.dot(ca.vertcat(*g), d) for g, d in zip(gains, deviation, strict=True)]
         entries = ca.vertsplit(expression(ca.DM(fixed)), ends_of_steps)
         steps = [ca.reshape(m, len(g), len(g)) for m, g in zip(entries, gains, strict=True)]
         deviation_next = [ca.mtimes(m, d) for m, d in zip(steps, deviation, strict=True)]

@@ -20,9 +20,8 @@ from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, power
 from fpirhc.symbolic.layout import Expression, Layout, vector
-from fpirhc.symbolic.open import power
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

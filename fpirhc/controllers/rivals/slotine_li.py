@@ -18,9 +18,8 @@ from fpirhc.members import Example
 from fpirhc.plant.motion import derivative_unit, places
 from fpirhc.plant.regressor import Combination, Regressor
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
-from fpirhc.symbolic.open import numbers
 from fpirhc.task.problem import Problem
 
 
@@ -156,7 +155,7 @@ class SlotineLi(Controller):
         return Block("force", Layout(reads), Layout((like(plant.input, "command_unclipped"),)), step)
 
     def _damping(self, built: Built) -> Expression:
-        return numbers([self.damping[name] for name in built.plant.names])
+        return expression(ca.vertcat(*(self.damping[name] for name in built.plant.names)))
 
 
 def _rates(built: Built, name: str) -> Signal:

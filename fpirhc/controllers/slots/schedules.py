@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import casadi as ca
 
@@ -16,7 +16,6 @@ from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.symbolic.open import expressed, rounded
 from fpirhc.task.problem import Problem
 
 
@@ -48,7 +47,7 @@ class Periodic(Schedule):
         durations: coordinate -> s, in the order of the slots.
     """
 
-    durations: Mapping[str, float]
+    durations: Mapping[str, float] = field(metadata={"structure": True})
 
     def check(self, names: Sequence[str], problem: Problem, mistakes: Mistakes) -> None:
         mistakes.unknown("Periodic: coordinate", self.durations, names)
@@ -76,13 +75,13 @@ class Periodic(Schedule):
         starts, at = [], 0.0
         for name, duration in self.durations.items():
             starts.append((name, at))
-            at += rounded(duration / problem.period)
+            at += round(duration / problem.period)
         numbers = {c.slot.coordinate: c.number for c in channels}
         order = [numbers[name] for name, _ in starts]
 
         def step(s: Signals) -> dict[str, Expression]:
             cycle = ca.floor(s.time / problem.period + 0.5)
-            phase, slot = ca.fmod(cycle, expressed(at, cycle)), ca.SX(order[0])
+            phase, slot = ca.fmod(cycle, at), ca.SX(order[0])
             for before, number, (_, start) in zip(order, order[1:], starts[1:], strict=False):
                 slot += (number - before) * (phase > start - 0.5)
             return {"slot": slot}

@@ -26,7 +26,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Named, Signal
-from fpirhc.symbolic.open import PREFIX
+from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -156,7 +156,7 @@ def for_channel(
         return replace(signal, name=name)
 
     begun = one.signal("warm_up")
-    reads = [s if s.name.startswith(PREFIX) else renamed(s) for s in block.inputs.signals]
+    reads = [s if s.name == SETTINGS else renamed(s) for s in block.inputs.signals]
     own = [renamed(s) for s in block.memory.signals]
     reads_begun = [] if not own or begun.name in [s.name for s in reads] else [begun]
 

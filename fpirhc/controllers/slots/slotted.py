@@ -49,9 +49,9 @@ from fpirhc.sensing.base import spline_weights
 from fpirhc.sensing.positions import PositionDifference
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, Value, expression, is_finite
+from fpirhc.symbolic.expression import Signals, Value, expression, is_finite, left_after
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.open import expressed, left_after, signed, stays
+from fpirhc.symbolic.open import expressed
 from fpirhc.task.problem import Problem
 
 
@@ -359,7 +359,7 @@ def state_block(built: Built, one: Channel, smallest_gain: float) -> Block:
             "gain": gain,
             "good": good,
             # Not zero, so that no slot that is not chosen divides by it.
-            "divisor": ca.if_else(good, gain, signed(smallest, one.start_gain)),
+            "divisor": ca.if_else(good, gain, ca.copysign(smallest, one.start_gain)),
         }
         return {one.wire(name): value for name, value in values.items()}
 
@@ -403,7 +403,7 @@ def join_block(built: Built, measured: Signal, one: Channel, blend: float, blank
     request_before, models = _request_before(one), [n.removeprefix("_") for n in one.slot.deformation.mirror.models]
     names = ("law", "free", "gain", "active", "warm_up", *models)
     first = _usable_from(built.problem, one, built.problem.dead_time.measurement)
-    at_once = stays(first, 1)
+    at_once = first == 1
 
     def step(s: Signals) -> dict[str, Expression]:
         law, free, gain, active, goes_on, *modelled = (getattr(s, one.wire(name)) for name in names)

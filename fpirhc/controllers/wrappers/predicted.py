@@ -29,7 +29,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import expressed
 from fpirhc.task.dead_time import MOST, DeadTime, Queue
 from fpirhc.task.problem import Problem
 
@@ -248,7 +247,7 @@ def _predict_block(
             memory_next |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
         state = queue.driven(advance, s.state, queued, size, [s.parameters, error])
         for name, function in outputs_ahead.items():
-            time = expressed(cycles, s.state) * problem.period
+            time = cycles * problem.period
             memory_next[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
         return {"time_ahead": s.time + ahead.inputs, "state_ahead": state, **memory_next}
 

@@ -15,8 +15,8 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Range
+from fpirhc.symbolic.expression import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.open import asin, larger, power, sqrt
 
 _RATE = 0.02  # gamma
 _GROWING, _RETURNING = 5, 8  # in a row
@@ -86,7 +86,7 @@ class Tuned(Wrapper):
 
     def _tuned(self, factor: Expression, error: Expression, before: Expression) -> Expression:
         """The factor after one step towards the target."""
-        signs = [_mean_sign(target, error.numel()) for target in (self.target, larger(self.target, _RECOVERY))]
+        signs = [_mean_sign(target, error.numel()) for target in (self.target, ca.fmax(self.target, _RECOVERY))]
         product, target_sign = ca.dot(error, before), ca.if_else(factor < 1, signs[1], signs[0])
         # Without a sign (a zero error, or one that is not a number) the factor stays.
         rise = ca.if_else(product > 0, 1 - target_sign, ca.if_else(product < 0, -1 - target_sign, 0))
@@ -118,11 +118,11 @@ def _mean_sign(product: float, components: int) -> float:
     correlation = -0.5 * product
     # Integration by parts: the mean for m + 2 components is the mean for m plus one term.
     size = 1 if components % 2 else 2
-    mean = 2 / math.pi * asin(correlation) if size == 1 else correlation
+    mean = 2 / math.pi * ca.asin(correlation) if size == 1 else correlation
     whole = math.pi / 2 if size == 1 else 1.0  # int_0^1 (1 - x^2)^(m/2-1) dx
     while size < components:
         spread = power(1 - correlation * correlation, size // 2)
-        mean += correlation * (spread * sqrt(1 - correlation * correlation) if size % 2 else spread) / (size * whole)
+        mean += correlation * (spread * ca.sqrt(1 - correlation * correlation) if size % 2 else spread) / (size * whole)
         whole *= size / (size + 1)
         size += 2
     return mean

@@ -34,7 +34,6 @@ from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables
 from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.symbolic.driver import SIGNATURE
-from fpirhc.symbolic.open import PREFIX
 from fpirhc.symbolic.paths import changed_at, paths_to
 from fpirhc.task.problem import Problem
 from fpirhc.whole_file import write_whole
@@ -162,7 +161,7 @@ def _sliders(problem: Problem, loops: list[LabLoop]) -> list[dict[str, Any]]:
     found = []
     for path in dict.fromkeys(path for loop in loops for path in loop.ready.live.paths):
         columns = [loop.ready.loop.memory.columns for loop in loops]
-        places = [[own.index(PREFIX + path)] if PREFIX + path in own else [] for own in columns]
+        places = [[own.index(f"settings.{path}")] if f"settings.{path}" in own else [] for own in columns]
         live = next(loop.ready.live for loop in loops if path in loop.ready.live.paths)
         value = live.start[path]
         ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *live.bounds(path, 2 * _SPAN)).tolist()

@@ -21,7 +21,6 @@ from fpirhc.simulation.machine import SKIPPED
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.open import PREFIX
 
 _FEW = 12  # entries of a signal that are named in C; longer ones are arrays
 _WIDTH = 120
@@ -150,7 +149,7 @@ def data_of(device: Device) -> dict[str, Layout]:
 def _struct(name: str, layout: Layout) -> str:
     """A struct of numbers without gaps, in the order of the layout."""
     signals, lines = layout.signals, []
-    names = identifiers([s.name.removeprefix(PREFIX) for s in signals])
+    names = identifiers([s.name for s in signals])
     alone = len(signals) == 1 and bool(signals[0].elements)
     for own, signal in zip(names, signals, strict=True):
         each = [in_comment(unit) or "as in the problem file" for unit in signal.entry_units]
@@ -240,8 +239,6 @@ def _bound(device: Device) -> list[str]:
     for k, signal in enumerate(device.stepper.reads.signals, start=1):
         if signal.name in device.inputs:
             place = f"(const casadi_real*)in + {device.inputs.slice(signal.name).start}"
-        elif signal.name in device.settings:
-            place = f"(const casadi_real*)&c->settings + {device.settings.slice(signal.name).start}"
         else:
             place = f"(const casadi_real*)&c->{signal.name}" if signal.name in data else "0"
         lines.append(f"  c->arg[{k}] = {place};")
@@ -254,13 +251,11 @@ def _setter(device: Device) -> str:
         return ""
     paths = list(device.bounds)
     other = [_other_end(path, paths) for path in paths]
-    places = [device.settings.slice(PREFIX + path).start for path in paths]
     low, high = (np.array([ends[k] for ends in device.bounds.values()]) for k in (0, 1))
     tables = of_type("\n".join([_table("LOWEST", low), _table("HIGHEST", high)])).replace(OF_TYPE, "")
     # Of an interval the sign of the other end's number + 1 says on which side it stands.
     return f"""
 {tables}
-static const int PLACES[] = {{{", ".join(map(str, places))}}}; /* among the settings */
 static const int OTHERS[] = {{{", ".join(map(str, other))}}};  /* k + 1: setting k must be above; -k - 1: below; 0: no interval */
 
 int {device.name}_set({device.name}_controller* c, {device.name}_setting setting, casadi_real value) {{
@@ -269,9 +264,9 @@ int {device.name}_set({device.name}_controller* c, {device.name}_setting setting
   if (which < 0 || which >= {len(paths)} || !(fabs(value) <= FINITE)) return 0;
   if (!(value >= LOWEST[which] && value <= HIGHEST[which])) return 0;
   other = OTHERS[which];
-  if (other > 0 && !(value < settings[PLACES[other - 1]])) return 0;
-  if (other < 0 && !(value > settings[PLACES[-other - 1]])) return 0;
-  settings[PLACES[which]] = value;
+  if (other > 0 && !(value < settings[other - 1])) return 0;
+  if (other < 0 && !(value > settings[-other - 1])) return 0;
+  settings[which] = value;
   return 1;
 }}
 """

@@ -23,7 +23,6 @@ from fpirhc.export.device import Device
 from fpirhc.export.target import Target
 from fpirhc.export.targets.c import data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.open import PREFIX
 
 
 @dataclass(frozen=True)
@@ -85,9 +84,10 @@ def _variables(device: Device) -> list[Variable]:
             listed += _numbers(layout, "input")
     listed += [replace(one, start=None) for one in _numbers(Layout((stepper.signals["command"],)), "output")]
     listed.append(STATUS)
-    for path, ends in device.bounds.items():
-        unit = device.settings[PREFIX + path].entry_units[0]
-        listed.append(Variable(_structured(PREFIX + path), unit, "parameter", "tunable", stepper.numbers[path], ends))
+    for (path, ends), unit in zip(device.bounds.items(), device.settings.units, strict=True):
+        listed.append(
+            Variable(_structured(f"settings.{path}"), unit, "parameter", "tunable", stepper.numbers[path], ends)
+        )
     trace = zip(stepper.signals.columns, stepper.signals.units, strict=True)
     return listed + [Variable(_structured(f"trace.{name}"), unit, "local") for name, unit in trace]
 
@@ -129,12 +129,10 @@ def _settings(device: Device) -> dict[str, str]:
     """How a setting is read, and written through its check."""
     if not device.bounds:
         return {"settings_read": "", "settings_written": ""}
-    places = [device.settings.slice(PREFIX + path).start for path in device.bounds]
-    inside = f"  if (r >= SETTINGS && r < SETTINGS + {len(places)})"
-    read = f"  static const int PLACES[] = {{{', '.join(map(str, places))}}};\n"
+    inside = f"  if (r >= SETTINGS && r < SETTINGS + {len(device.bounds)})"
     setting = f"({device.name}_setting)(r - SETTINGS)"
     return {
-        "settings_read": f"{read}{inside} return (casadi_real*)&s->c.settings + PLACES[r - SETTINGS];",
+        "settings_read": f"{inside} return (casadi_real*)&s->c.settings + (r - SETTINGS);",
         "settings_written": f"{inside} {{\n    s->fresh = 0;\n"
         f"    return {device.name}_set(&s->c, {setting}, (casadi_real)value) ? DONE : REFUSED;\n  }}",
     }

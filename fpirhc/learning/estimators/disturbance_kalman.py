@@ -23,7 +23,6 @@ from fpirhc.sensing.base import quantities, require_named, response_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import require_closed
 from fpirhc.task.problem import Problem
 
 _GAINS: Latest[np.ndarray] = Latest(8)
@@ -183,7 +182,6 @@ class DisturbanceKalman(ParameterEstimator):
     def step(self, problem: Problem) -> Correct:
         model = problem.plant
         advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
-        require_closed("the gain of the filter", self)
         gain = expression(ca.DM(self.gain(problem)))
         shown, follows = self._shown_function(model), self._has_state(model)
         foresees = self._foresees(model)

@@ -11,7 +11,6 @@ from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Positive
 from fpirhc.learning.rules.base import Bounds, Evidence, Rule
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.open import numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class LyapunovRule(Rule):
     def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
         """Return period Gamma G^T w."""
         matrix, along = evidence.gradient()
-        gains = numbers([self.gains[name] for name in bounds])
+        gains = ca.vertcat(*(self.gains[name] for name in bounds))
         return (1 - evidence.clipped) * period * gains * ca.mtimes(matrix.T, along)
 
 

@@ -26,9 +26,8 @@ from fpirhc.sensing.base import (
     values_of,
 )
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import nominal, overlaid
 
-_STATE, _COVARIANCE, _VARIANCES = "observer_state", "observer_covariance", "observer_variances"
+_STATE, _COVARIANCE = "observer_state", "observer_covariance"
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +69,7 @@ class KalmanFilter(StateObserver):
         return tuple(self.measured)
 
     def memory(self, model: Model) -> Layout:
-        """The believed state, its covariance column by column, and the variances of the noises.
-
-        The variances are constants of a run. As data they enter the same operations whether they are open or not.
-        """
+        """The believed state, and its covariance column by column."""
         state = model.plant.state
         first = np.diag([self.start.get(e, 0.0) ** 2 for e in state.elements])
         entries = tuple(f"{i},{j}" for j in state.elements for i in state.elements)
@@ -81,9 +77,6 @@ class KalmanFilter(StateObserver):
             (
                 Signal(_STATE, state.elements, state.units, tuple(map(float, model.start))),
                 Signal(_COVARIANCE, entries, start=tuple(map(float, first.ravel()))),
-                Signal(
-                    _VARIANCES, (*self.noise, *self.measured), start=tuple(nominal(d) ** 2 for d in self._deviations)
-                ),
             )
         )
 
@@ -97,29 +90,20 @@ class KalmanFilter(StateObserver):
 
     def correct(self, model: Model) -> Correct:
         spread, gain = self._spread_function(model), self._gain_function(model)
+        white, noise = (np.square(list(one.values())) for one in (self.noise, self.measured))
 
         def corrected(
             evidence: Evidence, memory: Remembered, predicted: Expression
         ) -> tuple[Expression, dict[str, Expression]]:
             u, p, before = evidence.command, evidence.parameters, memory[_COVARIANCE]
-            white, noise = self._variances(memory[_VARIANCES])
             covariance_predicted = spread(memory[_STATE], before, u, p, evidence.moves, white)
             shown = ca.vertcat(*(evidence.measured[n] for n in self.measured))
             state, covariance = gain(predicted, covariance_predicted, u, p, shown, noise)
             state = ca.if_else(evidence.counts, state, predicted)
             covariance = ca.if_else(evidence.counts, covariance, covariance_predicted)
-            return state, {_STATE: state, _COVARIANCE: covariance, _VARIANCES: memory[_VARIANCES]}
+            return state, {_STATE: state, _COVARIANCE: covariance}
 
         return corrected
-
-    @property
-    def _deviations(self) -> list[float]:
-        return [*self.noise.values(), *self.measured.values()]
-
-    def _variances(self, remembered: Expression) -> tuple[Expression, Expression]:
-        """Variances of the noises and of the sensors; those that are open, else the remembered ones."""
-        every = overlaid(remembered, [d * d for d in self._deviations])
-        return ca.vertcat(*every[: len(self.noise)]), ca.vertcat(*every[len(self.noise) :])
 
     def _spread_function(self, model: Model) -> ca.Function:
         """Function (state, covariance, input, parameters, share, variances of w) -> covariance of the prediction."""
