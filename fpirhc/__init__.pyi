@@ -56,11 +56,11 @@ from .plant.integrators import Collocation as Collocation
 from .plant.integrators import Cvodes as Cvodes
 from .plant.integrators import Euler as Euler
 from .plant.integrators import RungeKutta4 as RungeKutta4
-from .plant.motion import Output as Output
 from .plant.parameter import LogNormal as LogNormal
 from .plant.parameter import Normal as Normal
 from .plant.parameter import Uniform as Uniform
 from .plant.parameter import outside as outside
+from .plant.plant import Output as Output
 from .plant.plant import Parameter as Parameter
 from .plant.plant import Plant as Plant
 from .probing.probe import probe as probe

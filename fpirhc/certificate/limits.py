@@ -20,7 +20,7 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count
-from fpirhc.plant.plant import exact_ranges
+from fpirhc.plant.parameter import exact_ranges
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.summary import line
 from fpirhc.task.problem import Problem

@@ -17,8 +17,7 @@ from fpirhc.controllers.check import checked
 from fpirhc.controllers.composed import compose_controller
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.plant.motion import Output
-from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.plant.plant import Output, Parameter, Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate

@@ -22,8 +22,7 @@ from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
-from fpirhc.plant.chain import measured_signals, rateless
-from fpirhc.plant.lie_derivatives import without_disturbances
+from fpirhc.plant.chain import measured_signals, rateless, without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal

@@ -16,8 +16,8 @@ from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.nominal import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser
+from fpirhc.plant.chain import without_disturbances
 from fpirhc.plant.integrators import USUAL, motion_of
-from fpirhc.plant.lie_derivatives import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.driver import plans_are_compiled

@@ -1,28 +1,118 @@
-"""Derivatives of a plant's coordinates and outputs as functions of its state: the Lie derivatives y, y', y'', ... along its motion.
+"""The operator D of a plant, the next derivative of a quantity, and what follows from it: chains y, y', y'', ..., orders, slopes.
 
-With u and the forcing w held over a cycle, y_0 = the quantity and y_{k+1} = dy_k/dx x'(x, u, p, w); one that is a state or a
-response is that entry itself. The response of an output of order 0 is the output, and its nominal response the reference at the end
-of the cycle: there it is measured.
+    D y = dy/dx f(x, u, p, w),        of a map  D y = (y(f(x, u, p, w)) - y(x)) / T
+
+with u and the forcing w held over a cycle. Quantities are coordinates, each of which is a state, and outputs y = h(x, u, p).
+The response of an output of order 0 is the output, and its nominal response the reference at the end of the cycle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import NotSupported
-from fpirhc.plant.lie_derivatives import Symbols, lie_derivatives, output_expression, output_order, structural_order
-from fpirhc.plant.motion import controlled_places, derivative_unit, followed_units, outside_names
-from fpirhc.plant.plant import Plant
+from fpirhc.fields.kinds import takes
+from fpirhc.fields.user_code import called, scalar_expression
+from fpirhc.plant.motion import (
+    arguments_of,
+    by_name,
+    controlled_places,
+    derivative_unit,
+    followed_units,
+    outside_names,
+    sampling,
+)
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression, Signal
 
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
 _FUNCTIONS: Latest[ca.Function] = Latest(8)  # the parts of a loop that is composed ask for the same few
+Symbols = tuple[ca.SX, ca.SX, ca.SX, ca.SX]  # x, u, p, and the forcing w
+
+
+def output_expression(plant: Plant, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
+    """Return a coordinate, or h(x, u, p) of an output."""
+    if name in plant.coordinates:
+        return x[plant.state.elements.index(name)]
+    return stated_expression(plant, name, x, u, p)
+
+
+def stated_expression(plant: Plant, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
+    """Return what the user's function of an output gives."""
+    what, expression = f"outputs: '{name}'", plant.outputs[name].expression
+    arguments = by_name(plant, x, p)
+    arguments = arguments if takes(expression, len(arguments)) else arguments_of(plant, x, u, p)
+    return scalar_expression(what, called(what, expression, *arguments), of=expression, symbols=(x, u, p))
+
+
+def operator(plant: Plant, symbols: Symbols) -> Callable[[Expression], Expression]:
+    """Return D of expressions of these symbols."""
+    x, u, p, w = symbols
+    if plant.step is None:
+        rate = plant.equations.forced_rate(x, u, p, w)
+        return lambda y: ca.jtimes(y, x, rate)
+    after, cycle = plant.equations.next(x, u, p, w), sampling(plant)
+    return lambda y: (ca.substitute(ca.SX(y), x, after) - y) / cycle
+
+
+def derivatives(plant: Plant, counts: Mapping[str, int], symbols: Symbols) -> dict[str, list[Expression]]:
+    """Return y, D y, ... of quantities: each and so many derivatives."""
+    found = {name: [output_expression(plant, name, *symbols[:3])] for name in counts}
+    if any(counts.values()):
+        along = operator(plant, symbols)
+        for name, count in counts.items():
+            for _ in range(count):
+                found[name].append(along(found[name][-1]))
+    return found
+
+
+def output_order(plant: Plant, name: str) -> int | None:
+    """Return the relative order of a quantity: the first derivative that depends on an input, or 0; None where none does."""
+    x, u, p = plant.symbols()
+    value = output_expression(plant, name, x, u, p)
+    if ca.jacobian_sparsity(value, u).nnz():
+        return 0
+    if not _reached(plant, value, (x, u, p)):
+        return None
+    along = operator(plant, (x, u, p, ca.SX.zeros(len(plant.names))))
+    for order in range(1, plant.state.size + 1):
+        value = along(value)
+        if ca.jacobian_sparsity(value, u).nnz():
+            return order
+    return None
+
+
+def _reached(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX]) -> bool:
+    """Whether an input reaches a state on which a quantity depends: derivatives of what none reaches may grow without end."""
+    x, u, p = symbols
+    rate = plant.equations.rate(x, u, p)
+    patterns = ((rate, x), (rate, u), (value, x))
+    on_state, on_input, seen = (ca.DM(ca.jacobian_sparsity(*pair), 1).full() > 0 for pair in patterns)
+    for _ in range(x.numel()):
+        seen = seen | (seen @ on_state)
+    return bool((seen @ on_input).any())
+
+
+def believed_disturbance(plant: Plant, name: str, p: Expression) -> Expression:
+    """Return what a model believes to add to the response of a quantity: zero, or a parameter of an estimator."""
+    parameter = plant.outputs[name].response_disturbance if name in plant.outputs else ""
+    return p[plant.parameter.elements.index(parameter)] if parameter else ca.SX(0)
+
+
+def without_disturbances(plant: Plant) -> Plant:
+    """Return the plant without believed disturbances of its outputs' responses; itself where there are none."""
+    if not any(one.response_disturbance for one in plant.outputs.values()):
+        return plant
+    return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
 
 
 def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
@@ -34,48 +124,18 @@ def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.
 
 
 def _derivatives(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
-    x, u, p = plant.symbols()
-    w = ca.SX.sym("w", len(plant.names))
-    most = dict[str, int]()
-    for name, k in wanted:
-        most[name] = max(k, most.get(name, k))
-    responses = _responses(plant, (x, u, p, w))
-    chains = {name: _chain(plant, name, count, (x, u, p, w), responses) for name, count in most.items()}
+    symbols = *plant.symbols(), ca.SX.sym("w", len(plant.names))
+    most = {name: max(k for one, k in wanted if one == name) for name, _ in wanted}
+    chains = derivatives(plant, most, symbols)
     column = ca.vertcat(*(chains[name][k] for name, k in wanted))
-    return ca.Function("fpirhc_derivatives", [x, u, p, w], [ca.densify(column)])
+    return ca.Function("fpirhc_derivatives", list(symbols), [ca.densify(column)])
 
 
 def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
     """Return the first derivative of a quantity that depends on an input at once; None where none up to `count` does."""
     x, u, p = plant.symbols()
-    symbols = x, u, p, ca.SX.sym("w", len(plant.names))
-    chain = _chain(plant, name, count, symbols, _responses(plant, symbols))
+    chain = derivatives(plant, {name: count}, (x, u, p, ca.SX.sym("w", len(plant.names))))[name]
     return next((k for k, y in enumerate(chain) if ca.depends_on(y, u)), None)
-
-
-def _responses(plant: Plant, symbols: Symbols) -> Expression:
-    """The highest derivatives of all coordinates; a map has none."""
-    x, u, p, w = symbols
-    return w if plant.step is not None else plant.equations.response(x, u, p) + w
-
-
-def _chain(plant: Plant, name: str, count: int, symbols: Symbols, responses: Expression) -> list[Expression]:
-    """The coordinate or output and its first `count` derivatives."""
-    x, u, p, w = symbols
-    if name not in plant.coordinates:
-        return lie_derivatives(plant, output_expression(plant, name, x, u, p), count, (x, u, p, w))
-    elements, place = plant.state.elements, plant.names.index(name)
-    if plant.step is not None:
-        return lie_derivatives(plant, x[place], count, (x, u, p, w))
-    order = plant.orders[place]
-    chain = [x[elements.index(name + "'" * k)] for k in range(min(order, count + 1))]
-    if count >= order:
-        chain.append(responses[place])
-    if count > order:
-        rate = plant.equations.forced_rate(x, u, p, w)
-        for _ in range(count - order):
-            chain.append(ca.jtimes(chain[-1], x, rate))
-    return chain
 
 
 def measured_signals(plant: Plant) -> tuple[Signal, ...]:
@@ -121,11 +181,6 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.equations.output_orders.get(e, 1)]
     places = {name: plant.parameter.elements.index(name) for name in outside_names(plant)}
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))
-
-
-def relative_order(plant: Plant, name: str) -> int | None:
-    """Return the relative order of a coordinate or an output from the symbols; None where no input reaches it."""
-    return structural_order(plant, name) if name in plant.coordinates else output_order(plant, name)
 
 
 def rateless(plant: Plant) -> str:

@@ -11,8 +11,8 @@ import casadi as ca
 from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.maps import Differences
-from fpirhc.plant.motion import Output, followed_units, forcing_units
-from fpirhc.plant.plant import Parameter, Plant
+from fpirhc.plant.motion import followed_units, forcing_units
+from fpirhc.plant.plant import Output, Parameter, Plant
 from fpirhc.symbolic.layout import Expression, Named
 
 _Map = Callable[..., Mapping[str, Expression]]
@@ -43,13 +43,12 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
     if responses:
         units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
     added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
-    next_states = None if plant.next is None else _next(plant, coordinates)
-    response = _response(plant, coordinates) if next_states is None else _differences(plant, next_states)
+    moved, share = (plant.response, 1.0) if plant.next is None else (plant.next, float(plant.step or 1.0))
+    response = _moved(plant, moved, share, coordinates)
     bare = replace(
         plant,
         parameters={**plant.parameters, **added},
-        response=response,
-        next=next_states,
+        response=response if plant.next is None else Differences(response, plant.names, share),
         inverse=None,
         outputs={n: _output(plant, n, one, names) for n, one in plant.outputs.items()},
     )
@@ -75,33 +74,16 @@ def disturbance_name(name: str) -> str:
     return f"w_{name.rstrip(chr(39))}_{order}" if order else f"w_{name}"
 
 
-def _response(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
-    def response(*arguments: Named) -> Mapping[str, Expression]:
+def _moved(plant: Plant, function: _Map, share: float, coordinates: Sequence[str]) -> _Map:
+    """The response, or the next state of a map, with so large a share of each coordinate's disturbance."""
+
+    def moved(*arguments: Named) -> Mapping[str, Expression]:
         *others, p = arguments
-        responses = plant.response(*others, _own(plant, p))
-        return {c: v + p[disturbance_name(c)] if c in coordinates else v for c, v in responses.items()}
+        values = function(*others, _own(plant, p))
+        return {c: v + share * p[disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
 
-    vars(response)["__signature__"] = inspect.signature(plant.response)
-    return response
-
-
-def _differences(plant: Plant, next_states: _Map) -> _Map:
-    """The response of a map: the difference of its steps."""
-    return Differences(next_states, plant.names, float(plant.step or 1.0))
-
-
-def _next(plant: Plant, coordinates: Sequence[str]) -> Callable[..., Mapping[str, Expression]]:
-    """The map with its disturbances, whose response is the difference per step."""
-    assert plant.next is not None
-    original, step = plant.next, float(plant.step or 1.0)
-
-    def next_states(*arguments: Named) -> Mapping[str, Expression]:
-        *others, p = arguments
-        values = original(*others, _own(plant, p))
-        return {c: v + step * p[disturbance_name(c)] if c in coordinates else v for c, v in values.items()}
-
-    vars(next_states)["__signature__"] = inspect.signature(original)
-    return next_states
+    vars(moved)["__signature__"] = inspect.signature(function)
+    return moved
 
 
 def _output(plant: Plant, name: str, one: Output, names: Sequence[str]) -> Output:

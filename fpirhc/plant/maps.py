@@ -8,18 +8,19 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import TypeVar, cast
+from typing import TYPE_CHECKING, cast
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.fields.kinds import finite_number
-from fpirhc.plant.motion import Motion, sampling
+from fpirhc.plant.motion import sampling
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.symbolic.open import nominal
 
-_Motion = TypeVar("_Motion", bound=Motion)
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
+
 _WHOLE = 1e-6  # share of a step by which a cycle may differ from a whole number of steps
 
 
@@ -54,24 +55,7 @@ class Differences:
         }
 
 
-def check_map(plant: Motion, mistakes: Mistakes) -> None:
-    """Add every mistake of the steps to `mistakes`."""
-    if plant.step is None:
-        if plant.next is not None or plant.steps != 1:
-            mistakes.add("step is missing: a map needs the length of its step; write Plant.discrete(..., step=...)")
-        return
-    step = plant.step
-    if not (finite_number(step) and step > 0):
-        mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {step!r}")
-    elif plant.next is not None and set(plant.orders) != {1}:
-        mistakes.add("order: every state of a map has the order 1; later steps are found from outputs")
-    elif plant.next is not None and getattr(plant.response, "next", None) is not plant.next:
-        mistakes.add(
-            "response: that of a map is the difference of its steps; give the map alone, Plant.discrete(next=...)"
-        )
-
-
-def over(plant: _Motion, cycle: float) -> _Motion:
+def over(plant: Plant, cycle: float) -> Plant:
     """Return the plant as a controller with this cycle sees it: a map's steps with the command held, or the plant itself."""
     if plant.step is None:
         return plant
@@ -86,24 +70,24 @@ def over(plant: _Motion, cycle: float) -> _Motion:
     return plant if count == plant.steps else replace(plant, steps=count)
 
 
-def by_single_steps(plant: _Motion) -> _Motion:
+def by_single_steps(plant: Plant) -> Plant:
     """Return a map as one sees it that looks after each of its steps; any other plant as it is."""
     return plant if plant.step is None else over(plant, plant.step)
 
 
-def steps_in(plant: Motion, time: float) -> int:
+def steps_in(plant: Plant, time: float) -> int:
     """Return how many steps of its own a map makes in a time; one for a plant that moves in between."""
     return 1 if plant.step is None else round(time / plant.step)
 
 
-def unlike(plant: Motion, model: Motion) -> str:
+def unlike(plant: Plant, model: Plant) -> str:
     """Return how a plant moves otherwise than a model; empty where both step, or neither."""
     if (plant.step is None) == (model.step is None):
         return ""
     return "differential equations, and the model is a map" if plant.step is None else "steps, and the model has none"
 
 
-def check_time(plant: Motion, model: Motion, orders: Mapping[str, int], mistakes: Mistakes, *, at_once: bool) -> None:
+def check_time(plant: Plant, model: Plant, orders: Mapping[str, int], mistakes: Mistakes, *, at_once: bool) -> None:
     """Add to `mistakes` where one of model and reality steps and the other does not, and a response needs both alike.
 
     Args:
@@ -125,27 +109,18 @@ def check_time(plant: Motion, model: Motion, orders: Mapping[str, int], mistakes
         )
 
 
-def shifted(plant: Motion, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX, ca.SX]) -> Expression:
-    """Return the divided difference of an expression of the state over one control cycle.
-
-    `symbols`: x, u, p and the forcing w; what the value has of u, p and w is held.
-    """
-    x, u, p, w = symbols
-    return (ca.substitute(ca.SX(value), x, plant.equations.next(x, u, p, w)) - value) / sampling(plant)
-
-
 def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
     """Return log|1 + T s| / T of eigenvalues s of a map's divided differences: negative where a mode decays, -inf where it ends."""
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
 
 
-def response_age(plant: Motion) -> int:
+def response_age(plant: Plant) -> int:
     """Return how many cycles before a measured response its state was: at one instant, or one step earlier on a map."""
     return 0 if plant.step is None else 1
 
 
-def step_of(plant: Motion, matrix: np.ndarray, time: float) -> np.ndarray:
+def step_of(plant: Plant, matrix: np.ndarray, time: float) -> np.ndarray:
     """Return the matrix by which x' = A x moves in that time, or delta x = A x in the whole cycles of a map."""
     from scipy.linalg import expm  # only here: the import takes longer than that of the whole package
 
@@ -154,12 +129,12 @@ def step_of(plant: Motion, matrix: np.ndarray, time: float) -> np.ndarray:
     return np.linalg.matrix_power(np.eye(len(matrix)) + sampling(plant) * matrix, round(time / sampling(plant)))
 
 
-def growth_of(plant: Motion) -> Callable[[np.ndarray], np.ndarray]:
+def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
     return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))
 
 
-def time_derivatives(plant: Motion) -> Callable[[Expression, Expression, int], list[Expression]]:
+def time_derivatives(plant: Plant) -> Callable[[Expression, Expression, int], list[Expression]]:
     """Return the function (motion, time, order) -> (y, y', ..., y^(order)), of a map its divided differences."""
     return differentiated if plant.step is None else _differences(sampling(plant))
 
@@ -186,7 +161,7 @@ def _differences(step: float) -> Callable[[Expression, Expression, int], list[Ex
     return differences
 
 
-def check_modes(law: object, plant: Motion, gains: Sequence[float]) -> None:
+def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
     """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
 
     `gains`: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.

@@ -1,31 +1,35 @@
-"""Checks of a plant's settings: names, units, orders and the response."""
+"""Checks of a plant's settings: names, units, orders, the response, and the outputs."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import casadi as ca
 
 from fpirhc.errors import FpirhcError, Mistakes
-from fpirhc.fields.kinds import takes
+from fpirhc.fields.kinds import described, finite_number, takes
 from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
-from fpirhc.plant.lie_derivatives import structural_order
-from fpirhc.plant.motion import Motion, arguments_of, controlled_places, inverse_by_user, words
-from fpirhc.symbolic.layout import Expression
+from fpirhc.plant.chain import output_order, stated_expression
+from fpirhc.plant.equations import inverse_by_user
+from fpirhc.plant.motion import arguments_of, followed, followed_units, words
+
+if TYPE_CHECKING:
+    from fpirhc.plant.plant import Plant
 
 HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mistyped 10**9 would fill the memory
+_LOWER = ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
 
 
-def check_names(plant: Motion, mistakes: Mistakes) -> None:
+def check_names(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
     outputs = {name: one.unit for name, one in plant.outputs.items()}
     quantities = "states" if plant.next is not None or (plant.outputs and plant.order == 1) else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
         if not group and what != "outputs":
-            still = (
-                " (a static map y = h(u) may have one that stands still)"
-                if plant.outputs and what == quantities
-                else ""
-            )
+            static = plant.outputs and what == quantities
+            still = " (a static map y = h(u) may have one that stands still)" if static else ""
             mistakes.add(f"{what} are empty; name at least one, with its unit{still}")
         for name, unit in group.items():
             if not isinstance(unit, str) or not unit:
@@ -39,13 +43,9 @@ def check_names(plant: Motion, mistakes: Mistakes) -> None:
     for name in sorted(plant.outputs.keys() & plant.inputs.keys()):
         mistakes.add(f"'{name}' names both an output and an input; rename one")
     _check_order_numbers(plant, mistakes)
-    _check_controlled(plant, mistakes)
-
-
-def _check_controlled(plant: Motion, mistakes: Mistakes) -> None:
     if plant.controlled is not None:
-        what = "output" if plant.outputs else "coordinate"
-        mistakes.unknown(f"controlled: {what}", plant.controlled, plant.outputs or plant.coordinates)
+        what = followed(plant)
+        mistakes.unknown(f"controlled: {what}", plant.controlled, followed_units(plant))
         if len(plant.controlled) != len(plant.inputs):
             mistakes.add(
                 f"controlled names {len(plant.controlled)} {what}(s), but {len(plant.inputs)} input(s) "
@@ -53,7 +53,15 @@ def _check_controlled(plant: Motion, mistakes: Mistakes) -> None:
             )
 
 
-def check_ranges(plant: Motion, mistakes: Mistakes) -> None:
+def check_map(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the steps to `mistakes`."""
+    if plant.step is not None and not (finite_number(plant.step) and plant.step > 0):
+        mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {plant.step!r}")
+    if plant.step is None and (plant.next is not None or plant.steps != 1):
+        mistakes.add("step is missing: a map needs the length of its step; write Plant.discrete(..., step=...)")
+
+
+def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the physical ranges to `mistakes`."""
     mistakes.unknown("ranges: state", plant.ranges, plant.state.elements)
     for name, (low, high) in plant.ranges.items():
@@ -61,45 +69,49 @@ def check_ranges(plant: Motion, mistakes: Mistakes) -> None:
             mistakes.add(f"ranges: '{name}' must be (lowest, highest), got {(low, high)!r}")
 
 
-def check_response(plant: Motion, mistakes: Mistakes) -> None:
-    """Add every mistake of the response and of the orders to `mistakes`."""
+def check_response(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the response, of the orders, and of the user's inverse to `mistakes`."""
     x, u, p = plant.symbols()
-    arguments_of_step, symbols = arguments_of(plant, x, u, p), [x, u, p]
-    quantity, function = words(plant)
-    expected = len(arguments_of_step)
-    if not takes(plant.response, expected):
-        mistakes.add(_wrong_arguments(plant, expected))
+    arguments, (quantity, function) = arguments_of(plant, x, u, p), words(plant)
+    if not takes(plant.response, len(arguments)):
+        mistakes.add(_wrong_arguments(plant, len(arguments)))
         return
     try:
-        response = named_results(function, called(function, plant.response, *arguments_of_step))
+        response = named_results(function, called(function, plant.response, *arguments))
     except FpirhcError as error:
         mistakes.add(str(error))
         return
     mistakes.unknown(f"{function}: {quantity}", response, plant.coordinates)
     for c, r in zip(plant.names, plant.orders, strict=True):
-        if c not in response and plant.next is not None:
+        if c in response:
+            with mistakes.caught():
+                scalar_expression(f"{function} of '{c}'", response[c], of=plant.response, symbols=[x, u, p])
+        elif plant.next is not None:
             mistakes.add(f"next does not give the value of state '{c}' one step later; return it too")
-            continue
-        if c not in response:
+        else:
             mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
-            continue
-        with mistakes.caught():
-            scalar_expression(f"{function} of '{c}'", response[c], of=plant.response, symbols=symbols)
     if mistakes.none:
         _check_orders(plant, mistakes)
     if mistakes.none and plant.inverse is not None:
-        _check_inverse(plant, plant.inverse, mistakes)
+        count = max(plant.orders, default=0) + 2
+        if takes(plant.inverse, count):
+            with mistakes.caught():
+                inverse_by_user(plant, plant.inverse)
+        else:
+            mistakes.add(
+                f"inverse is called with {count} arguments: the derivatives below the order, responses, parameters"
+            )
 
 
-def _wrong_arguments(plant: Motion, expected: int) -> str:
+def _wrong_arguments(plant: Plant, expected: int) -> str:
     """What a response of another number of arguments is, and what it should be."""
     quantity, function = words(plant)
     kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
     arguments, order = len(kinds), max(plant.orders, default=0)
-    lower = ["x"] if quantity == "state" else ["q", "v", "a"] + [f"d{k}" for k in range(3, 12)]
-    names = [*lower[:order], "u", "p"]
     state, fitting, place = quantity == "state", order + arguments - expected, place_of(plant.response)
-    mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else _OF_STATES
+    names = [*(["x"] if state else _LOWER)[:order], "u", "p"]
+    of_states = "; equations in states go to Plant.of_states(rates=...)"
+    mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else of_states
     mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
     return (
         f"{function} takes {arguments} argument{'s' * (arguments != 1)}{f' ({place})' if place else ''}; "
@@ -107,17 +119,13 @@ def _wrong_arguments(plant: Motion, expected: int) -> str:
     )
 
 
-_OF_STATES = "; equations in states go to Plant.of_states(rates=...)"
-
-
-def _check_order_numbers(plant: Motion, mistakes: Mistakes) -> None:
+def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
     if isinstance(plant.order, Mapping):
         mistakes.unknown("order: coordinate", plant.order, plant.coordinates)
         for c in plant.coordinates:
             if c not in plant.order:
                 mistakes.add(f"order: coordinate '{c}' has none; add '{c}': 2 (the derivative that the response gives)")
-    orders = plant.order.values() if isinstance(plant.order, Mapping) else [plant.order]
-    for order in orders:
+    for order in plant.order.values() if isinstance(plant.order, Mapping) else [plant.order]:
         if not isinstance(order, int) or isinstance(order, bool) or order < 1:
             mistakes.add(f"order must be a whole number of at least 1, got {order!r}")
         elif order > HIGHEST_ORDER:
@@ -127,23 +135,12 @@ def _check_order_numbers(plant: Motion, mistakes: Mistakes) -> None:
             )
 
 
-def _check_inverse(plant: Motion, inverse: Callable[..., Mapping[str, Expression]], mistakes: Mistakes) -> None:
-    arguments = max(plant.orders, default=0) + 2
-    if not takes(inverse, arguments):
-        mistakes.add(
-            f"inverse is called with {arguments} arguments: the derivatives below the order, responses, parameters"
-        )
-        return
-    with mistakes.caught():
-        inverse_by_user(plant, inverse)
-
-
-def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
+def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
+    """The orders that are stated; those of outputs are found."""
     if plant.outputs or (plant.controlled is None and len(plant.inputs) != len(plant.coordinates)):
-        return  # orders of outputs are found, not stated
-    for k in controlled_places(plant):
-        name, stated = plant.names[k], plant.orders[k]
-        order = structural_order(plant, name)
+        return
+    for name, stated in plant.response_orders.items():
+        order = output_order(plant, name)
         if order is None:
             mistakes.add(
                 f"no input reaches coordinate '{name}', however often it is differentiated; use {' or '.join(plant.inputs)} in the "
@@ -159,3 +156,32 @@ def _check_orders(plant: Motion, mistakes: Mistakes) -> None:
                 f"order of '{name}' is given as {stated}, but its response has no input: the first derivative that an "
                 f"input reaches is number {order}. Write the response of order {order}, or control another coordinate"
             )
+
+
+def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every mistake of the outputs to `mistakes`."""
+    for name, one in plant.outputs.items():
+        lower = max(plant.orders, default=0)
+        if takes(one.expression, lower + 1) or takes(one.expression, lower + 2):
+            with mistakes.caught():
+                _check_output(plant, name, mistakes)
+            continue
+        names = ", ".join((["x"] if words(plant)[0] == "state" else _LOWER)[:lower])
+        mistakes.add(
+            f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
+            f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
+        )
+
+
+def _check_output(plant: Plant, name: str, mistakes: Mistakes) -> None:
+    x, u, p = plant.symbols()
+    value, parameter = ca.SX(stated_expression(plant, name, x, u, p)), plant.outputs[name].response_disturbance
+    if name in plant.coordinates and not ca.is_equal(value, x[plant.state.elements.index(name)], 1):
+        mistakes.add(f"outputs: '{name}' has the name of a coordinate, but is another expression; rename the output")
+        return
+    if parameter and parameter not in plant.parameters:
+        mistakes.add(
+            f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there"
+        )
+    if (plant.controlled is None or name in plant.controlled) and output_order(plant, name) is None:
+        mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")

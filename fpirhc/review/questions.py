@@ -19,7 +19,7 @@ import numpy as np
 from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.chain import relative_order, zero_dynamics
+from fpirhc.plant.chain import output_order, zero_dynamics
 from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked, predictor
 from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.status import Status
@@ -84,7 +84,7 @@ def _posed(case: Case) -> Fact | None:
 
 def _orders(case: Case) -> Fact:
     plant = case.problem.plant
-    found = {name: (float(relative_order(plant, name) or 0), order) for name, order in plant.response_orders.items()}
+    found = {name: (float(output_order(plant, name) or 0), order) for name, order in plant.response_orders.items()}
     name = next((n for n, (own, stated) in found.items() if own != stated), next(iter(found)))
     own, stated = found[name]
     return Fact(Verdict.YES if own == stated else Verdict.NO, {"order": own, "stated": stated}, name)

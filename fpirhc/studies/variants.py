@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from fpirhc.errors import InvalidValue
-from fpirhc.plant.plant import drawn, exact_ranges
+from fpirhc.plant.parameter import drawn, exact_ranges
 from fpirhc.problem_files.problem_file import Task, with_numbers_of_all
 from fpirhc.problem_files.settings import number_of_case, of_problem, with_numbers
 from fpirhc.task.problem import Problem

@@ -16,7 +16,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
 from fpirhc.fields.kinds import described, finite_number
-from fpirhc.plant.plant import Parametric
+from fpirhc.plant.parameter import Parametric
 from fpirhc.summary import line
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.paths import changed_at, content_at

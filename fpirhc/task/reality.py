@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
-from fpirhc.plant.chain import derivatives_function, input_reaches_at, relative_order
+from fpirhc.plant.chain import derivatives_function, input_reaches_at, output_order
 from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.maps import check_time, over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters, with_outputs_of
@@ -306,7 +306,7 @@ def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name:
             f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
             f"the order {order}; give the model this order, or the reality a coordinate of its own"
         )
-    elif name in (model.controlled or model.chains) and relative_order(plant, own) is None:
+    elif name in (model.controlled or model.chains) and output_order(plant, own) is None:
         mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
 
 

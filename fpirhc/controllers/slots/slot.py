@@ -18,7 +18,7 @@ from fpirhc.controllers.contract import refuse
 from fpirhc.deformation.base import Deformation, Identity, against_wrappers
 from fpirhc.errors import InvalidName, InvalidProblem, NotInvertible, nearest
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.lie_derivatives import lie_derivatives, output_expression, structural_order
+from fpirhc.plant.chain import operator, output_expression, output_order
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import derivative_unit, followed_units
 from fpirhc.plant.plant import Plant
@@ -208,7 +208,6 @@ def integrators(plant: Plant, quantities: Mapping[str, tuple[str, int]], inputs:
         inverse=None,
         ranges={},
         outputs={},
-        next=None,
     )
 
 
@@ -255,14 +254,13 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
     x, u, p = plant.symbols()
     w = ca.SX.sym("w", len(plant.names))
     command = u[plant.input.elements.index(name)]
-    first = [x[plant.state.elements.index(coordinate)]] if coordinate in plant.coordinates else []
-    derivatives = first or [output_expression(plant, coordinate, x, u, p)]
+    derivatives, along = [output_expression(plant, coordinate, x, u, p)], operator(plant, (x, u, p, w))
     if ca.jacobian_sparsity(derivatives[0], u).nnz():
         raise NotInvertible(
             f"the command moves '{coordinate}' at once (order 0), so a slot has no derivative to prescribe"
         )
     for order in range(1, plant.state.size + 1):
-        derivative = lie_derivatives(plant, derivatives[-1], 1, (x, u, p, w))[1]
+        derivative = along(derivatives[-1])
         if ca.jacobian_sparsity(derivative, command).nnz():
             return _chain(plant, coordinate, name, derivatives, derivative, (x, u, p, w))
         if ca.depends_on(derivative, u):
@@ -271,7 +269,7 @@ def output_chain(plant: Plant, coordinate: str, input_name: str | None = None) -
                 f"derivative {order} of '{coordinate}' is reached by another input than '{name}'; choose input='{others[0]}'"
             )
         derivatives.append(derivative)
-    orders = ", ".join(f"{c} {structural_order(plant, c) or 'none'}" for c in plant.names)
+    orders = ", ".join(f"{c} {output_order(plant, c) or 'none'}" for c in plant.names)
     raise NotInvertible(
         f"input '{name}' does not reach coordinate '{coordinate}', however often it is differentiated "
         f"(relative order by coordinate: {orders}); choose a coordinate that has one"
