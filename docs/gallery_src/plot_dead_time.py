@@ -13,11 +13,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.contraction.delayed import delayed_limit
+from fpirhc.contraction.delayed import largest_gain
 
 delays = np.arange(0, 13)
-unpaired = [delayed_limit(np.append(np.zeros(d), 1.0)) for d in delays]
-paired = [delayed_limit(np.append(np.zeros(d), 1.0), pairing=d) for d in delays]
+map, same = fp.Affine(gain=-0.5), np.eye(1)
+late = [[np.append(np.zeros(d), 1.0)] for d in delays]
+unpaired = [largest_gain(map, same, seen) for seen in late]
+paired = [
+    largest_gain(fp.Paired(map, cycles=d), same, late[d]) for d in delays.tolist()
+]
 
 figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
 axis.plot(delays, unpaired, "o", label="unpaired")

@@ -6,24 +6,23 @@ gains of the other sign enlarge every error, and a delay of the response lowers 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
 import numpy as np
 
-from fpirhc.contraction.delayed import limit_behind_weights
+from fpirhc.contraction.delayed import converges, delayed, largest_gain
 from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, refuse, resolved
-from fpirhc.deformation.base import Deformation, Iteration, against_wrappers, own_gain, with_its_gain
+from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
+from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.open import nominal
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
-_SOUGHT = 20.0  # effective gain times eigenvalue up to which limits are sought
 _NOTHING = 1e-12  # largest eigenvalue of a Jacobian that has no effect
 
 
@@ -53,67 +52,43 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
 def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     """Raise if a gain is beyond the limit of the iteration: that of the plant itself, or behind the delay of estimator and filter.
 
-    The dead time of the problem is added where all inputs have the same. Without estimator and filter dead time is not judged. A
-    map that changes its gain on line begins where it likes.
+    The dead time of the problem is added where all inputs have the same. Without estimator dead time is not judged. A map that
+    changes its gain on line begins where it likes.
     """
-    gain, iteration, mirror = deformation.effective_gain(), deformation.iteration, deformation.mirror
-    if gain == 0 or not iteration.limited or not iteration.constant or not _REFUSES.get():
+    gain = deformation.effective_gain()
+    if gain == 0 or not deformation.iteration.constant or not _REFUSES.get():
         return
-    spectrum = _at_start(problem, deformation)
+    spectrum, jacobian = _at_start(problem, deformation), _jacobian_at_start(problem)
     if spectrum is None:
         return
-    late = _delayed_weights(problem, iteration)
-    weights = late or [np.ones(1)]
-    eigenvalues = np.unique(np.round(spectrum.eigenvalues.ravel() * math.copysign(1, gain), 12))
-
-    def limit(pairing: float) -> float:
-        return min(
-            limit_behind_weights(iteration, mirror, w, pairing, complex(v)) for w in weights for v in eigenvalues
-        )
-
-    at_once = not (late or iteration.leak)
-    largest = (
-        max(map(abs, linear_limit(spectrum.eigenvalues))) if at_once else limit(_paired(iteration) if late else 0.0)
-    )
-    largest = min(largest, _SOUGHT / float(np.abs(eigenvalues).max()))
-    if abs(gain) < largest:
+    seen = _delayed_weights(problem)
+    if seen is None and abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
         return
-    if not late:
+    pairing = deformation.iteration.pairing
+    weights = seen or [delayed(np.ones(1), pairing.cycles if pairing else 0.0)] * len(jacobian)
+    if converges(deformation, jacobian, weights):
+        return
+    if seen is None and not deformation.memory(problem.plant.controlled_names).size:
+        raise _too_large(deformation, spectrum, max(map(abs, linear_limit(spectrum.eigenvalues))))
+    largest = largest_gain(deformation, jacobian, weights)
+    if seen is None:
         raise _too_large(deformation, spectrum, largest)
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
-    limits = {d: limit(d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
-    best = None if mirror.share else next((d for d, most in limits.items() if abs(gain) < most), None)
+    pairs = {d: Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0 and pairing is None}
+    best = next((d for d, one in pairs.items() if converges(one, jacobian, weights)), None)
     raise _too_late(problem, deformation, largest, best)
 
 
-def limit_behind(deformation: Deformation, weights: np.ndarray, late: float, eigenvalue: float) -> float:
-    """Return the largest effective gain for a response with these weights of past requests, late by some cycles."""
-    iteration = deformation.iteration
-    return limit_behind_weights(iteration, deformation.mirror, _late(weights, late), _paired(iteration), eigenvalue)
-
-
-def _delayed_weights(problem: Problem, iteration: Iteration) -> list[np.ndarray]:
-    """Weights of past requests in the estimated responses, dead time included; empty without estimator and filter."""
-    orders = set(problem.plant.response_orders.values())
+def _delayed_weights(problem: Problem) -> list[np.ndarray] | None:
+    """Weights of past requests in every estimated response, dead time included; None where no estimator spreads them."""
+    orders = problem.plant.response_orders.values()
     weights = [problem.sensing.estimator.weights(order, problem.period) for order in orders]
     dead_times = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
-    if (iteration.error_pole == 0 and all(w.size == 1 for w in weights)) or len(dead_times) > 1:
-        return []
+    if all(w.size == 1 for w in weights) or len(dead_times) > 1:
+        return None
     dead_time = (dead_times.pop() + problem.dead_time.measurement) / problem.period
-    return [_late(w, dead_time) for w in weights]
-
-
-def _paired(iteration: Iteration) -> float:
-    """Age of the request that a response is paired with, cycles."""
-    return iteration.pairing.cycles if iteration.pairing else 0.0
-
-
-def _late(weights: np.ndarray, cycles: float) -> np.ndarray:
-    """The weights after a dead time, interpolated as the queues do."""
-    whole = math.floor(cycles + 1e-9)
-    share = max(cycles - whole, 0.0)
-    return np.convolve(weights, np.append(np.zeros(whole), [1 - share, share]))
+    return [delayed(w, dead_time) for w in weights]
 
 
 def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> NotContractive:
@@ -132,21 +107,15 @@ def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> No
 def _too_late(problem: Problem, deformation: Deformation, limit: float, pairing: float | None) -> NotContractive:
     name, estimator = own_gain(deformation)[0], problem.sensing.estimator
     delay, of_estimator = problem.response_delay, problem.sensing.delay(problem.plant, problem.period)
-    causes = (
-        str(estimator)
-        if delay == of_estimator
-        else f"dead time {delay - of_estimator:.4g}, {estimator} {of_estimator:.4g}"
-    )
-    reasons = [f"the response comes {delay:.4g} cycles late ({causes})"] if delay else []
-    pole = deformation.iteration.error_pole
-    reasons += [f"the error is filtered with the pole {pole:g}"] if pole else []
+    apart = f"dead time {delay - of_estimator:.4g}, {estimator} {of_estimator:.4g}"
+    causes = str(estimator) if delay == of_estimator else apart
     remedies = [f"0 < |{name}| < {_in_own(deformation, limit):.3g}"] if limit else []
     remedies += [f"Paired(map, cycles={pairing:.4g})"] if pairing is not None else []
     remedies += ["a shorter window or time constant"]
     # These remedies stay beside an advice on the gain, because all but the first change something else.
     return NotContractive(
-        f"{with_its_gain(deformation)}: {' and '.join(reasons)}, so the iteration does not converge with this {name}; what "
-        f"helps: {', or '.join(remedies)}"
+        f"{with_its_gain(deformation)}: the response comes {delay:.4g} cycles late ({causes}), so the iteration "
+        f"does not converge with this {name}; what helps: {', or '.join(remedies)}"
     )
 
 
@@ -160,11 +129,15 @@ def _at_start(problem: Problem, deformation: Deformation) -> Spectrum | None:
 
     With a reality they are those of the response at the end of a cycle; None where the command has not reached it by then.
     """
-    jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian(problem.of_equations))
+    jacobian = _jacobian_at_start(problem)
     if not np.isfinite(jacobian).all():
         return None
     spectrum = Spectrum(np.linalg.eigvals(deformation.iteration.weighted(jacobian)))
     return spectrum if np.abs(spectrum.eigenvalues).max() > _NOTHING else None
+
+
+def _jacobian_at_start(problem: Problem) -> np.ndarray:
+    return _JACOBIANS.of((problem,), (), lambda: _jacobian(problem.of_equations))
 
 
 def _jacobian(problem: Problem) -> np.ndarray:

@@ -78,18 +78,6 @@ class LastRequest(Mirror):
 
 
 @dataclass(frozen=True)
-class Reach:
-    """The setting of a map that requests and responses must stay far below.
-
-    Args:
-        size: of the setting, in units of the response.
-    """
-
-    name: str
-    size: float
-
-
-@dataclass(frozen=True)
 class Pairing:
     """The earlier request that a response is paired with: the request of `cycles` cycles before the last one.
 
@@ -119,26 +107,18 @@ class RequestChange:
 
 @dataclass(frozen=True)
 class Iteration:
-    """What a map is to first order, beside its effective gain: what a review needs to judge this gain.
+    """What a map is to first order, beside its effective gain, as far as its step alone does not tell.
 
     Args:
-        constant: whether gain and pairing stay as they are at the start of a run.
-        error_pole: pole of a low-pass filter on the response error, from 0 (none) to below 1.
-        leak: pole of the leak between the deformation of the last cycle and the next; 0: none.
+        constant: whether gain and pairing stay as they are at the start of a run, and are those of small errors too.
         pairing: the earlier request that a response is paired with; None: the last one.
-        reach: the setting that bounds the requests for which the gains hold; None where the gains hold for all requests.
         channels: number of controlled coordinates that the map is made for; None: any number.
-        limited: whether a gain beyond the limit of the iteration is refused.
         weights: W by rows where the gain is a matrix, r+ = r - a W (f - d); None: the one matrix.
     """
 
     constant: bool = True
-    error_pole: float = 0.0
-    leak: float = 0.0
     pairing: Pairing | None = None
-    reach: Reach | None = None
     channels: int | None = None
-    limited: bool = True
     weights: tuple[tuple[float, ...], ...] | None = None
 
     def weighted(self, jacobian: np.ndarray) -> np.ndarray:
@@ -177,12 +157,8 @@ class Deformation(Checked, ABC):
 
     @property
     def iteration(self) -> Iteration:
-        """What the map is to first order; gain and pairing are constant where it remembers nothing of its own."""
-        own = self.memory(("q",)).names
-        if self.inner is None:
-            return Iteration(constant=not own)
-        inner = self.inner.iteration
-        return replace(inner, constant=inner.constant and own == self.inner.memory(("q",)).names)
+        """What the map is to first order."""
+        return Iteration() if self.inner is None else self.inner.iteration
 
     @property
     def mirror(self) -> Mirror:
@@ -286,9 +262,8 @@ def smooth_norm(column: Expression, floor: float) -> Expression:
 
 
 def of_last_pair(deformation: Deformation) -> bool:
-    """Whether a request follows from the last request and its response alone: no model, pairing or filter of its own."""
-    iteration = deformation.iteration
-    return iteration.pairing is None and not (deformation.mirror.share or iteration.error_pole)
+    """Whether a request follows from the last request and its response alone: no model, pairing or memory of its own."""
+    return deformation.iteration.pairing is None and not (deformation.mirror.share or deformation.memory(("q",)).size)
 
 
 _FORGETTING = 0.1  # share of the newest sign

@@ -65,7 +65,6 @@ class ModelReferenced(Wrapper):
         longest, several_channels = max(every(self._delays)), isinstance(self._cycles, tuple)
         return replace(
             self.map.iteration,
-            leak=self._leak,
             pairing=Pairing(longest, channels=several(self._delays)) if longest else None,
             channels=len(every(self._cycles)) if several_channels else self.map.iteration.channels,
         )

@@ -12,7 +12,7 @@ from typing import Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Reach, smooth_norm
+from fpirhc.deformation.base import Deformation, smooth_norm
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import NotZero
 from fpirhc.symbolic.layout import Expression
@@ -33,11 +33,6 @@ class _Transformation(Deformation):
             raise InvalidValue(
                 f"{type(self).__name__}(sign={self.sign!r}): expected -1 or 1; -1 for offset > 0 and a model of right sign"
             )
-
-    @property
-    def iteration(self) -> Iteration:
-        """The gains hold for |K_c| >> |r|."""
-        return Iteration(reach=Reach("offset", abs(self.offset)))
 
     def effective_gain(self) -> float:
         """The effective gain a = -K_c B_c A_c."""

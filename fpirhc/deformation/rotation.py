@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Reach
+from fpirhc.deformation.base import Deformation
 from fpirhc.fields.kinds import NotZero, Positive
 from fpirhc.symbolic.layout import Expression
 
@@ -39,11 +39,6 @@ class Rotation(Deformation):
 
     fraction: NotZero
     radius: Positive
-
-    @property
-    def iteration(self) -> Iteration:
-        """R is several times the longest vector."""
-        return Iteration(reach=Reach("radius", self.radius))
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

@@ -13,7 +13,7 @@ import pandas as pd
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import any_gain
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.deformation.base import Identity, Iteration
+from fpirhc.deformation.base import Identity
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.motion import input_columns
@@ -39,10 +39,6 @@ class Excitation(Identity):
     cycles: int  # length of the sequence; after it the request is the desired response
     seed: int = 0  # of the sequence
     adapts = True  # without adaptation no loop passes its response on
-
-    @property
-    def iteration(self) -> Iteration:
-        return Iteration(limited=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         del elements

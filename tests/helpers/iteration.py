@@ -25,12 +25,10 @@ class Scalar:
         self.memory: Any = self.layout.start()
 
     def __call__(self, request: float, response: float, desired: float) -> float:
-        """The next request."""
         after, self.memory = self.step(request, response, desired, self.memory)
         return float(after)
 
     def remembered(self, name: str) -> float:
-        """A number of the memory."""
         return float(ca.DM(self.memory).full()[self.layout.slice(name)].item(0))
 
 

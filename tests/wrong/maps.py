@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.contracts import Deformation, Iteration
+from fpirhc.contracts import Deformation, Iteration, Layout, Pairing, Signal
 
 
 @dataclass(frozen=True)
@@ -120,12 +120,12 @@ class GivesAnotherGain(Softsign):
         return replace(self, gain=2 * gain)
 
 
-class SaysItFilters(Softsign):
-    """Names a filter that it does not have."""
+class SaysItIsLate(Softsign):
+    """Names an earlier request than the one that it compares the response with."""
 
     @property
     def iteration(self):
-        return Iteration(error_pole=0.9)
+        return Iteration(pairing=Pairing(3))
 
 
 class SaysItDoesNotAdapt(Softsign):
@@ -136,9 +136,12 @@ class SaysItDoesNotAdapt(Softsign):
         return False
 
 
-class SaysItLeaks(Softsign):
-    """Names a leak that it does not have."""
+class FiltersTwice(Softsign):
+    """Remembers half of the last step too, and so has twice the gain that it tells."""
 
-    @property
-    def iteration(self):
-        return Iteration(leak=0.5)
+    def memory(self, elements):
+        return Layout((Signal("last_step", elements),))
+
+    def step(self, request, response, desired, memory):
+        step = super().step(request, response, desired, {})[0] - request + 0.5 * memory["last_step"]
+        return request + step, {"last_step": step}

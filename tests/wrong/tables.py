@@ -29,9 +29,9 @@ MAPS = {
     maps.Fades: ("only desired is fixed", "a false fixed point is near"),
     maps.Rests: ("only desired is fixed", "an error of 1.* a false fixed point is near"),
     maps.GivesAnotherGain: ("gain can be set", "effective gain 1.6"),
-    maps.SaysItFilters: ("filter and pairing are told", "the pole 0.9"),
+    maps.SaysItIsLate: ("gain and pairs are told", "a response 3 cycles late a pair takes 4.01 times"),
     maps.SaysItDoesNotAdapt: ("adaptation is told", "`adapts` is false, but.*0.3 per unit"),
-    maps.SaysItLeaks: ("leak is told", "its leak is 0.5.*by -0.3 and not by -0.15"),
+    maps.FiltersTwice: ("gain and pairs are told", "a pair takes 2 times the gain off"),
 }
 OPTIMISERS = {
     optimisers.AlwaysOk: ("numbers are true far away", "calls a plan OK whose stationarity is"),
@@ -69,7 +69,7 @@ MAP_MEMBERS = {
     "effective_gain": "first step is effective gain",
     "gain_name": "gain is proportional to its field",
     "inner": "inner can be exchanged",
-    "iteration": "filter and pairing are told",
+    "iteration": "gain and pairs are told",
     "largest_step": "step is bounded",
     "memory": "graphs agree",
     "mirror": "exact model is left alone",

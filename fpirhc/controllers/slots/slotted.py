@@ -10,6 +10,7 @@ from itertools import accumulate
 import casadi as ca
 import numpy as np
 
+from fpirhc.contraction.delayed import converges, delayed, largest_gain
 from fpirhc.contraction.spectrum import Spectrum, assess_gain
 from fpirhc.controllers.base import (
     Controller,
@@ -22,7 +23,6 @@ from fpirhc.controllers.base import (
     warm_up_block,
 )
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.check import limit_behind
 from fpirhc.controllers.contract import late_deformation
 from fpirhc.controllers.path import Answers, answer_block, measured_output
 from fpirhc.controllers.reference_states import stages_of
@@ -308,10 +308,11 @@ def _check_gain(problem: Problem, one: Channel) -> None:
     weights = _weights(problem, one)
     if weights.size == 1:
         return
-    late = problem.dead_time.inputs.get(one.chain.input, 0.0) + problem.dead_time.measurement
-    most = limit_behind(deformation, weights, late / problem.period, abs(exact / one.start_gain))
-    size = abs(deformation.effective_gain())
-    if size >= most:
+    dead_time = problem.dead_time.inputs.get(one.chain.input, 0.0) + problem.dead_time.measurement
+    seen = delayed(weights, dead_time / problem.period)
+    asked = deformation, np.array([[exact / one.start_gain]]), [seen]
+    if not converges(*asked):
+        most, size = largest_gain(*asked), abs(deformation.effective_gain())
         raise NotContractive(
             f"slot '{one.slot.coordinate}': its response is of several cycles, so the iteration converges only for effective gains "
             f"below {most:.3g}, and this one is {size:.3g}; use a smaller gain"

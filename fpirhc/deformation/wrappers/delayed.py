@@ -171,10 +171,6 @@ class Increment(_Queued):
         return cls(map, cycles=most / 2, uncertainty=math.ceil(most / 2))
 
     @property
-    def iteration(self) -> Iteration:
-        return replace(super().iteration, leak=self._leak)
-
-    @property
     def _leak(self) -> float:
         """The pole p in use."""
         return chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)

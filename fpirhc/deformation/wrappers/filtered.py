@@ -8,9 +8,9 @@ Theory: docs/theory.md.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from fpirhc.deformation.base import Deformation, Iteration, Wrapper, memory_of_map, with_inner
+from fpirhc.deformation.base import Deformation, Wrapper, memory_of_map, with_inner
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -25,10 +25,6 @@ class Filtered(Wrapper):
     """
 
     pole: BelowOne
-
-    @property
-    def iteration(self) -> Iteration:
-        return replace(self.map.iteration, error_pole=self.pole)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         return Layout((Signal("filter_error", elements),)) + self.map.memory(elements)

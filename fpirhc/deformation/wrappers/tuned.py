@@ -12,7 +12,7 @@ from typing import Annotated, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
+from fpirhc.deformation.base import Deformation, Iteration, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.expression import power
@@ -52,6 +52,10 @@ class Tuned(Wrapper):
                 f"Tuned(largest_gain={self.largest_gain!r}): expected a bound beyond the map's own effective gain {gain:.4g}; "
                 "assess_gain(...).sector_limit gives one. Without a bound a tuner raises the gain until the loop oscillates"
             )
+
+    @property
+    def iteration(self) -> Iteration:
+        return replace(self.map.iteration, constant=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         counts = scalar("tuner_growing"), scalar("tuner_returning")
