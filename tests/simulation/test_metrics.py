@@ -317,7 +317,7 @@ def test_figures_have_the_value_of_their_definition(figure, value, unit, better)
     metrics = fp.measure(problem(), run(0.0, command=COMMAND), [figure])
     assert metrics[figure.name][""] == pytest.approx(value)
     assert metrics.units[figure.name][""] == unit
-    assert figure.better == better
+    assert (figure.better, figure.headline, figure.finite) == (better, True, True)
     ended = fp.measure(problem(), run(0.0, command=COMMAND, stop="limits"), [figure])
     assert math.isnan(ended[figure.name][""])
 
@@ -344,6 +344,7 @@ def test_the_first_direction_is_that_from_the_start_to_the_reference():
     ("wrong", "message"),
     [
         (lambda: figures.InBand("command.u", 3.0, 2.0), "low is 3 and high is 2; expected low < high"),
+        (lambda: figures.InBand("command.u", 3.0, 3.0), "low is 3 and high is 3; expected low < high"),
         (lambda: figures.Norm([]), "power is 2 of 0 signals; expected at least 1 of at least one signal"),
         (lambda: figures.Norm(["command.u"], power=0.5), "power is 0.5 of 1 signals"),
     ],
@@ -362,11 +363,28 @@ def test_a_signal_that_is_not_there_breaks_its_figure_alone():
     assert "Did you mean 'command.u'?" in metrics.broken["largest"]
 
 
-def test_metrics_come_from_other_processes():
+# In the order of tables. h: stands in short ones, r: in reports, f: must be finite; how a baseline compares it, up to which size.
+MEANT = {
+    "cycles": "f exact", "rms_error": "hrf banded", "max_error": "rf banded", "iae": "f banded", "settling": "r banded",
+    "effort": "rf banded", "total_variation": "hrf banded", "at_limit": "hrf banded", "cost": "rf banded",
+    "status": "f exact", "contraction.predicted": "hr banded 0.0001", "contraction.growing": "r not",
+    "contraction.measured": "r banded 0.0001", "solve.median_iterations": "rf banded", "solve.worst_iterations": "f banded",
+    "solve.median_stationarity": " not", "solve.worst_stationarity": "r not", "solve.worst_feasibility": " not",
+    "plans": "f exact",
+}  # fmt: skip
+
+
+def test_metrics_come_from_other_processes_and_say_what_they_are_for():
     """Pickled and read again they are the same numbers of the same metrics."""
     task = fp.load_problem("two_mass")
     problem = replace(task.problem, duration=0.05, measure_from=0.0)
-    metrics = fp.measure(problem, fp.simulate(problem, task.controllers["CTC"], seed=0, compiled=False))
+    metrics = fp.measure(problem, fp.simulate(problem, task.controllers["RHC+FPI"], seed=0, compiled=False))
     again = pickle.loads(pickle.dumps(metrics))
     assert [(m.name, e, repr(v)) for m, e, v in again] == [(m.name, e, repr(v)) for m, e, v in metrics]
     assert all(again.entries[name] is metric for name, metric in metrics.entries.items())
+    found = {}
+    for m in dict.fromkeys(metric for metric, _, _ in metrics):
+        marks = "".join(k * on for k, on in zip("hrf", (m.headline, m.report, m.finite), strict=True))
+        found[m.name] = f"{marks} {m.compared}" + (f" {m.floor:g}" if m.floor > 1e-12 else "")
+    assert list(found.items()) == list(MEANT.items())
+    assert {m.name: m.step(0.1, 8) for m, _, _ in metrics if m.step(0.1, 8)} == {"settling": 0.1, "at_limit": 0.125}
