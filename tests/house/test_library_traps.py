@@ -59,11 +59,6 @@ def test_ipopt_prints_nothing(capfd):
     assert capfd.readouterr().out == ""
 
 
-def test_optimisers_are_sent_as_values():
-    """A pickled solver has megabytes; workers get the settings and build their own."""
-    assert len(pickle.dumps(fp.Ipopt(tolerance=1e-3))) < 10_000
-
-
 def test_no_adaptation_is_no_frozen_request():
     """A gain of zero would keep the last request for ever; Identity passes on what is desired."""
     request, response, desired = (ca.SX([v]) for v in (1.0, 2.0, 3.0))

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import fpirhc as fp
 from fpirhc import Plant
 
 
@@ -44,19 +43,3 @@ def test_infusion_that_holds_half_the_effect():
     """The nominal patient needs 8.32 mg/min for 4.37 mg/l at the effect site (Schnider's kinetics, Hill curve of patient 13)."""
     plant = abroad.load("drug_infusion").problem.plant
     assert rates(plant, [4.37] * 4, [8.32]) == pytest.approx(np.zeros(4), abs=5e-3)
-
-
-def test_half_rule_runs_as_an_independent_integration_does():
-    """Late commands through the valve and the process, cycle after cycle by another integrator."""
-    task = abroad.load("half_rule")
-    problem = task.problem
-    assert isinstance(problem.reality, fp.Reality)
-    run = fp.simulate(problem, task.controllers["RHC+FPI"], seed=0, compiled=False)
-    plant, late = problem.reality.plant, 11  # cycles of 0.07 s in 0.77 s
-    commands = np.concatenate([np.zeros(late), run["command"][:, 0]])
-    state, outputs = [0.0, 0.0], [0.0]
-    for command in commands[:1000]:
-        moved = solve_ivp(lambda _, x, u=command: rates(plant, list(x), [u]), (0, 0.07), state, rtol=1e-9, atol=1e-11)
-        state = list(moved.y[:, -1])
-        outputs.append(state[0])
-    np.testing.assert_allclose(run["reality_state.y"][:1000], outputs[:1000], atol=1e-6)
