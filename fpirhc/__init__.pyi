@@ -10,7 +10,6 @@ from .controllers.replanning import FromMeasurement as FromMeasurement
 from .controllers.replanning import FromPlan as FromPlan
 from .controllers.rivals.pid import PID as PID
 from .controllers.slots.schedules import Periodic as Periodic
-from .controllers.slots.slot import Slot as Slot
 from .controllers.slots.slotted import Slotted as Slotted
 from .controllers.wrappers.cascade import Cascade as Cascade
 from .controllers.wrappers.cascade import ThroughModel as ThroughModel

@@ -62,8 +62,8 @@ _REMEDIES = {
     "allow more iterations, loosen the tolerance, or scale the cost.",
     Status.INFEASIBLE: "the plan violates a bound or the dynamics: check the initial state against the "
     "limits, soften state limits, or lengthen the horizon.",
-    Status.HELD: "the optimiser failed and the stated policy replaced its plan, or a slot's input had too little "
-    "effect and the command was held: see the cycles counted here and the signals around them.",
+    Status.HELD: "the optimiser failed and the stated policy replaced its plan: see the cycles counted here and the "
+    "signals around them.",
     Status.NON_FINITE: "a signal became NaN or infinite, and the cycle was skipped: look at the first such signal of the run; the "
     "measurement is outside the model's domain, or the loop diverged.",
     Status.BAD_SAMPLE: "a measurement was lost, outside the range of its sensor, or out of date: the cycle was skipped, with the "

@@ -71,9 +71,9 @@ sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=10.0)  # scale in m/s^2 or rad/
 
 
 def slotted(deformation):
-    cart = fp.Slot("cart", fp.Exponential(rate=1.0, integral=False), deformation)  # 1/s
-    angle = fp.Slot("angle", fp.Exponential(rate=3.0, integral=False), deformation)
-    return fp.Slotted((cart, angle), schedule, blend=0.1)
+    cart = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False), deformation)  # 1/s
+    angle = fp.ComputedTorque(fp.Exponential(rate=3.0, integral=False), deformation)
+    return fp.Slotted({"cart": cart, "angle": angle}, schedule, blend=0.1)
 
 
 controllers = {

@@ -62,9 +62,9 @@ sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=100.0)  # scale in m/s^2 or m/s
 
 
 def slotted(deformation):
-    second = fp.Slot("q2", fp.Exponential(rate=4.0, integral=False), deformation, order=2)  # 1/s
-    first = fp.Slot("q1", fp.Exponential(rate=4.0, integral=False), deformation, order=4)
-    return fp.Slotted((second, first), schedule, blend=0.1)
+    second = fp.ComputedTorque(fp.Exponential(rate=4.0, integral=False), deformation)  # 1/s
+    first = fp.ComputedTorque(fp.Exponential(rate=4.0, integral=False), deformation)
+    return fp.Slotted({"q2": second, "q1": first}, schedule, blend=0.1)
 
 
 controllers = {

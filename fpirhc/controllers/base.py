@@ -110,7 +110,7 @@ def commanding_blocks(built: Built, judged: Sequence[Signal] = ()) -> tuple[list
     `judged` are solver statuses.
     """
     delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(built.before, "command")]
-    return [_limit_block(built), _judge_block(judged), warm_up_block(built.warm_up)], delays
+    return [_limit_block(built), judge_block(judged), warm_up_block(built.warm_up)], delays
 
 
 def warm_up_block(warm_up_cycles: float) -> Block:
@@ -248,7 +248,8 @@ def clip(u: Expression, lower: Iterable[float], upper: Iterable[float]) -> Expre
     return ca.vertcat(*entries)
 
 
-def _judge_block(judged: Sequence[Signal]) -> Block:
+def judge_block(judged: Sequence[Signal] = ()) -> Block:
+    """Block (whether the command was held, statuses of solvers) -> the worst status."""
     reads = Layout((scalar("_held"), *judged))
 
     def step(s: Signals) -> dict[str, Expression]:

@@ -66,9 +66,9 @@ class Built:
         """Return the reference's own signals inside a step."""
         return [getattr(s, signal.name) for signal in self.own]
 
-    def path(self, deformation: Deformation, name: str = "mirror") -> Path:
+    def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""
-        return believed_path(self.problem, deformation, name)
+        return believed_path(self.problem, deformation)
 
     def of_plant(self, plant: Plant) -> Built:
         """Return what blocks of another model of the same plant are made from."""

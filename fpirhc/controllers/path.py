@@ -15,7 +15,7 @@ whole cycles, those of the plant may be any. What really moves is in `fpirhc.sim
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -153,11 +153,11 @@ class Path:
         return Told(self.problem.plant, self.problem.signals, self.problem.period)
 
 
-def believed_path(problem: Problem, deformation: Deformation, name: str = "mirror") -> Path:
-    """Return the way of the commands as a deformation believes it; `name` begins the names of what is remembered."""
+def believed_path(problem: Problem, deformation: Deformation) -> Path:
+    """Return the way of the commands as a deformation believes it."""
     mirror, inputs = deformation.mirror, problem.plant.input
     last = Signal("_command_before", inputs.elements, inputs.units)
-    return Path(problem, name, last, Queue(mirror.cycles), whole(mirror.measurement), mirror.lag)
+    return Path(problem, "mirror", last, Queue(mirror.cycles), whole(mirror.measurement), mirror.lag)
 
 
 def stated_path(problem: Problem) -> Path:
@@ -168,47 +168,38 @@ def stated_path(problem: Problem) -> Path:
     return Path(problem, "observer", last, waits, whole(late.measurement / period))
 
 
-class Answers(NamedTuple):
-    """The responses that a model gives."""
-
-    response: Callable[[Expression, Expression, Expression], Expression]  # function of (state, input, parameters)
-    orders: Mapping[str, int]  # of the responses, by name
-    signal: Signal  # that holds them
-
-
 def model_block(path: Path) -> Block:
     """Block that writes '_modelled', the response that a model-referenced map reads in place of its last request."""
     estimator = path.problem.sensing.estimator
     return answer_block(path) if estimator.of_steps or estimator.shows_response else _twin(path)
 
 
-def answer_block(path: Path, answers: Answers | None = None) -> Block:
+def answer_block(path: Path) -> Block:
     """Block (measured state, last command, parameters) -> the model's response at what is measured: nothing can drift.
 
     On a map it is that of the cycle before. A response of relative order r of a map is complete r cycles after its command, so the
-    model's waits as long: modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then. `answers`: None: the controlled ones.
+    model's waits as long: modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then.
     """
-    plant = path.problem.plant
-    orders = {name: plant.chains[name] for name in plant.controlled_names}
-    given = answers or Answers(plant.equations.controlled_response, orders, plant.response_signal("_modelled"))
+    plant, modelled = path.problem.plant, path.problem.plant.response_signal("_modelled")
     age, start = response_age(plant), tuple(map(float, path.problem.start_state))
     before = replace(plant.state, name=f"{path.name}_state_before", start=start)
-    waits = [Queue(age * (order - 1)) for order in given.orders.values()]
-    queues = [w.memory(f"{path.name}_{name}", (name,), (0.0,)) for name, w in zip(given.orders, waits, strict=True)]
+    waits = [Queue(age * (plant.chains[name] - 1)) for name in plant.controlled_names]
+    names = [f"{path.name}_{name}" for name in plant.controlled_names]
+    queues = [w.memory(queue, (e,), (0.0,)) for queue, w, e in zip(names, waits, modelled.elements, strict=True)]
 
     def step(s: Signals) -> dict[str, Expression]:
         acted = path.acted(s)
         at = getattr(s, before.name if age else MEASURED)
         shown: list[Expression] = []
         later = {f"{before.name}_next": getattr(s, MEASURED)} if age else {}
-        values = ca.vertsplit(given.response(at, acted.end, acted.parameters))
-        for name, wait, value in zip(given.orders, waits, values, strict=True):
-            arrived, queue = wait.arrived(s, f"{path.name}_{name}", value)
+        values = ca.vertsplit(plant.equations.controlled_response(at, acted.end, acted.parameters))
+        for name, wait, value in zip(names, waits, values, strict=True):
+            arrived, queue = wait.arrived(s, name, value)
             shown, later = [*shown, arrived], later | queue
-        return {given.signal.name: ca.vertcat(*shown), **acted.later, **later}
+        return {modelled.name: ca.vertcat(*shown), **acted.later, **later}
 
     memory = (*path.memory, *((before,) * age), *(signal for queue in queues for signal in queue))
-    return Block(path.name, Layout((measured_state(plant), *path.reads)), Layout((given.signal,)), step, Layout(memory))
+    return Block(path.name, Layout((measured_state(plant), *path.reads)), Layout((modelled,)), step, Layout(memory))
 
 
 def _twin(path: Path) -> Block:

@@ -100,14 +100,6 @@ class Reference(Checked, ABC):
         t = kind(self.opaque).sym("t")
         return ca.Function("fpirhc_reference_ahead", [t], list(function(t + ahead)), ["t"], ["state", "response"])
 
-    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
-        """Function (t, own signals) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,)."""
-        del stages
-        matrix = kind(self.opaque)
-        t = matrix.sym("t")
-        values = time_derivatives(plant)(matrix(self.coordinates(t)[coordinate]), t, order)
-        return ca.Function("fpirhc_reference_derivatives", [t], [ca.densify(ca.vertcat(*values))])
-
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
         """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from t on; None without own signals."""
         del plant, nodes

@@ -16,7 +16,7 @@ from typing import NoReturn
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
+from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import Count, Positive
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.motion import sampling
@@ -89,13 +89,6 @@ class FilterBank:
         state, response = arranged(self.plant, self._chains(z, points[:, 0]))
         results = [ca.densify(state), ca.densify(response)]
         return ca.Function("fpirhc_reference_now", [ca.SX.sym("t"), own], results, ["t", "own"], ["state", "response"])
-
-    def chain(self, coordinate: str, order: int) -> ca.Function:
-        """Function (t, own signal) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,)."""
-        own = ca.SX.sym("own", self.own.size)
-        z, points = self._parts(own)
-        whole = self._chains(z, points[:, 0])[list(self.orders).index(coordinate)]
-        return ca.Function("fpirhc_reference_chain", [ca.SX.sym("t"), own], [ca.densify(whole[: order + 1])])
 
     def preview(self, times: np.ndarray) -> ca.Function:
         """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)): free motion, every node's set-points held."""
@@ -307,20 +300,6 @@ class Setpoint(Reference):
     def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signal) -> (state, response), now or after some time with the set-points held."""
         return self._bank(plant, stages).motion(ahead)
-
-    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
-        """Function (t, own signal) -> the coordinate's value and its derivatives up to `order`, shape (order + 1,).
-
-        Raises:
-            InvalidProblem: the order is above that of the filter.
-        """
-        own_order = self._orders(plant)[coordinate]
-        if order > own_order:
-            raise InvalidProblem(
-                f"reference: derivatives of '{coordinate}' are needed up to order {order}, and the filter of its set-point has "
-                f"order {own_order}; give Setpoint(order={order})"
-            )
-        return self._bank(plant, stages).chain(coordinate, order)
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
         """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""

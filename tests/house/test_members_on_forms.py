@@ -66,7 +66,7 @@ CONTROLLERS: dict[str, Callable[[int], Controller]] = {
     "RepetitiveControl": lambda order: fp.rivals.RepetitiveControl(TRACK, repeats=0.5, gain=0.2, smoothing=0.05),
     "ResolvedAccelerationRate": lambda order: fp.rivals.ResolvedAccelerationRate(6.0),
     "SlidingMode": lambda order: fp.rivals.SlidingMode(rate=6.0, gain=30.0, width=1.0),
-    "Slotted": lambda order: fp.Slotted([fp.Slot("y", TRACK, MAP)], fp.Periodic({"y": 1.0}), blend=0.1),
+    "Slotted": lambda order: fp.Slotted({"y": fp.ComputedTorque(TRACK, MAP)}, fp.Periodic({"y": 1.0}), blend=0.1),
 }
 ELSEWHERE = {  # members that need a plant of their own, with the tests that try them on forms
     "AdaptiveInverseDynamics": "controllers/test_adaptive_rivals.py",
@@ -121,7 +121,6 @@ REFUSED: dict[tuple[str, str], str] = {
     ("IntelligentPID", "at once"): "'y' is moved at once (order 0); it needs an order from 1 to the window",
     ("L1Adaptive", "at once"): "predicts a derivative below the response, and the command moves 'y' at once (order 0)",
     ("SlidingMode", "at once"): "the command moves 'y' at once (order 0), so there is no surface to slide on",
-    ("Slotted", "at once"): "the command moves 'y' at once (order 0), so a slot has no derivative to prescribe",
     ("BacksteppingMRAC", "at once"): "rates=()): expected positive numbers, 1/s",
     ("LyapunovMRAC", "at once"): f"proves that errors vanish by {AT_ONCE_SAID}",
     **{("LyapunovMRAC", form): f"proves that errors vanish by {STEPS_SAID}" for form in IN_STEPS},

@@ -182,12 +182,6 @@ def test_the_integral_of_order_zero_removes_a_constant_error() -> None:
 
 
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
-    "slot": (
-        lambda: simulated(
-            heated(element()), fp.Slotted([fp.Slot("power", fp.Exponential(rate=1.0))], fp.Periodic({"power": 1.0}), blend=0.1)
-        ),
-        r"the command moves 'power' at once \(order 0\)",
-    ),
     "estimator": (
         lambda: simulated(heated(element(), sensing=fp.Sensing(estimator=fp.PositionDifference())), STATIC),
         "need none; leave the estimator out",

@@ -67,8 +67,7 @@ def test_the_plants_of_the_box_are_drawn_by_its_mismatch():
 
 def test_a_controller_that_does_not_fit_is_a_no_with_its_reason():
     task = fp.load_problem("crane_slots")
-    controller = task.controllers["slots+FPI"]
-    wrong = replace(controller, slots=(replace(controller.slots[0], order=3), controller.slots[1]))
+    wrong = replace(task.controllers["slots+FPI"], schedule=fp.Periodic({"cart": 1.0}))
     found = fp.review(task.problem, {"it": wrong}, mismatch=0.0, seed=0)
     assert [a.key for a in found.answers["it"]] == ["fits"]
     assert not found.ready

@@ -24,7 +24,6 @@ def test_a_scale_goes_from_the_first_point():
     state, response = scaled.function(chain(2))(0.3)
     wanted = [3 - 1.5 * np.sin(0.6), -3 * np.cos(0.6), 6 * np.sin(0.6)]
     np.testing.assert_allclose(np.append(state.full().ravel(), float(response)), wanted, rtol=1e-12)
-    np.testing.assert_allclose(scaled.chain(chain(2), 0, "y", 2)(0.3).full().ravel(), wanted, rtol=1e-12)
     np.testing.assert_allclose(float(ca.evalf(scaled.coordinates(ca.SX(0.3))["y"])), wanted[0], rtol=1e-12)
 
 

@@ -212,12 +212,12 @@ def test_run_and_file_record_what_was_in_force(tmp_path):
     assert again.settings["setpoints"] == {"q1": [[0.0, 2.2], [0.0505, 2.3]], "q2": [list(p) for p in STEPS["q2"]]}
 
 
-def test_slots_need_the_order_of_their_chain():
-    """A slot differentiates its coordinate as often as its chain is long."""
-    task = fp.load_problem("two_tanks_slots")
-    problem = on(task.problem, fp.Setpoint({"h1": 5.0, "h2": 5.0}, rate=2.0), 0.01 * task.problem.duration)
-    with pytest.raises(InvalidProblem, match=r"'h2' are needed up to order 2.*order 1; give Setpoint\(order=2\)"):
-        fp.simulate(problem, task.controllers["slots"], seed=0, compiled=False)
+def test_a_slot_has_the_filter_of_its_chain():
+    """Of rate a and order r a filter at rest begins with y^(r) = a^r (w - y): r = 2 for the lower tank, 1 for the upper one."""
+    task, rate = fp.load_problem("two_tanks_slots"), 0.05
+    reference = fp.Setpoint({"h1": 2.5, "h2": 3.6}, rate=rate, start={"h1": 5.0, "h2": 5.0})
+    run = fp.simulate(on(task.problem, reference, 1.0), task.controllers["slots"], seed=0, compiled=False)
+    assert [run[f"nominal.{name}"][0] for name in ("h2", "h1")] == pytest.approx([rate**2 * -1.4, rate * -2.5])
 
 
 def test_predicted_says_that_set_points_are_late():

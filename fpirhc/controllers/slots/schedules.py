@@ -1,4 +1,4 @@
-"""Schedules of time slots: which slot a control cycle belongs to. Theory: docs/theory.md."""
+"""Schedules of time slots: whose turn a control cycle is. Theory: docs/theory.md."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from fpirhc.controllers.slots.slot import Channel
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import finite_number
@@ -27,16 +26,8 @@ class Schedule(Checked, ABC):
         """Note every mistake of the schedule for slots of these coordinates."""
 
     @abstractmethod
-    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        """Return the longest stretch of each slot that is certain before a run, s, by coordinate."""
-
-    def sequence(self, problem: Problem) -> tuple[tuple[str, float], ...]:  # noqa: ARG002
-        """Return one period as (coordinate, duration in s); empty where the schedule is not periodic."""
-        return ()
-
-    @abstractmethod
-    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
-        """Return a Block -> slot, its number."""
+    def block(self, names: Sequence[str], problem: Problem) -> Block:
+        """Return a Block -> slot, its place among the names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,27 +53,18 @@ class Periodic(Schedule):
             elif value < problem.period * (1 - 1e-9):
                 mistakes.add(f"{what} is {value:g} {unit}, shorter than one control cycle of {problem.period:g} {unit}")
 
-    def dwells(self, names: Sequence[str], problem: Problem) -> Mapping[str, float]:
-        if len(self.durations) == 1:
-            return dict.fromkeys(self.durations, problem.duration)
-        return {n: self.durations.get(n, 0.0) for n in names}
-
-    def sequence(self, problem: Problem) -> tuple[tuple[str, float], ...]:
-        return tuple((n, round(d / problem.period) * problem.period) for n, d in self.durations.items())
-
-    def block(self, problem: Problem, channels: Sequence[Channel]) -> Block:
+    def block(self, names: Sequence[str], problem: Problem) -> Block:
         """Return Block time -> slot."""
         starts, at = [], 0.0
-        for name, duration in self.durations.items():
-            starts.append((name, at))
+        for duration in self.durations.values():
+            starts.append(at)
             at += round(duration / problem.period)
-        numbers = {c.slot.coordinate: c.number for c in channels}
-        order = [numbers[name] for name, _ in starts]
+        order = [names.index(name) for name in self.durations]
 
         def step(s: Signals) -> dict[str, Expression]:
             cycle = ca.floor(s.time / problem.period + 0.5)
             phase, slot = ca.fmod(cycle, at), ca.SX(order[0])
-            for before, number, (_, start) in zip(order, order[1:], starts[1:], strict=False):
+            for before, number, start in zip(order, order[1:], starts[1:], strict=False):
                 slot += (number - before) * (phase > start - 0.5)
             return {"slot": slot}
 

@@ -86,15 +86,6 @@ class Shifted(Reference):
         shifted = state + places @ parts[-2]
         return ca.Function("fpirhc_target", [t, own], [shifted, response], ["t", "own"], ["state", "response"])
 
-    def chain(self, plant: Plant, stages: int, coordinate: str, order: int) -> ca.Function:
-        """Function (t, own signal) -> the coordinate's value and its derivatives up to `order`."""
-        t, own, parts, _ = self._symbols(plant, stages)
-        values = self.reference.chain(plant, stages, coordinate, order)(t, *parts[:-2])
-        if coordinate in plant.controlled_names:
-            unit = ca.DM(np.eye(order + 1)[:, :1])
-            values = values + unit * parts[-2][plant.controlled_names.index(coordinate)]
-        return ca.Function("fpirhc_target_chain", [t, own], [values])
-
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
         """Function (t, own signal) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
         t, own, parts, places = self._symbols(plant, len(nodes) - 1)
