@@ -38,9 +38,6 @@ def angle_gain(angle: np.ndarray) -> np.ndarray:
     return np.cos(angle) / p["l"] / (p["M"] + p["m"] * np.sin(angle) ** 2)
 
 
-# Schedules
-
-
 def pendulum_problem() -> fp.Problem:
     """A pendulum that follows a ramp with hardly enough torque."""
     return fp.Problem(
@@ -202,6 +199,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         ({"angle": replace(SLOT, deformation=fp.Affine(gain=0.3))}, {"angle": 1.0}),
         "slot 'angle': ",
     ),
+    "no law": (({"cart": fp.PID({"cart": 1.0})}, {"cart": 1.0}), "has no law whose response a map deforms"),
     "pairs of another slot": (
         ({"angle": replace(SLOT, deformation=fp.Paired(fp.Affine(gain=-0.3), cycles=2))}, {"angle": 1.0}),
         "Paired keeps pairs of earlier cycles, which belong to another slot after a switch",

@@ -10,21 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, Response, judge_block, like, reference_block, under_names, warm_up_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.path import measured_output
 from fpirhc.controllers.reference_states import with_reference
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.deformation.base import Deformation, Identity, LastRequest
 from fpirhc.deformation.model_referenced import settled
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
 from fpirhc.plant.motion import followed_units
@@ -46,7 +45,7 @@ class Slotted(Controller):
     turn, so an integral begins anew.
 
     Args:
-        slots: coordinate -> the computed torque that controls it. Its relative order is found from the symbols.
+        slots: coordinate -> what controls it, ComputedTorque(tracking, deformation). Its relative order is found from the symbols.
         schedule: chooses the active slot (Periodic).
         blend: time constant with which the offset of a switch decays, s; 0: the law is joined at once, and the command jumps
             one cycle after the switch.
@@ -57,7 +56,7 @@ class Slotted(Controller):
         our own.
     """
 
-    slots: Mapping[str, ComputedTorque]
+    slots: Mapping[str, Controller]
     schedule: Schedule
     blend: NotNegative
 
@@ -75,11 +74,11 @@ class Slotted(Controller):
         return Response(signal, problem.truth.function(names) if known else None)
 
     def with_deformation(self, deformation: Deformation) -> Slotted:
-        return replace(self, slots={n: replace(slot, deformation=deformation) for n, slot in self.slots.items()})
+        return replace(self, slots={n: slot.with_deformation(deformation) for n, slot in self.slots.items()})
 
     def with_defaults(self, problem: Problem) -> Slotted:
         self._check_names(problem)
-        slots = {n: cast(ComputedTorque, resolved(slot_problem(problem, n), slot)) for n, slot in self.slots.items()}
+        slots = {n: resolved(slot_problem(problem, n), slot) for n, slot in self.slots.items()}
         same = all(slot is self.slots[n] for n, slot in slots.items())
         return self if same else replace(self, slots=slots)
 
@@ -143,7 +142,7 @@ class Turn(NamedTuple):
 
     number: int  # place among the slots
     name: str  # of its coordinate
-    slot: ComputedTorque
+    slot: Controller
     built: Built  # the slot alone
 
     def own(self, name: str) -> str:
@@ -270,6 +269,8 @@ def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list
     """The slot's own blocks, under names of its own, and what they remember. Its law begins a run with every turn."""
     given, delays = one.slot.blocks(one.built)
     blocks = [b for b in with_reference(one.built.problem, given) if not {"status", "_warm_up_now"} & {*b.writes.names}]
+    if not any("_deformation" in b.writes.names for b in blocks):
+        raise NotSupported(f"slot '{one.name}': {one.slot} has no law whose response a map deforms; use ComputedTorque")
     delays = [d for d in delays if d.now.name not in _OF_ALL]
     told = {n for b in blocks for n in (*b.writes.names, *b.memory.names)} | {d.now.name for d in delays}
     names = {n: one.own(n) for n in (*told, *_OF_TURN, "realised", "warm_up")}
@@ -279,7 +280,7 @@ def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list
     begins, asked = names | {"warm_up": names["_goes_on"]}, names | {LastRequest.request: names["_request"]}
     cycle: list[Block] = []
     for block in blocks:
-        if "_deformed_unclipped" in block.writes.names:
+        if "_deformation" in block.writes.names:
             handover = under_names(_handover_block(one.built, one.slot.deformation, decay), names)
             cycle += [handover, under_names(_begun_anew(one.slot.deformation, block), asked)]
         else:
@@ -305,8 +306,7 @@ def _begun_anew(deformation: Deformation, block: Block) -> Block:
 def _handover_block(built: Built, deformation: Deformation, decay: float) -> Block:
     """Block that joins the slot's law to the last motion: what is desired, and the request that caused the last response.
 
-    A turn begins with the last command, so with a desired response for which the map asks for it: what a plain map has just
-    realised is what it desires, and a model-referenced one adds the difference of model and plant.
+    A turn begins with the last command: a plain map desires what it has just realised, a model-referenced one adds model - plant.
     """
     plant, response, models = built.plant, built.plant.equations.controlled_response, deformation.mirror.models
 
