@@ -16,12 +16,10 @@ import stat
 import subprocess
 import sys
 import tempfile
-import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from pathlib import Path
 
 import casadi as ca
@@ -37,10 +35,10 @@ _LINK = ("-shared", *(("-Wl,-z,defs",) if sys.platform == "linux" else ()))
 _ALIGNED = ("-falign-functions=64", "-falign-loops=64")
 # -fno-semantic-interposition: CasADi's small functions are no symbols that another library may replace, so they are inlined.
 _FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-fno-semantic-interposition")
+_SUFFIX = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _loaded: dict[str, ca.Function] = {}
 _begun: dict[Path, Future[None]] = {}  # compilers at work, by the library that they make
-_places: dict[Path, threading.Lock] = {}  # of objects that are being made
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +84,7 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
     if compiler is None:
         return Native(function, False, why_no_compiler())
     try:
-        library = _Library(function, compiler, _with_own(flags), calls)
+        library = _Library(function, compiler, flags, calls)
         if library.key not in _loaded:
             _loaded[library.key] = library.load()
         return Native(_loaded[library.key], True, "")
@@ -110,8 +108,8 @@ def compiling_ahead() -> Iterator[Callable[..., None]]:
         if compiler is None:
             return
         with contextlib.suppress(NoCode):
-            library = _Library(function, compiler, _with_own(flags), calls)
-            if library.key in _loaded or library.path in _begun or _is_intact(library.path):
+            library = _Library(function, compiler, flags, calls)
+            if library.key in _loaded or library.path in _begun or library.path.is_file():
                 return
             library.units  # noqa: B018 -- its C is written here: CasADi works in one thread
             _begun[library.path] = pool.submit(library.make)
@@ -125,24 +123,22 @@ def compiling_ahead() -> Iterator[Callable[..., None]]:
             _begun.pop(path, None)
 
 
-def _with_own(flags: Sequence[str]) -> Sequence[str]:
-    """The flags, and behind them those of the user."""
-    return (*flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", "")))
-
-
 def cache_folder() -> Path:
     """Folder of compiled libraries: the user's own one in FPIRHC_CACHE, which may be shared, or fpirhc in the user's cache.
 
-    It is a temporary folder of this process where that one cannot be written, or belongs to another user.
+    It is a temporary folder of this process where that one cannot be written, or others may write to it: what is in it is run.
     """
-    setting = os.environ.get("FPIRHC_CACHE")
+    setting, posix = os.environ.get("FPIRHC_CACHE"), os.name == "posix"
     try:
         if setting:
-            base = Path(setting) / own_name()
+            base = Path(setting) / (f"fpirhc-{os.geteuid()}" if posix else "fpirhc")
         else:
             base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
         base = base.absolute()  # a bare file name would be looked for in the system's library folders
-        private_folder(base)
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        facts = base.lstat()  # of a link itself: one of a stranger leads to what is not meant
+        if posix and (facts.st_uid != os.geteuid() or not stat.S_ISDIR(facts.st_mode) or facts.st_mode & 0o022):
+            return _temporary_folder()
         with tempfile.TemporaryFile(dir=base):
             return base
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
@@ -207,17 +203,12 @@ def _unit(source: str, compiler: str, more: Sequence[str]) -> _Unit:
 
 
 @cache
-def _processor() -> str:
-    """What Linux says of the processors; empty elsewhere."""
-    try:
-        return Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return ""
-
-
 def _machine_flags() -> tuple[str, ...]:
     """Flags for this machine: where it has wide registers all code uses them, and the optimisers' loops have no other code."""
-    return ("-DALWAYS_WIDE", "-mavx2") if platform.machine() == "x86_64" and " avx2 " in _processor() else ()
+    with contextlib.suppress(OSError):
+        if platform.machine() == "x86_64" and " avx2 " in Path("/proc/cpuinfo").read_text(encoding="utf-8"):
+            return ("-DALWAYS_WIDE", "-mavx2")
+    return ()
 
 
 @cache
@@ -238,6 +229,7 @@ class _Library:
     """
 
     def __init__(self, function: ca.Function, compiler: str, flags: Sequence[str], calls: int) -> None:
+        flags = *flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", ""))
         self._what, self._compiler, self._flags = (function, calls), compiler, flags
         self._link = (compiler, *flags, *_LINK)
         try:
@@ -246,7 +238,7 @@ class _Library:
             content = "\0".join(generate(function, calls))
         facts = (_writer(), str(calls), *self._link, _unit("", compiler, flags).key, content)
         self.key = hashlib.sha256("\0".join(facts).encode()).hexdigest()[:32]
-        self.path = cache_folder() / f"{self.key}{_suffix()}"
+        self.path = cache_folder() / f"{self.key}{_SUFFIX}"
 
     @cached_property
     def units(self) -> tuple[_Unit, ...]:
@@ -255,16 +247,12 @@ class _Library:
         texts = own.replace(NAME, f"fpirhc_{self.key}"), *drivers
         return tuple(_unit(text, self._compiler, self._flags) for text in texts)
 
-    def make(self) -> None:
-        """Compile it into the cache."""
-        _compile(self.units, self._link, self.path)
-
     def load(self) -> ca.Function:
-        """Return it from the cache, compiled before where it is not there, or was made on another system."""
+        """Return it from the cache, compiled before where it is not there, or cannot be loaded on this system."""
         begun = _begun.pop(self.path, None)
         if begun is not None:
             wait([begun])
-        if _is_intact(self.path):
+        if self.path.is_file():
             with contextlib.suppress(RuntimeError):
                 return ca.external(f"fpirhc_{self.key}", str(self.path))
         try:
@@ -277,123 +265,34 @@ class _Library:
                 f"the compiled library cannot be kept in '{self.path.parent}' or loaded: {error}"
             ) from None
 
-
-def _suffix() -> str:
-    return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
-
-
-def _checksum_file(path: Path) -> Path:
-    return path.with_suffix(".sha256")
-
-
-def _is_intact(path: Path) -> bool:
-    try:
-        return hashlib.sha256(read_own(path)).hexdigest().encode() == read_own(_checksum_file(path))
-    except OSError:
-        return False
+    def make(self) -> None:
+        """Compile it into the cache, its files side by side: its own one, and drivers, whose objects other libraries share."""
+        folder = self.path.parent
+        with tempfile.TemporaryDirectory(prefix="fpirhc-") as work, ThreadPoolExecutor(os.cpu_count()) as pool:
+            places = [Path(work) / "own.o", *(folder / f"{unit.key}.o" for unit in self.units[1:])]
+            list(pool.map(_compile, self.units, places, [work] * len(places)))
+            _made([*self._link, *map(str, places), "-lm"], self.path, work)
 
 
-def _compile(units: Sequence[_Unit], link: Sequence[str], path: Path) -> None:
-    """Compile into a folder of its own beside the cache entry, files side by side, then link and put the library into place.
-
-    The first file is of this library alone. Others are drivers, whose objects are kept for the libraries that share them. What
-    killed processes left behind is removed here and not where a library is found: a cache of thousands of files is slow to list.
-    """
-    _remove_abandoned(path.parent)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=BUILDING, ignore_cleanup_errors=True) as work:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            own = pool.submit(_object, Path(work), 0, units[0])
-            shared = pool.map(partial(_driver, path.parent, Path(work)), range(1, len(units)), units[1:])
-            objects = [own.result(), *shared]
-        library = Path(work) / f"model{_suffix()}"
-        _succeed([*link, "-o", str(library), *map(str, objects), "-lm"], library, work)
-        _publish(library, path)
+def _compile(unit: _Unit, place: Path, work: str) -> None:
+    if not place.is_file():
+        text = Path(work) / f"{unit.key}.c"
+        text.write_text(unit.source, encoding="utf-8")
+        _made([*unit.command, str(text)], place, work)
 
 
-def _driver(folder: Path, work: Path, number: int, unit: _Unit) -> Path:
-    """The object of a driver: one of two threads that need the same one compiles it, and the other one waits."""
-    place = folder / f"{unit.key}.o"
-    with _places.setdefault(place, threading.Lock()):
-        if not _is_intact(place):
-            _publish(_object(work, number, unit), place)
-    return place
-
-
-def _object(work: Path, number: int, unit: _Unit) -> Path:
-    text, made = (work / f"part{number}{suffix}" for suffix in (".c", ".o"))
-    text.write_text(unit.source, encoding="utf-8")
-    _succeed([*unit.command, "-o", str(made), str(text)], made, str(work))
-    return made
-
-
-def _succeed(command: Sequence[str], made: Path, work: str) -> None:
-    process = _run(command)
-    if process.returncode != 0 or not made.is_file():
-        message = _first_error(process.stderr.replace(work + os.sep, "")) or f"exit code {process.returncode}"
-        raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
-
-
-def _publish(made: Path, path: Path) -> None:
-    """Put a file and its checksum into their places in the cache."""
-    checksum = made.with_suffix(".sha256")
-    checksum.write_text(hashlib.sha256(made.read_bytes()).hexdigest(), encoding="ascii")
-    made.chmod(0o700)
-    checksum.chmod(0o600)
-    made.replace(path)
-    checksum.replace(_checksum_file(path))
+def _made(command: Sequence[str], place: Path, work: str) -> None:
+    """Run a compiler and put what it makes into its place, whole or not at all."""
+    with tempfile.TemporaryDirectory(dir=place.parent, prefix="building-", ignore_cleanup_errors=True) as near:
+        made = Path(near) / place.name
+        process = _run([*command, "-o", str(made)])
+        if process.returncode != 0 or not made.is_file():
+            message = _first_error(process.stderr.replace(work + os.sep, "")) or f"exit code {process.returncode}"
+            raise CompileError(f"the C compiler '{command[0]}' failed: {message}")
+        made.replace(place)
 
 
 def _first_error(messages: str) -> str:
     """The line that names the error, not the line that names the function around it."""
     lines = messages.strip().splitlines()
     return next((line for line in lines if "error" in line or "undefined" in line), lines[0] if lines else "")
-
-
-BUILDING = "building-"  # beginning of the names of folders in which something is being compiled
-_ABANDONED = 3600.0  # s; no compilation takes that long, so its process was killed
-
-
-def private_folder(folder: Path) -> Path:
-    """Create the folder where needed, and close it to others.
-
-    Raises:
-        OSError: it cannot be made, or it belongs to another user.
-    """
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    facts = folder.stat()
-    if not _is_own(facts) or not _is_own(folder.lstat()):  # a link of a stranger leads to what is not meant
-        raise PermissionError(f"'{folder}' belongs to another user")
-    if os.name == "posix" and stat.S_IMODE(facts.st_mode) & 0o077:
-        folder.chmod(0o700)
-    return folder
-
-
-def own_name() -> str:
-    """Return the name of the user's folder in a folder that several users may share."""
-    return f"fpirhc-{os.geteuid()}" if os.name == "posix" else "fpirhc"
-
-
-def read_own(path: Path) -> bytes:
-    """Return the contents of a file that nobody else can have written."""
-    # Without O_NONBLOCK the opening of a FIFO would wait for a writer.
-    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-    with os.fdopen(os.open(path, flags), "rb") as file:
-        facts = os.fstat(file.fileno())
-        shared = os.name == "posix" and stat.S_IMODE(facts.st_mode) & 0o022
-        if not stat.S_ISREG(facts.st_mode) or not _is_own(facts) or shared:
-            raise PermissionError(f"'{path}' is no file of the user's own, or others may write to it")
-        return file.read()
-
-
-def _is_own(facts: os.stat_result) -> bool:
-    return os.name != "posix" or facts.st_uid == os.geteuid()
-
-
-def _remove_abandoned(folder: Path) -> None:
-    for path in folder.glob(f"{BUILDING}*"):
-        try:
-            facts = path.lstat()
-        except OSError:
-            continue  # another process has just removed it
-        if stat.S_ISDIR(facts.st_mode) and _is_own(facts) and time.time() - facts.st_mtime > _ABANDONED:
-            shutil.rmtree(path, ignore_errors=True)

@@ -4,7 +4,7 @@ import pytest
 from helpers.attack.artefacts import ARTEFACTS, flipped
 from helpers.attack.commands import prepared, random_line, raw_end
 from helpers.attack.faults import FAULTS
-from helpers.attack.files import flipped_bits, killed_compilations
+from helpers.attack.files import killed_compilations
 from helpers.attack.harness import PROBLEMS, Bench, shipped
 from helpers.machine import needs_compiler
 
@@ -31,13 +31,6 @@ def test_every_fault_of_the_loop(problem):
             bench = Bench(task, controller)
             wrong |= {f"{label}: {fault.name}": bench.outcome(fault).wrong for fault in FAULTS}
     assert {k: v for k, v in wrong.items() if v} == {}
-
-
-@needs_compiler
-@pytest.mark.parametrize("flips", [40, pytest.param(400, marks=pytest.mark.slow)])
-def test_flipped_bits_of_a_library_are_noticed(flips, tmp_path):
-    """No library with a flipped bit, and none with a flipped bit in its checksum, is loaded."""
-    assert flipped_bits(tmp_path, flips, seed=flips) == 0
 
 
 @pytest.mark.slow

@@ -1,12 +1,10 @@
 """Compiled loops: the same numbers, a cache that is never wrong, and a fallback that says why."""
 
-import hashlib
 import os
 import stat
 import struct
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -143,69 +141,41 @@ def test_cache_is_by_content_and_shared_by_processes(cache):
 
 
 @needs_compiler
-@pytest.mark.parametrize("damage", ["empty", "overwritten", "no checksum"])
-def test_damaged_library_is_built_again(cache, damage):
-    """Whatever a crash leaves in its place: the answer is right and the cache is whole again."""
+@pytest.mark.parametrize("content", [b"", b"not a library"])
+def test_damaged_library_is_built_again(cache, content):
+    """What a full disk leaves in its place: the answer is right and the cache is whole again."""
     assert other_process(cache, 4.5).wait() == 0
     [path] = libraries(cache)
-    content, checksum = path.read_bytes(), path.with_suffix(".sha256")
-    if damage == "no checksum":
-        checksum.unlink()
-    else:
-        path.write_bytes(b"" if damage == "empty" else b"not a library")
+    begin = path.read_bytes()[:4]
+    path.write_bytes(content)
     assert other_process(cache, 4.5).wait() == 0
-    assert path.read_bytes()[:4] == content[:4]
-    assert checksum.exists()
+    assert path.read_bytes()[:4] == begin
 
 
 @needs_compiler
 @needs_posix
-@pytest.mark.parametrize(
-    "who", ["open to others", "open to a group", "of another user", "a link", "checksum open", "checksum a link", "checksum a pipe"]
-)  # fmt: skip
+@pytest.mark.parametrize("who", ["open to others", "open to a group", "of another user", "a link"])
 def test_library_that_others_may_have_written_is_not_run(cache, who):
-    """One that computes with another number, with a fitting checksum: it would differ from the virtual machine."""
+    """One that computes with another number would differ from the virtual machine: a folder of others is not read."""
     number = 4.512345678901
     assert other_process(cache, number).wait() == 0
     [path] = libraries(cache)
-    checksum, content = path.with_suffix(".sha256"), path.read_bytes()
+    content = path.read_bytes()
     planted = content.replace(struct.pack("<d", number), struct.pack("<d", 1 + number))
     assert planted != content
     path.unlink()
     path.write_bytes(planted)
-    checksum.write_text(hashlib.sha256(planted).hexdigest())
-    one = checksum if who.startswith("checksum") else path
-    if who.endswith("a link"):
-        one.rename(one.with_name("elsewhere"))
-        one.symlink_to(one.with_name("elsewhere"))
-    elif who.endswith("a pipe"):
-        one.unlink()
-        os.mkfifo(one)
-    elif who == "of another user" and os.geteuid() == 0:  # only root can give a file away
-        os.chown(one, 65534, 65534)
+    assert other_process(cache, number).wait() != 0  # it is run from a folder of one's own
+    own = path.parent
+    if who == "a link":
+        own.rename(own.with_name("elsewhere"))
+        own.symlink_to(own.with_name("elsewhere"))
+    elif who == "of another user" and os.geteuid() == 0:  # only root can give a folder away
+        os.chown(own, 65534, 65534)
     else:
-        one.chmod(0o775 if who == "open to a group" else 0o777)
+        own.chmod(0o775 if who == "open to a group" else 0o777)
     assert other_process(cache, number).wait() == 0
-    assert path.read_bytes() != planted
-    for one in (path, checksum):
-        facts = one.lstat()
-        assert stat.S_ISREG(facts.st_mode)
-        assert facts.st_uid == os.geteuid()
-        assert not facts.st_mode & 0o022
-
-
-@needs_compiler
-def test_what_killed_processes_left_behind_is_removed(cache):
-    """The next compilation removes a folder that is older than any compilation, and no other."""
-    run(5.5)
-    own = libraries(cache)[0].parent
-    for name, age in (("building-old", 7200.0), ("building-new", 10.0), ("mine", 7200.0)):
-        (own / name).mkdir()
-        (own / name / "model.c").write_text("")
-        then = time.time() - age
-        os.utime(own / name, (then, then))
-    run(5.75)
-    assert sorted(p.name for p in own.iterdir() if p.is_dir()) == ["building-new", "mine"]
+    assert path.read_bytes() == planted
 
 
 @needs_compiler

@@ -1,4 +1,4 @@
-"""Attacks on the cache of compiled libraries: flipped bits, and processes that are killed while they compile."""
+"""Attacks on the cache of compiled libraries: processes that are killed while they compile."""
 
 import os
 import subprocess
@@ -19,25 +19,6 @@ assert ready.compiled, ready.reason
 value = np.array([0.5, 1.0, 2.0])
 assert np.array_equal(ready.function(value).full(), function(value).full())
 """
-
-
-def flipped_bits(folder: Path, count: int, *, seed: int) -> int:
-    """Flip one bit at a time in a compiled library or its checksum; return how many flips go unnoticed."""
-    from fpirhc.symbolic import native as module
-
-    _compiled(folder)
-    library = next(p for p in folder.rglob("*") if p.suffix in {".so", ".dylib", ".dll"})
-    generator, unnoticed = np.random.default_rng(seed), 0
-    for path in (library, library.with_suffix(".sha256")):
-        whole = path.read_bytes()
-        for place in generator.integers(0, 8 * len(whole), size=count // 2):
-            damaged = bytearray(whole)
-            damaged[place // 8] ^= 1 << (place % 8)
-            path.write_bytes(damaged)
-            unnoticed += module._is_intact(library)
-        path.write_bytes(whole)
-    assert module._is_intact(library), "the whole library is refused"
-    return unnoticed
 
 
 def killed_compilations(folder: Path, count: int, *, seed: int) -> int:
