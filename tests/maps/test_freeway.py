@@ -11,7 +11,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.kinds import slow_but
 
 import fpirhc as fp
 
@@ -101,7 +100,8 @@ def by_hand(state: np.ndarray, rate: float, demands: tuple[float, float]) -> np.
 # The time spent
 
 
-@pytest.mark.parametrize("which", slow_but(("ipopt", "shipped", "one start"), "shipped"))
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["ipopt", "shipped", "one start"])
 def test_an_economic_plan_is_the_published_run(which: str) -> None:
     """The rates of 17 minutes and the time spent after 96 steps of sym-metanet's metering, which IPOPT solves there."""
     shipped, rates = (

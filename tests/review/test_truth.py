@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from abroad import load
 from helpers import reviewed, tasks
+from helpers.kinds import slow_but
 from helpers.reviewed import ball, biased, levitation, plans, turntable
 
 import fpirhc as fp
@@ -195,7 +196,7 @@ def said(name: str) -> dict[tuple[str, str], Any]:
 LONG = ("two pend", "a servo", "an own", "an inverse", "a limit of", "an unst", "a dead time")  # 4 s and more
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow if n.startswith(LONG) else ()) for n in CASES])
+@pytest.mark.parametrize("name", slow_but(CASES, *(n for n in CASES if not n.startswith(LONG))))
 def test_what_is_said_is_true(name):
     """It prints the table: pytest -k is_true -rP."""
     case, found = CASES[name], said(name)

@@ -151,7 +151,7 @@ def test_a_cluster_of_dask_gives_the_rows_of_one_process(task):
     assert len(kept()) == 1 + 24
 
 
-@pytest.mark.parametrize("processes", ["1", "2"])
+@pytest.mark.parametrize("processes", ["2", pytest.param("1", marks=pytest.mark.slow)])
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(task, processes):
     """The command is interrupted once rows are there, with its processes, as a terminal does it: code 130 and one line."""
     words = ["study", "line.py", "--draws", "15", "--mismatch", "20", "--seed", "5", "--no-compile", "--json"]

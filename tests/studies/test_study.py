@@ -315,7 +315,6 @@ def test_the_cost_can_be_judged():
 @pytest.mark.parametrize(
     ("words", "count", "scales"),
     [
-        ("--draws 3 --mismatch 20%", 9, []),
         ("--cases heavy far", 9, []),
         ("--over deformation.gain=-1:-0.2:3 exact.b=1:2:2", 18, []),
         ("--over exact.b=1:2:3:log", 9, ["log"]),

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
+from helpers.kinds import slow_but
 
 import fpirhc as fp
 from fpirhc.__main__ import main
@@ -310,7 +311,7 @@ ABROAD: dict[str, tuple[dict[str, Any], dict[str, str], dict[str, float]]] = {
 }
 
 
-@pytest.mark.parametrize("name", ABROAD)
+@pytest.mark.parametrize("name", slow_but(ABROAD, "quadruple_tank", "drug_infusion", "own_map"))
 def test_plants_of_others_are_judged_by_what_happened(name):
     changes, outcomes, ratios = ABROAD[name]
     task = abroad.load(name)
