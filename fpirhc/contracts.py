@@ -13,8 +13,7 @@ from fpirhc.controllers.contract import ControllerWrapper as ControllerWrapper
 from fpirhc.controllers.contract import PlantModel as PlantModel
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.deformation.base import Deformation as Deformation
-from fpirhc.deformation.base import Iteration as Iteration
-from fpirhc.deformation.base import Pairing as Pairing
+from fpirhc.deformation.base import Form as Form
 from fpirhc.deformation.base import Wrapper as Wrapper
 from fpirhc.horizon.problem import reduced_gradient as reduced_gradient
 from fpirhc.learning.estimators.base import ParameterEstimator as ParameterEstimator

@@ -16,6 +16,7 @@ from fpirhc.certificate.tube import Centre, Chains, Expressions, Sweep, Tube
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import refuse, resolved, tracking_law
 from fpirhc.deformation.affine import Affine
+from fpirhc.deformation.base import Form
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import NotSupported
 from fpirhc.fields.checked import checked_call
@@ -137,7 +138,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     if ready.learns or ready.inner is not None or ready.deforms != "response":
         yield "its model, state or command is changed beside the deformation"
     plain = type(deformation) is ModelReferenced and type(deformation.map) is Affine and deformation.map.weights is None
-    if not plain or not deformation.mirror.bare:
+    if not plain or deformation.form != Form("model"):
         yield "the deformation must be ModelReferenced(Affine(gain=...)) without dead time, lag, weights or filter"
     if planner is None and tracking_law(ready) is None:
         yield "it has no tracking law"

@@ -41,7 +41,7 @@ def check_deformation(
     """Check every law on a deformation that iterates; Identity does not iterate.
 
     Laws about one pair of request and response are tried where the map's facts say that it is given one: without pairing and
-    mirror.
+    model.
 
     Args:
         deformation: the deformation.
@@ -54,8 +54,7 @@ def check_deformation(
         AssertionError: the first law that does not hold, in one sentence.
         FpirhcError: the map is not complete, a Sigmoid without scale for instance.
     """
-    paired = deformation.iteration.pairing is not None or deformation.mirror.share
-    laws = ANY if paired else STEPS
+    laws = ANY if deformation.form.pairs else STEPS
     keep(deformation, _Map(deformation, deformation, tuple(elements), amplitude), laws, seed)
     settled = deformation.with_scale_for(RequestChange(amplitude, sudden=True))
     keep(deformation, _Map(deformation, settled, ("q",), amplitude), FACTS, seed)
@@ -107,8 +106,8 @@ class _Map:
     @cached_property
     def wait(self) -> int:
         """Cycles after which every pair is one of this run."""
-        pairing = self.deformation.iteration.pairing
-        return 0 if pairing is None else int(np.ceil(pairing.cycles)) + pairing.uncertainty + 2
+        late = int(np.ceil(self.deformation.form.late))
+        return 2 * late + 2 if late else 0
 
     def after(self, errors: Array) -> Array:
         """Requests after every cycle with these response errors; the first is zero."""
@@ -128,7 +127,7 @@ class _Map:
     @property
     def linear(self) -> bool:
         """Whether it answers an error in the same way at any time."""
-        return self.deformation.iteration.constant and self.deformation.adapts
+        return self.deformation.form.steady and self.deformation.adapts
 
 
 def fixed_point_stays(trial: _Map, generator: np.random.Generator) -> None:
@@ -271,18 +270,27 @@ def gain_is_proportional_to_its_field(trial: _Map, generator: np.random.Generato
     hold(told, f"with {factor:.3g} times its effective gain its '{before.gain_name}' is {other}, and was {one}")
 
 
-def exact_model_is_left_alone(trial: _Map, generator: np.random.Generator) -> None:
-    """With a `mirror` it is given the model's response, and where this is the plant's the request is the desired response."""
-    if not trial.deformation.mirror.share:
-        return
-    memory = trial.layout.start()
-    for response, desired in generator.normal(size=(_WARM, 2)) * trial.amplitude:
+def compares_as_it_says(trial: _Map, generator: np.random.Generator) -> None:
+    """A right model leaves the desired response alone, an increment passes a jump of it on, and a request without error stays."""
+    form, memory, jump = trial.deformation.form, trial.layout.start(), trial.amplitude
+    for response, desired in generator.normal(size=(_WARM, 2)) * jump if form.modelled else ():
         request, memory = trial.function(response, response, desired, memory)
         missed = abs(float(request) - desired)
         hold(
-            missed <= 1e-9 * trial.amplitude,
+            missed <= 1e-9 * jump,
             f"given the model's response as the plant's, the request misses the desired one by {missed:.3g}",
         )
+    if form.modelled or not trial.deformation.adapts:
+        return
+    for _ in range(_WARM + trial.wait):
+        memory = trial.function(0.0, 0.0, 0.0, memory)[1]
+    passes = form.compares == "increment"
+    request, expected = float(trial.function(0.0, 0.0 if passes else jump, jump, memory)[0]), jump if passes else 0.0
+    hold(
+        abs(request - expected) <= 1e-9 * jump,
+        f"it compares with the {form.compares}, but after a jump of the desired response to {jump:g} it requests {request:.4g} and "
+        f"not {expected:g}",
+    )
 
 
 def shown_is_remembered(trial: _Map, generator: np.random.Generator) -> None:  # noqa: ARG001
@@ -310,13 +318,11 @@ def gain_and_pairs_are_told(trial: _Map, generator: np.random.Generator) -> None
     deformation, gain = trial.settled, trial.deformation.effective_gain()
     if not trial.linear:
         return
-    pairing, size = deformation.iteration.pairing, deformation.iteration.channels or 1
-    late = pairing.cycles if pairing else 0.0
-    sign = math.copysign(1.0, gain)
+    form, size = deformation.form, deformation.form.channels or 1
+    late, sign = form.late, math.copysign(1.0, gain)
     small, plant = deformation.with_effective_gain(sign * _SMALL_GAIN), sign * np.eye(size)
-    weights = deformation.iteration.weights
-    if weights is not None:
-        plant = plant @ np.linalg.inv(np.array(weights))
+    if form.weights is not None:
+        plant = plant @ np.linalg.inv(np.array(form.weights))
     left = radius(small, plant, [delayed(np.ones(1), late)] * size)
     share = (1 - left) * (1 + late) / _SMALL_GAIN
     hold(
@@ -354,7 +360,7 @@ FACTS = (
     adaptation_is_told,
     gain_and_pairs_are_told,
     gain_is_proportional_to_its_field,
-    exact_model_is_left_alone,
+    compares_as_it_says,
     shown_is_remembered,
 )
 LAWS = (*STEPS, *FACTS)

@@ -39,7 +39,7 @@ def radius(deformation: Deformation, jacobian: Array, weights: Sequence[Array]) 
     """
     size, longest = len(jacobian), max(map(len, weights))
     seen = np.hstack([np.diag([w[j] if j < len(w) else 0.0 for w in weights]) for j in range(longest)])
-    given = seen if deformation.mirror.share else np.eye(size, size * longest)
+    given = seen if deformation.form.modelled else np.eye(size, size * longest)
     on_request, on_response, on_memory = np.split(_slopes(deformation, size), [size, 2 * size], axis=1)
     now = on_request @ given + on_response @ seen @ np.kron(np.eye(longest), jacobian)
     kept = np.eye(size * (longest - 1), size * longest)

@@ -17,7 +17,7 @@ from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.path import model_block
-from fpirhc.deformation.base import Deformation, LastRequest
+from fpirhc.deformation.base import Deformation, Form
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
@@ -28,7 +28,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar,
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
-_REQUEST = LastRequest.request
+_REQUEST = Form().request
 _ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
 
 
@@ -138,7 +138,7 @@ def deform_block(
         largest: response of every controlled coordinate that the limits of the inputs allow; empty: any.
     """
     memory = deformation.memory(plant.controlled_names)
-    request_before = deformation.mirror.request
+    request_before = deformation.form.request
     responses = [plant.response_signal(name) for name in (request_before, "realised", "desired")]
     reads = (*responses, scalar("warm_up"))
 

@@ -56,7 +56,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     changes its gain on line begins where it likes.
     """
     gain = deformation.effective_gain()
-    if gain == 0 or not deformation.iteration.constant or not _REFUSES.get():
+    if gain == 0 or not deformation.form.steady or not _REFUSES.get():
         return
     spectrum, jacobian = _at_start(problem, deformation), _jacobian_at_start(problem)
     if spectrum is None:
@@ -64,8 +64,7 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     seen = _delayed_weights(problem)
     if seen is None and abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
         return
-    pairing = deformation.iteration.pairing
-    weights = seen or [delayed(np.ones(1), pairing.cycles if pairing else 0.0)] * len(jacobian)
+    weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)
     if converges(deformation, jacobian, weights):
         return
     if seen is None and not deformation.memory(problem.plant.controlled_names).size:
@@ -75,7 +74,11 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
         raise _too_large(deformation, spectrum, largest)
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
-    pairs = {d: Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0 and pairing is None}
+    pairs = {
+        d: Paired(deformation, cycles=d)
+        for d in (delay, delay + 0.5, delay - 0.5)
+        if d >= 0 and not deformation.form.pairs
+    }
     best = next((d for d, one in pairs.items() if converges(one, jacobian, weights)), None)
     raise _too_late(problem, deformation, largest, best)
 
@@ -132,7 +135,7 @@ def _at_start(problem: Problem, deformation: Deformation) -> Spectrum | None:
     jacobian = _jacobian_at_start(problem)
     if not np.isfinite(jacobian).all():
         return None
-    spectrum = Spectrum(np.linalg.eigvals(deformation.iteration.weighted(jacobian)))
+    spectrum = Spectrum(np.linalg.eigvals(deformation.form.weighted(jacobian)))
     return spectrum if np.abs(spectrum.eigenvalues).max() > _NOTHING else None
 
 
@@ -196,25 +199,19 @@ def _of_outputs(problem: Problem) -> Iterator[str]:
         )
 
 
-def _what(deformation: Deformation) -> str:
-    """What the map has one of per controlled coordinate."""
-    iteration = deformation.iteration
-    return "weights" if iteration.weights is not None and iteration.channels == len(iteration.weights) else "dead times"
-
-
 def _of_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
     """Reasons against the form, the first one first."""
-    plant, channels, mirror = problem.plant, deformation.iteration.channels, deformation.mirror
-    names = plant.controlled_names
-    if channels not in (None, len(names)):
+    plant, form, names = problem.plant, deformation.form, problem.plant.controlled_names
+    given = "dead times" if form.weights is None else "weights"
+    if form.channels not in (None, len(names)):
         yield (
-            f"{type(deformation).__name__}: {channels} {_what(deformation)} are given, but the plant has {len(names)} "
+            f"{type(deformation).__name__}: {form.channels} {given} are given, but the plant has {len(names)} "
             f"controlled coordinates ({', '.join(names)}); give one for each, or one number for all"
         )
     yield from against_wrappers(deformation)
-    for setting, values in (("cycles", every(mirror.cycles)), ("lag", every(mirror.lag))):
-        if len(values) not in (1, len(plant.inputs)):
+    for setting, values in (("cycles", every(form.cycles)), ("lag", every(form.lag))):
+        if form.modelled and len(values) not in (1, len(plant.inputs)):
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
-    if plant.step is not None and mirror.lags:
+    if plant.step is not None and any(every(form.lag)):
         yield f"{type(deformation).__name__}: a map has no lag; write an actuator as a state of the map"

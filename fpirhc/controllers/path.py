@@ -155,9 +155,9 @@ class Path:
 
 def believed_path(problem: Problem, deformation: Deformation) -> Path:
     """Return the way of the commands as a deformation believes it."""
-    mirror, inputs = deformation.mirror, problem.plant.input
+    form, inputs = deformation.form, problem.plant.input
     last = Signal("_command_before", inputs.elements, inputs.units)
-    return Path(problem, "mirror", last, Queue(mirror.cycles), whole(mirror.measurement), mirror.lag)
+    return Path(problem, "mirror", last, Queue(form.cycles), whole(form.measurement), form.lag)
 
 
 def stated_path(problem: Problem) -> Path:

@@ -9,7 +9,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.deformation.base import Deformation, Iteration
+from fpirhc.deformation.base import Deformation, Form
 from fpirhc.describe import as_written
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import NotZero, finite_number
@@ -54,10 +54,8 @@ class Affine(Deformation):
         return as_written(self)
 
     @property
-    def iteration(self) -> Iteration:
-        if self.weights is None:
-            return Iteration()
-        return Iteration(channels=len(self.weights), weights=self._rows)
+    def form(self) -> Form:
+        return Form(weights=None if self.weights is None else self._rows)
 
     @property
     def _rows(self) -> tuple[tuple[float, ...], ...]:

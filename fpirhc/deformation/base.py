@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -20,76 +20,63 @@ from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.symbolic.layout import Expression, Layout
+from fpirhc.symbolic.open import stays
+from fpirhc.task.dead_time import Cycles, every, several
 
 Wrapping = TypeVar("Wrapping")
 
 
 @dataclass(frozen=True)
-class Mirror:
-    """The believed way of a command to its response: the model's response passes it, to be as late as the plant's.
+class Form:
+    """With what a map compares a response, and how late it believes the response to be.
 
     Args:
-        cycles: dead time of the inputs, control cycles; a tuple gives one per input.
+        compares: "request": with the request that caused it; "increment": the same, and the request is the desired response and a
+            deformation, which is what iterates; "model": with the model's response, which `step` is given as its request.
+        cycles: dead time between a request and its response beyond the cycle that every loop has, control cycles; a tuple gives
+            every channel its own.
         measurement: dead time of the measurement, cycles.
         lag: time constant of the actuators, s; a tuple gives one per input.
+        weights: W by rows where the gain is a matrix, r+ = r - a W (f - d); None: the one matrix.
+        steady: whether it is the same map in every cycle, and for small errors too; False for gains that change on line.
     """
 
-    request: ClassVar[str] = "_modelled"  # the signal that the map is given as the request which caused the response
-    models: ClassVar[tuple[str, ...]] = ("_modelled",)  # signals of a model that the map reads
-    share: ClassVar[float] = 1.0  # of the model's response in the response error, (f - d) - share (f^ - d)
-
-    cycles: float | tuple[float, ...] = 0.0
+    compares: Literal["request", "increment", "model"] = "request"
+    cycles: Cycles = 0.0
     measurement: float = 0.0
     lag: float | tuple[float, ...] = 0.0
+    weights: tuple[tuple[float, ...], ...] | None = None
+    steady: bool = True
 
     @property
-    def bare(self) -> bool:
-        """Whether nothing is believed of the way: the command acts at once."""
-        return self == type(self)()
-
-    def require_last_request(self, refusal: str) -> None:
-        """Raise where a map is not given its own last request, with the refusal; a plan, or a law on commands, has nothing else.
-
-        Raises:
-            NotSupported: a model-referenced form.
-        """
-        for reason in self.against_last_request(refusal):
-            raise NotSupported(reason)
-
-    def against_last_request(self, refusal: str) -> tuple[str, ...]:
-        """The refusal of a place that has only the last request to give, such as a plan; empty where a map wants just that."""
-        return (refusal,)
+    def modelled(self) -> bool:
+        """Whether it needs the model's response."""
+        return self.compares == "model"
 
     @property
-    def lags(self) -> bool:
-        """Whether an actuator is believed to lag."""
-        return any(self.lag) if isinstance(self.lag, tuple) else self.lag > 0
+    def request(self) -> str:
+        """The signal that `step` is given as its request."""
+        return "_modelled" if self.modelled else "_deformed_last"
 
+    @property
+    def late(self) -> float:
+        """Cycles that the response is believed to be late, the most of several."""
+        return max(every(self.cycles)) + self.measurement
 
-class LastRequest(Mirror):
-    """No model: a map is given the last request."""
+    @property
+    def pairs(self) -> bool:
+        """Whether it says itself to which request a response belongs."""
+        return self.compares != "request" or self.late > 0
 
-    request = "_deformed_last"
-    models = ()
-    share = 0.0
+    @property
+    def channels(self) -> int | None:
+        """Number of controlled coordinates that it is made for; None: any number."""
+        rows = self.weights if self.weights is not None else several(self.cycles)
+        return len(rows) or None
 
-    def against_last_request(self, refusal: str) -> tuple[str, ...]:  # noqa: ARG002
-        return ()
-
-
-@dataclass(frozen=True)
-class Pairing:
-    """The earlier request that a response is paired with: the request of `cycles` cycles before the last one.
-
-    Args:
-        cycles: the longest of several dead times.
-        uncertainty: half width of the mean over the requests around it, cycles.
-        channels: the dead time of every controlled coordinate where there are several; else empty.
-    """
-
-    cycles: float
-    uncertainty: int = 0
-    channels: tuple[float, ...] = ()
+    def weighted(self, jacobian: np.ndarray) -> np.ndarray:
+        """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""
+        return jacobian if self.weights is None else jacobian @ np.array(self.weights)
 
 
 @dataclass(frozen=True)
@@ -103,27 +90,6 @@ class RequestChange:
     # step per cycle with which the plain form comes back from the largest response error that is expected, in units of the
     # response (`fpirhc.contraction.delayed`)
     recovery: float = 0.0
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """What a map is to first order, beside its effective gain, as far as its step alone does not tell.
-
-    Args:
-        constant: whether gain and pairing stay as they are at the start of a run, and are those of small errors too.
-        pairing: the earlier request that a response is paired with; None: the last one.
-        channels: number of controlled coordinates that the map is made for; None: any number.
-        weights: W by rows where the gain is a matrix, r+ = r - a W (f - d); None: the one matrix.
-    """
-
-    constant: bool = True
-    pairing: Pairing | None = None
-    channels: int | None = None
-    weights: tuple[tuple[float, ...], ...] | None = None
-
-    def weighted(self, jacobian: np.ndarray) -> np.ndarray:
-        """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""
-        return jacobian if self.weights is None else jacobian @ np.array(self.weights)
 
 
 class Deformation(Checked, ABC):
@@ -152,18 +118,13 @@ class Deformation(Checked, ABC):
 
     @property
     def adapts(self) -> bool:
-        """Whether the response changes the request at all; False for no adaptation."""
-        return True if self.inner is None else self.inner.adapts
+        """Whether the response changes the request at all."""
+        return not stays(self.effective_gain(), 0.0)
 
     @property
-    def iteration(self) -> Iteration:
-        """What the map is to first order."""
-        return Iteration() if self.inner is None else self.inner.iteration
-
-    @property
-    def mirror(self) -> Mirror:
-        """The way of the model's response to `step`, which is given it as `request`; without a model it is given the last one."""
-        return LastRequest() if self.inner is None else self.inner.mirror
+    def form(self) -> Form:
+        """With what it compares a response; by default with the last request, around a map as that does."""
+        return Form() if self.inner is None else self.inner.form
 
     def with_scale_for(self, request: RequestChange) -> Self:
         """Return the map with its automatic settings chosen for how much the desired response changes."""
@@ -187,7 +148,7 @@ class Deformation(Checked, ABC):
         Values and derivatives of any order are finite at response = desired.
 
         Args:
-            request: the request that caused the response, a CasADi column; the model's response where there is a `mirror`.
+            request: the request that caused the response, a CasADi column; the model's response where the `form` compares with it.
             response: the realised response, a column of the same size.
             desired: the response that is desired now, a column of the same size.
             memory: the signals of `memory`, by name.
@@ -263,7 +224,7 @@ def smooth_norm(column: Expression, floor: float) -> Expression:
 
 def of_last_pair(deformation: Deformation) -> bool:
     """Whether a request follows from the last request and its response alone: no model, pairing or memory of its own."""
-    return deformation.iteration.pairing is None and not (deformation.mirror.share or deformation.memory(("q",)).size)
+    return not (deformation.form.pairs or deformation.memory(("q",)).size)
 
 
 _FORGETTING = 0.1  # share of the newest sign
@@ -277,8 +238,6 @@ class Wrapper(Deformation, ABC):
     Args:
         map: the wrapped deformation, the first field of every wrapper.
     """
-
-    chooses_pair: ClassVar[bool] = False  # whether it says what a response is compared with, not the last request
 
     map: Deformation
 
@@ -312,16 +271,16 @@ def against_wrappers(deformation: Deformation) -> Iterator[str]:
     """Yield a sentence for every wrapper that does not fit what it is around, the outermost first."""
     while deformation.inner is not None:
         name, inside = type(deformation).__name__, list(_chain(deformation.inner))
-        pairing = [one for one in inside if getattr(one, "chooses_pair", False)]
+        pairing = [one for one in inside if one.form.pairs]
         if any(type(one) is type(deformation) for one in inside) and _shares_memory(deformation):
             yield f"{name} stands around another {name}; one is enough, so leave one of them out"
-        elif pairing and getattr(deformation, "chooses_pair", False):
+        elif pairing and replace(deformation.form, steady=True) != replace(deformation.inner.form, steady=True):
             yield (
-                f"{name} around {type(pairing[0]).__name__}: each of them says which request a response belongs to; use one of "
+                f"{name} around {type(pairing[-1]).__name__}: each of them says which request a response belongs to; use one of "
                 "them around the map, and state the dead time there"
             )
-        else:
-            yield from deformation.inner.mirror.against_last_request(
+        elif deformation.inner.form.modelled:
+            yield (
                 f"{name} around a model-referenced form changes what the form compares, the model's response with the measured "
                 f"one; put it inside: ModelReferenced({name}(map, ...))"
             )
@@ -376,8 +335,6 @@ class Identity(Deformation):
 
     It is the only map that does not iterate: its gains are zero, and it corrects no response error.
     """
-
-    adapts = False
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

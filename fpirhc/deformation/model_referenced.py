@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Mirror, Pairing, Wrapper, memory_of_map
+from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_uncertainty, check_whole, chosen_pole
+from fpirhc.errors import NotSupported
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.open import stays
-from fpirhc.task.dead_time import Cycles, Queue, every, several
+from fpirhc.task.dead_time import Cycles, Queue
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,6 @@ class ModelReferenced(Wrapper):
         InvalidValue: a dead time, lag, uncertainty or pole out of range, or parts of a cycle.
     """
 
-    chooses_pair: ClassVar[bool] = True
-
     cycles: Cycles | None = field(default=None, metadata={"of_problem": True, "structure": True})
     measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
     lag: NotNegative | tuple[NotNegative, ...] | None = field(
@@ -57,17 +55,9 @@ class ModelReferenced(Wrapper):
             check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
 
     @property
-    def mirror(self) -> Mirror:
-        return Mirror(self._cycles, self.measurement, self._lag)
-
-    @property
-    def iteration(self) -> Iteration:
-        longest, several_channels = max(every(self._delays)), isinstance(self._cycles, tuple)
-        return replace(
-            self.map.iteration,
-            pairing=Pairing(longest, channels=several(self._delays)) if longest else None,
-            channels=len(every(self._cycles)) if several_channels else self.map.iteration.channels,
-        )
+    def form(self) -> Form:
+        inner, late = self.map.form, self.measurement
+        return replace(inner, compares="model", cycles=self._cycles, measurement=late, lag=self._lag)
 
     @property
     def _leak(self) -> float:
@@ -112,10 +102,11 @@ class ModelReferenced(Wrapper):
 
 def require_map_of_plan(owner: str, deformation: Deformation) -> None:
     """Check that a map may be given its own last request, as a plan has nothing else."""
-    deformation.mirror.require_last_request(
-        f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a plan's "
-        "gradient has no model beside it; use the map inside"
-    )
+    if deformation.form.modelled:
+        raise NotSupported(
+            f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a "
+            "plan's gradient has no model beside it; use the map inside"
+        )
 
 
 def settled(deformation: Deformation, request: Expression, response: Expression) -> dict[str, Expression]:

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.deformation.base import Deformation, Mirror
+from fpirhc.deformation.base import Deformation, Form
 from fpirhc.describe import identity
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant
@@ -33,17 +33,17 @@ def with_believed_way(problem: Problem, deformation: Deformation) -> Problem:
     A lag or a dead time that a deformation believes is a part of its model, so a plant without it is no right model. A dead time
     that the problem states is a fact, and stays. A lag before a map is left out.
     """
-    mirror = deformation.mirror
-    return _with_lag(_with_dead_time(problem, mirror), mirror)
+    form = deformation.form
+    return _with_lag(_with_dead_time(problem, form), form) if form.modelled else problem
 
 
-def _with_dead_time(problem: Problem, mirror: Mirror) -> Problem:
-    cycles = _each(mirror.cycles, len(problem.plant.inputs))
+def _with_dead_time(problem: Problem, form: Form) -> Problem:
+    cycles = _each(form.cycles, len(problem.plant.inputs))
     stated = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if stated or not (any(cycles) or mirror.measurement):
+    if stated or not (any(cycles) or form.measurement):
         return problem
     inputs = {name: c * problem.period for name, c in zip(problem.plant.inputs, cycles, strict=True)}
-    return replace(problem, dead_time=DeadTime(inputs=inputs, measurement=mirror.measurement * problem.period))
+    return replace(problem, dead_time=DeadTime(inputs=inputs, measurement=form.measurement * problem.period))
 
 
 def behind_stated_lag(problem: Problem) -> Problem:
@@ -54,8 +54,8 @@ def behind_stated_lag(problem: Problem) -> Problem:
     return _behind(problem.of_model, tuple(lag.get(name, 0.0) for name in problem.plant.inputs))
 
 
-def _with_lag(problem: Problem, mirror: Mirror) -> Problem:
-    return _behind(problem, _each(mirror.lag, len(problem.plant.inputs)))
+def _with_lag(problem: Problem, form: Form) -> Problem:
+    return _behind(problem, _each(form.lag, len(problem.plant.inputs)))
 
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
@@ -95,9 +95,9 @@ class ModelAsPlant:
 
         It is the same one for controllers that know the same. Signals are what the model believes of them.
         """
-        known, mirror = controller.plant_model(self._problem), controller.deformation.mirror
+        known, form = controller.plant_model(self._problem), controller.deformation.form
         parameters = known.parameters(self._problem.plant)
-        name = parameters.tobytes(), identity(known.signals), mirror.cycles, mirror.measurement, mirror.lag
+        name = parameters.tobytes(), identity(known.signals), form
         if name not in self._models:
             self._models[name] = self._made(parameters, known.signals, controller.deformation)
         return self._models[name]

@@ -172,8 +172,8 @@ class Simulator:
             "backend": "compiled C" if own.compiled else "CasADi virtual machine",
             "why not compiled": own.why_not_compiled,
         }
-        if controller.deformation.iteration.weights is not None:
-            facts["weights"] = [list(row) for row in controller.deformation.iteration.weights]
+        if controller.deformation.form.weights is not None:
+            facts["weights"] = [list(row) for row in controller.deformation.form.weights]
         if force.record:
             facts["live"] = [[time, dict(values)] for time, values in force.record]
         points = set_point_record(problem, setpoints)
@@ -465,12 +465,12 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
     """
     states, deformed = log[:, layout.slice("state")], log[:, layout.slice("deformed")]
     gain, model = controller.deformation.effective_gain(), controller.plant_model(problem)
-    iteration = controller.deformation.iteration
+    form = controller.deformation.form
     if not problem.equations_known:
         shown = (
             np.nan
             if problem.response_delay
-            else identified_factor(deformed, log[:, layout.slice("realised")], gain, iteration.weights)
+            else identified_factor(deformed, log[:, layout.slice("realised")], gain, form.weights)
         )
         return np.full(len(log), shown)
     own = model.plant
@@ -484,7 +484,7 @@ def _contraction(problem: Problem, controller: Controller, layout: Layout, log: 
 
     def jacobians(rows: np.ndarray) -> np.ndarray:
         parameters = believed[rows], exact[rows]
-        return iteration.weighted(jacobians_along(modelled, real[rows], states[rows], deformed[rows], *parameters))
+        return form.weighted(jacobians_along(modelled, real[rows], states[rows], deformed[rows], *parameters))
 
     return factors_along(len(log), jacobians, gain)
 

@@ -78,12 +78,12 @@ def test_one_slot_is_computed_torque_where_responses_are_measured(name, deformat
     """On maps, late, behind estimators, of a body outside: the plain form to rounding."""
     problem, law = replace(FORMS[name][0], horizon=None, cost=None, duration=1.6), fp.Exponential(rate=6.0)
     slots = alone("y", law, deformation)
-    if deformation.mirror.share and name in ("encoder", "believed"):
+    if deformation.form.modelled and name in ("encoder", "believed"):
         assert "gives a mean over several; use the map inside" in refused(problem, slots)
         return
     torque = run(problem, fp.ComputedTorque(law, deformation))
     slotted = run(problem, slots)
-    scale, late = np.abs(torque["command"]).max(), 0 if not deformation.mirror.share else -80
+    scale, late = np.abs(torque["command"]).max(), 0 if not deformation.form.modelled else -80
     tolerance = 1e-9 if not late else 2e-3
     np.testing.assert_allclose(slotted["command"][late:], torque["command"][late:], atol=tolerance * scale)
     np.testing.assert_allclose(slotted["realised_of_slots"], slotted["realised"], atol=0)

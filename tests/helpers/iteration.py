@@ -34,8 +34,7 @@ class Scalar:
 
 def iteration_radius(deformation: Deformation, delay: int) -> float:
     """Spectral radius of the scalar iteration whose response is the request of `delay` cycles earlier."""
-    pairing = deformation.iteration.pairing
-    believed = round(pairing.cycles or 0) if deformation.mirror.share and pairing is not None else 0
+    believed = round(deformation.form.late) if deformation.form.modelled else 0
     layout, size = deformation.memory(("q",)), max(delay, believed) + 1  # requests on their way, newest first
     z = ca.SX.sym("z", size + layout.size)
     memory = layout.split(z[size:])

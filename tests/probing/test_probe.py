@@ -174,10 +174,10 @@ def test_coupled_bodies_are_offered_a_gain_matrix():
     """Directions with gains of 1.3 and .2: the matrix is the inverse of the gains."""
     problem = replace(body_problem([[0.8, 0.6], [0.5, 0.7]], 0, 0.0, 0.02), duration=2.0)
     found = fp.probe(problem, RHC, cycles=150)
-    weighted = {n: one for n, one in found.candidates.items() if one.iteration.weights is not None}
+    weighted = {n: one for n, one in found.candidates.items() if one.form.weights is not None}
     assert weighted
     for one in weighted.values():
-        product = np.array(one.iteration.weights) @ np.array([[0.8, 0.6], [0.5, 0.7]])
+        product = np.array(one.form.weights) @ np.array([[0.8, 0.6], [0.5, 0.7]])
         assert product == pytest.approx(np.eye(2), abs=0.15)
 
 

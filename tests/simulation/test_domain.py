@@ -39,7 +39,7 @@ BAD = 60  # cycle
 MAPS: tuple[Deformation, ...] = tuple(
     m
     for e in examples("deformations", SHAPE)
-    if (m := e.value if isinstance(e, Example) else e).iteration.channels in (None, 1) and m.effective_gain() >= 0
+    if (m := e.value if isinstance(e, Example) else e).form.channels in (None, 1) and m.effective_gain() >= 0
 )
 CONTROLLERS: dict[str, Controller] = {
     **{f"{type(m).__name__}-{k}": fp.ComputedTorque(TRACK, m) for k, m in enumerate(MAPS)},

@@ -1,4 +1,4 @@
-"""Fifteen deformations that break the contract, each in one thing, and the right one that they are made from."""
+"""Sixteen deformations that break the contract, each in one thing, and the right one that they are made from."""
 
 # ruff: noqa: ARG002 - arguments are those of the contract
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.contracts import Deformation, Iteration, Layout, Pairing, Signal
+from fpirhc.contracts import Deformation, Form, Layout, Signal
 
 
 @dataclass(frozen=True)
@@ -123,17 +123,19 @@ class GivesAnotherGain(Softsign):
 class SaysItIsLate(Softsign):
     """Names an earlier request than the one that it compares the response with."""
 
-    @property
-    def iteration(self):
-        return Iteration(pairing=Pairing(3))
+    form = Form(cycles=3)
+
+
+class SaysItIncrements(Softsign):
+    """Says that it passes a change of the desired response on."""
+
+    form = Form("increment")
 
 
 class SaysItDoesNotAdapt(Softsign):
     """Adapts."""
 
-    @property
-    def adapts(self):
-        return False
+    adapts = False
 
 
 class FiltersTwice(Softsign):

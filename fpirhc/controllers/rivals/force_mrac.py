@@ -15,13 +15,14 @@ from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic
-from fpirhc.errors import Mistakes
+from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import Finite
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -59,9 +60,10 @@ class ForceMRAC(Controller):
             NotSupported: a model-referenced deformation where sensing is not ideal or something is late, because the last command
                 is then not the one that the response recalculates.
         """
-        mirror, late = self.deformation.mirror, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
-        if late or not problem.sensing.ideal or not mirror.bare:
-            mirror.require_last_request(
+        form, late = self.deformation.form, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
+        believes = form.late or any(every(form.lag))
+        if form.modelled and (late or believes or not problem.sensing.ideal):
+            raise NotSupported(
                 "ForceMRAC cannot use a model-referenced deformation here: it compares the last command with the one recalculated "
                 "from the response, through no estimator, dead time or lag; use the map itself or Increment"
             )

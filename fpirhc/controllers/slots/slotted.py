@@ -21,7 +21,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.path import measured_output
 from fpirhc.controllers.reference_states import with_reference
 from fpirhc.controllers.slots.schedules import Schedule
-from fpirhc.deformation.base import Deformation, Identity, LastRequest
+from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative
@@ -189,12 +189,12 @@ def _measured(problem: Problem, light: Plant) -> bool:
 
 def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
     estimator = problem.sensing.estimator
-    if not (estimator.of_steps or estimator.shows_response):
-        yield from deformation.mirror.against_last_request(
+    if deformation.form.modelled and not (estimator.of_steps or estimator.shows_response):
+        yield (
             f"ModelReferenced in a slot compares with the model's response of one cycle, and {estimator} gives a mean over "
             "several; use the map inside"
         )
-    if deformation.iteration.pairing is not None and not deformation.mirror.share:
+    if deformation.form.pairs and not deformation.form.modelled:
         yield (
             f"{type(deformation).__name__} keeps pairs of earlier cycles, which belong to another slot after a switch, where the "
             "command would jump back to them; use the map itself, or behind a dead time ModelReferenced(map, cycles=...)"
@@ -277,7 +277,7 @@ def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list
     names |= {n: f"{n}_{one.name}" for n in one.slot.deformation.shown()}
     if not outer.outputs:
         names["output"] = _OUTPUT
-    begins, asked = names | {"warm_up": names["_goes_on"]}, names | {LastRequest.request: names["_request"]}
+    begins, asked = names | {"warm_up": names["_goes_on"]}, names | {Form().request: names["_request"]}
     cycle: list[Block] = []
     for block in blocks:
         if "_deformation" in block.writes.names:
@@ -294,7 +294,7 @@ def _begun_anew(deformation: Deformation, block: Block) -> Block:
     """The deform block, whose memory stays at its start until a turn, which begins with the pair of the last command."""
 
     def step(s: Signals) -> Mapping[str, Value]:
-        pair = settled(deformation, getattr(s, deformation.mirror.request), s.realised)
+        pair = settled(deformation, getattr(s, deformation.form.request), s.realised)
         begins = {m.name: expression(ca.DM(m.start_vector())) for m in block.memory.signals}
         begins |= {name: ca.if_else(s.warm_up > 0.5, value, begins[name]) for name, value in pair.items()}
         fresh = {name: ca.if_else(s._goes_on > 0.5, getattr(s, name), value) for name, value in begins.items()}
@@ -308,23 +308,23 @@ def _handover_block(built: Built, deformation: Deformation, decay: float) -> Blo
 
     A turn begins with the last command: a plain map desires what it has just realised, a model-referenced one adds model - plant.
     """
-    plant, response, models = built.plant, built.plant.equations.controlled_response, deformation.mirror.models
+    plant, response, modelled = built.plant, built.plant.equations.controlled_response, deformation.form.modelled
 
     def step(s: Signals) -> dict[str, Value]:
         begins = ca.logic_and(s.warm_up > 0.5, ca.logic_not(s._goes_on))
         last = shown = response(s.state, s._command_before, s.parameters)
         if deformation.adapts:
-            shown = s.realised + sum(last - getattr(s, modelled) for modelled in models)
+            shown = s.realised + (last - getattr(s, deformation.form.request) if modelled else 0)
             shown = ca.if_else(s.warm_up > built.warm_up - 0.5, shown, last)
         offset = ca.if_else(begins, shown - s._law, decay * s._offset)
         # What is not finite would be remembered for the rest of the turn.
         kept = ca.if_else(is_finite(offset), offset, 0)
-        request = {} if models else {"_request": ca.if_else(begins, last, getattr(s, LastRequest.request))}
+        request = {} if modelled else {"_request": ca.if_else(begins, last, getattr(s, Form().request))}
         return {"desired": s._law + kept, "_offset_next": kept, **request}
 
-    reads = map(plant.response_signal, ("_law", "realised", *(models or (LastRequest.request,))))
+    reads = map(plant.response_signal, ("_law", "realised", deformation.form.request))
     flags, before = (scalar("_goes_on"), scalar("warm_up")), like(plant.input, "_command_before")
-    writes = map(plant.response_signal, ("desired",) if models else ("desired", "_request"))
+    writes = map(plant.response_signal, ("desired",) if modelled else ("desired", "_request"))
     layout = Layout((*reads, *flags, plant.state, plant.parameter, before))
     return Block("handover", layout, Layout(tuple(writes)), step, Layout((scalar("_offset"),)))
 

@@ -249,12 +249,11 @@ class Cascade(Controller):
             InvalidValue: see `ThroughModel`.
         """
         self.controller.check(self.inner_problem(problem))
-        self.deformation.mirror.require_last_request(
-            "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
-        )
-        if self.deformation.iteration.pairing is not None:
+        if self.deformation.form.pairs:
             raise NotSupported(
-                f"Cascade: {type(self.deformation).__name__} pairs by itself; give the map inside, and "
+                "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
+                if self.deformation.form.modelled
+                else f"Cascade: {type(self.deformation).__name__} pairs by itself; give the map inside, and "
                 "ThroughModel(dead_time=...)"
             )
         if self.deformation.effective_gain() < 0:

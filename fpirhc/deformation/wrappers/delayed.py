@@ -9,17 +9,17 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Pairing, Wrapper, memory_of_map
+from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
 from fpirhc.symbolic.open import stays
-from fpirhc.task.dead_time import MOST, Cycles, Queue, every, several
+from fpirhc.task.dead_time import MOST, Cycles, Queue, every
 
 __all__ = ["MOST", "Increment", "Paired"]
 
@@ -43,16 +43,11 @@ class _Queued(Wrapper):
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
 
-    chooses_pair: ClassVar[bool] = True
-
     cycles: Cycles = field(metadata={"structure": True})
 
     @property
-    def iteration(self) -> Iteration:
-        """That of the map, on the pairs of the believed dead time, the longest of several."""
-        pairing = Pairing(max(every(self.cycles)), channels=several(self.cycles))
-        channels = len(every(self.cycles)) if several(self.cycles) else self.map.iteration.channels
-        return replace(self.map.iteration, pairing=pairing, channels=channels)
+    def form(self) -> Form:
+        return replace(self.map.form, cycles=self.cycles)
 
     @property
     @abstractmethod
@@ -117,12 +112,6 @@ class Paired(_Queued):
             )
 
     @property
-    def iteration(self) -> Iteration:
-        return replace(
-            super().iteration, pairing=Pairing(max(every(self.cycles)), self.uncertainty, several(self.cycles))
-        )
-
-    @property
     def _queue(self) -> Queue:
         return Queue(self.cycles, self.uncertainty)
 
@@ -169,6 +158,10 @@ class Increment(_Queued):
         """
         check_cycles("Increment.within", most, "most")
         return cls(map, cycles=most / 2, uncertainty=math.ceil(most / 2))
+
+    @property
+    def form(self) -> Form:
+        return replace(super().form, compares="increment")
 
     @property
     def _leak(self) -> float:

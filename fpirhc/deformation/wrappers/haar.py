@@ -14,7 +14,7 @@ from typing import Annotated
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Wrapper, memory_of_map
+from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.fields.kinds import Positive, whole
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
@@ -35,9 +35,9 @@ class Haar(Wrapper):
     threshold: Positive = 3.0
 
     @property
-    def iteration(self) -> Iteration:
+    def form(self) -> Form:
         """That of the map for errors beyond the noise; smaller ones are spread over 2^J cycles."""
-        return replace(self.map.iteration, constant=False)
+        return replace(self.map.form, steady=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, 2**self.levels) for e in elements)

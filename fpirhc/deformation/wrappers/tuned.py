@@ -12,7 +12,7 @@ from typing import Annotated, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Iteration, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
+from fpirhc.deformation.base import Deformation, Form, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.expression import power
@@ -54,8 +54,8 @@ class Tuned(Wrapper):
             )
 
     @property
-    def iteration(self) -> Iteration:
-        return replace(self.map.iteration, constant=False)
+    def form(self) -> Form:
+        return replace(self.map.form, steady=False)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         counts = scalar("tuner_growing"), scalar("tuner_returning")
