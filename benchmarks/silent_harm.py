@@ -4,8 +4,8 @@
 
 Exact parameters of a shipped or of a small random problem move by half, with some of: dead time, lags of actuators,
 friction and a load on a spring, noise or bias of sensors, limits of inputs; the problem states it, the model does not.
-Untold is at times a lag or a gain, which a caution must name. Harmed: an error above 1.2 times that without adaptation,
-or lost alone, in runs of another seed. Healthy: none above 1.1 times, all below a quarter of the task, seldom at limits.
+Untold is at times a lag or a gain, which a caution must name, or else advise no adaptation. Harmed: an error above 1.2 times
+that without, or lost alone, in runs of another seed. Healthy: none above 1.1 times, all below .25 of the task, seldom at limits.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def asked(seed: int, loud: bool = False) -> tuple[str, str, list[str], str]:
     yes, no, caution = ([k for k, a in answers.items() if a.verdict == said] for said in ("yes", "no", "caution"))
     fate = "harmed" if ratio > HARMED else "healthy" if ratio <= NEUTRAL and good and not untold else "other"
     wrong = {
-        "silent": fate == "harmed" and not no and not untold & {*caution},
+        "silent": fate == "harmed" and not no and not (untold and {*untold, "pays"} & {*caution}),
         "a no": fate == "healthy" and bool(no),
         "growing": any(v > 1 for k in yes for n, v in answers[k].numbers.items() if n.startswith(GROWING)),
     }

@@ -31,6 +31,7 @@ GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
 MOSTLY, BUSY = 0.5, 2.0  # share of the cycles at a limit that shows no loop; times the movement without adaptation
 OFFSET = 0.8  # share of the rms error from which on its mean is most of it
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
+CALM, CHATTER = 0.1, 0.01  # step of a command a cycle, as a share of what it covers: mean, and rms from noise
 SATURATED, UNUSED = 0.2, 0.01  # share of the cycles at a limit; largest command as a share of its limit
 
 Numbers = Mapping[str, float]
@@ -65,9 +66,8 @@ class Question:
 
 
 def graded(value: float, good: float, bad: float) -> Verdict:
-    """Return yes up to `good`, no from `bad` on, caution between; the other way round where good is the larger one."""
-    sign = 1 if good <= bad else -1
-    return Verdict.YES if sign * value <= sign * good else Verdict.CAUTION if sign * value < sign * bad else Verdict.NO
+    """Return yes up to `good`, no from `bad` on, caution between."""
+    return Verdict.YES if value <= good else Verdict.CAUTION if value < bad else Verdict.NO
 
 
 def _turns(case: Case) -> Fact | None:
@@ -152,9 +152,8 @@ def _returns(case: Case) -> Fact:
         raise NotAsked("A command at its limits is no loop: see whether it follows.")
     back, far, step = bench.back, bench.along[0], bench.steps(bench.start)
     worst = max(one.factor for one in bench.along)
-    calm = back.left <= GOOD and far.left <= GOOD and worst < 1 and step <= 0.1
-    lost = back.left >= 1.05 and (far.left >= 1.05 or back.left >= 2)  # else a small cycle about the run
-    verdict = Verdict.YES if calm else Verdict.NO if lost else Verdict.CAUTION
+    calm = back.left <= GOOD and worst < 1 and step <= CALM
+    verdict = Verdict.YES if calm else Verdict.NO if bench.lost else Verdict.CAUTION
     numbers = {"left": back.left, "left_of_ten_times": far.left, "factor": back.factor, "largest_factor": worst}
     numbers |= _times(math.log(back.factor) / case.problem.period) if back.factor > 0 else {}
     return Fact(verdict, {**numbers, "mean_step": step})
@@ -212,7 +211,7 @@ def _box(case: Case) -> Fact | None:
         base = bench.run(exact=exact)
         found.append((bench.pushed(PLACES[0], base=base, exact=exact)[0].left, bench.share(base)))
     good, most = float(np.mean([left <= 1 and share <= 1 for left, share in found])), np.max(found, axis=0)
-    verdict = graded(most[0], max(GOOD, bench.back.left), BAD) if good == 1 else Verdict.CAUTION if good else Verdict.NO
+    verdict = Verdict.YES if good == 1 else Verdict.CAUTION if good else Verdict.NO
     return Fact(verdict, {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]})
 
 
@@ -222,36 +221,36 @@ def _gains(case: Case) -> Fact | None:
 
     def bears(gain: float) -> bool:
         run = case.bench.pushed(PLACES[0], gain=gain)[0]
-        return run.left <= 1 and run.steps <= 2 * case.bench.back.steps + 0.01
+        return run.left <= 1 and run.steps <= BUSY * max(CALM, case.bench.back.steps)
 
     most, least = (([1.0, *takewhile(bears, side)])[-1] for side in GAINS)
-    change = "With less gain of the inputs it is lost: only a faster loop bears that." if most == 2 else ""
-    return Fact(graded(most / least, 4.0, 0.0), {"most": most, "least": least}, "", change)
+    change = "With less gain of the inputs it is lost: only a faster loop bears that." if most > 1 else ""
+    return Fact(Verdict.YES if least < 1 < most else Verdict.CAUTION, {"most": most, "least": least}, "", change)
 
 
 def _latency(case: Case) -> Fact | None:
     if not case.asks_more():
         return None
-    bench, borne, harms = case.bench, LATENCY, 0.0
-    adapts = bench.built.controller.deformation.adapts
+    bench, borne, harms, numbers = case.bench, 0, 0.0, dict[str, float]()
     most, calm = max(2 * bench.share(bench.start), 0.1), bench.steps(bench.start)
     for cycles in range(1, LATENCY + 1):
         base = bench.run(latency=cycles)
         share, step = bench.share(base), bench.steps(base)
         left = without = math.inf
-        if share <= most and step <= 2 * calm + 0.01:
+        if share <= most and step <= BUSY * max(CALM, calm):
             left = bench.pushed(PLACES[0], base=base, latency=cycles)[0].left
-        if left <= 1 and adapts:
+        if left <= 1 and bench.built.controller.deformation.adapts:
             plain = case.plain.run(latency=cycles)
             without = case.plain.share(plain)
-            harms = _added(case, case.plain.errors(plain), bench.errors(base))[2]
-        if left > 1 or harms > WORSE:
-            borne = cycles - 1
+            harms = _added(case, case.plain.errors(plain), bench.errors(base), SLIGHT)[2]
+        bears = left <= 1 and harms <= WORSE
+        if bears or cycles == 1:
+            borne, numbers = cycles * bears, {"error": share, "mean_step": step, "mean_step_without": calm}
+            numbers |= {n: v for n, v in (("left", left), ("error_without", without)) if v < math.inf}
+        if not bears:
             break
-    numbers = {"cycles_borne": borne, "time_borne": borne * case.problem.period, "cycles_tried": cycles}
-    numbers |= {"error": share, "mean_step": step, "mean_step_without": calm}
-    numbers |= {n: v for n, v in (("left", left), ("error_without", without)) if v < math.inf}
-    return Fact(graded(borne, LATENCY, -1), numbers)
+    numbers |= {"cycles_borne": borne, "time_borne": borne * case.problem.period, "cycles_tried": max(borne, 1)}
+    return Fact(Verdict.YES if borne else Verdict.CAUTION, numbers)
 
 
 def _left(case: Case) -> Fact | None:
@@ -284,19 +283,16 @@ def _noise(case: Case) -> Fact | None:
         return None
     bench, quiet = case.bench, case.bench.quiet
     noisy = max((run.first(bench.cycles) for run in bench.draws), key=bench.steps)
-    count, (lower, upper) = min(noisy.cycles, quiet.cycles), case.problem.limits.input_bounds(case.problem.plant)
+    count = min(noisy.cycles, quiet.cycles)
     steps = np.diff((noisy["command"][:count] - quiet["command"][:count])[bench.first(count) :], axis=0)
-    span = np.where(np.isfinite(upper - lower), upper - lower, np.maximum(np.ptp(quiet["command"], axis=0), 1e-300))
     size = np.sqrt((steps**2).mean(axis=0))
-    worst = int((size / span).argmax())
-    numbers = {"rms_change": size[worst], "rms_step": size[worst] / span[worst], "movement": bench.moves(noisy)[worst]}
-    numbers |= {"movement_without_noise": bench.moves(quiet)[worst], "error": bench.share(noisy)}
-    numbers["error_without_noise"] = bench.share(quiet)
+    worst = int((size / bench.span).argmax())
+    step, (moves, quietly) = size[worst] / bench.span[worst], (bench.moves(run)[worst] for run in (noisy, quiet))
+    numbers = {"rms_change": size[worst], "rms_step": step, "movement": moves, "movement_without_noise": quietly}
+    numbers |= {"error": bench.share(noisy), "error_without_noise": bench.share(quiet)}
     adapts, name = bench.built.controller.deformation.adapts, list(case.problem.plant.inputs)[worst]
     change = gain_by_run(case).change if adapts and _busy(case) else ""
-    if numbers["movement"] < numbers["movement_without_noise"]:
-        change = "Without noise the command moves more: a limit cycle of the quantum or of the window."
-    return Fact(graded(numbers["rms_step"], 0.01, math.inf), numbers, name, change)
+    return Fact(Verdict.CAUTION if step > CHATTER and moves > BUSY * quietly else Verdict.YES, numbers, name, change)
 
 
 def _bias(case: Case) -> Fact | None:
@@ -314,18 +310,15 @@ def _bias(case: Case) -> Fact | None:
     even = alone[name] / slopes[name] if slopes[name] > 1e-12 else math.inf
     numbers = {"added_by_a_bias": 0.01 * size * slopes[name]}
     numbers |= {"share_of_the_response": even / size} if even <= 10 * size else {}
-    if case.problem.sensing.drawn:  # what the sensors have may be a bias
-        right, own, most = bench.share(bench.quiet), bench.share(base), plain.share(plain.start)
-        numbers |= {"error_with_right_sensors": right, "error": own}
-        if right < most < own:
-            return Fact(Verdict.NO, numbers, name)
-    return Fact(graded(even / size, 0.02, 0.0), numbers, name)
+    right, own, most = bench.share(bench.quiet), bench.share(base), plain.share(plain.start)
+    numbers |= {"error_with_right_sensors": right, "error": own} if case.problem.sensing.drawn else {}
+    return Fact(Verdict.NO if right < most and own > WORSE * most else Verdict.YES, numbers, name)
 
 
 def _allowed(case: Case) -> np.ndarray:
-    """The total variation that commands may have per unit of time: twice that without adaptation, or once their own range."""
+    """Total variation that commands may have per unit of time: twice that without adaptation, or their range, at rest .01 of it."""
     quiet = case.bench.quiet["command"][case.bench.first(case.bench.quiet.cycles) :]
-    once = np.ptp(quiet, axis=0) / (len(quiet) * case.problem.period)
+    once = np.maximum(np.ptp(quiet, axis=0), 0.01 * case.bench.span) / (len(quiet) * case.problem.period)
     return np.maximum(BUSY * case.plain.moves(case.plain.start), once)
 
 
@@ -365,12 +358,11 @@ def _tries(case: Case) -> dict[tuple[float, float], Try]:
             if way == TODAY:
                 error, moves = max(map(own.share, own.draws)), now
             calm = bool((moves <= most).all())
-            good = error <= useful and (calm or bool((moves <= 2 * now).all())) and bench.back.left <= 1
+            good = error <= useful and (calm or bool((moves <= 2 * now).all())) and not bench.lost
             tries[way] = Try(error, moves, good, calm)
         return tries[way].good and (tries[way].calm or not busy)
 
-    if not tried(TODAY):
-        any(map(tried, SMALLER if busy else SMALLER[:2]))
+    any(map(tried, SMALLER[:1] if tried(TODAY) else SMALLER if busy else SMALLER[:2]))
     any(map(tried, FILTERS)) if busy else all(map(tried, LARGER))
     if not any(one.good and WORSE * one.error < alone for one in tries.values()):  # is its sign wrong?
         tried(TURNED)
@@ -406,7 +398,9 @@ def gain_by_run(case: Case) -> Fact:
         numbers |= {"error_recommended": tries[best].error, "movement_recommended": tries[best].moves[worst]}
         told = f"Set the {name} to {times * value:.4g}."
         change = f"Filter the error of the map: Filtered(map, pole={pole:g})." if pole else told
-    return Fact(graded(largest, 2.0, 0.0) if good else Verdict.NO, numbers, of, change)
+    reserve, costs = largest >= 2 and tries[SMALLER[0]].good, tries[best].error > WORSE * tries[TODAY].error
+    verdict = Verdict.NO if not good else Verdict.YES if (reserve or costs) and not busy else Verdict.CAUTION
+    return Fact(verdict, numbers, of, change)
 
 
 def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) -> tuple[str, dict[str, float], float]:
@@ -433,7 +427,7 @@ def _model(case: Case) -> Fact:
     # more than it may cure
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
     no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
-    verdict = Verdict.NO if no else Verdict.CAUTION if harms > WORSE else Verdict.YES
+    verdict = Verdict.NO if no else Verdict.CAUTION if spoils and harms > WORSE else Verdict.YES
     return Fact(verdict, numbers, name)
 
 
@@ -444,7 +438,8 @@ def _pays(case: Case) -> Fact:
         return Fact(Verdict.UNKNOWN, {"share_without": plain, "share_with": own}, change=why)
     name, numbers, harms = _added(case, case.plain.errors(case.plain.nominal), case.bench.errors(case.bench.nominal))
     numbers["divided_by"] = plain / max(own, 1e-300)
-    verdict = Verdict.NO if harms > WORSE or own > BAD else Verdict.YES if own < plain else Verdict.CAUTION
+    verdict = Verdict.YES if own < max(plain, SLIGHT) else Verdict.CAUTION  # a small one is nothing to mend
+    verdict = Verdict.NO if harms > WORSE or own > BAD else verdict
     return Fact(verdict, numbers, name)
 
 
@@ -470,7 +465,7 @@ QUESTIONS = (
              "| {error_at_four_times:%} at four times| {error_turned:%} with the other sign| recommended gain {recommended_gain:4}"
              "| total variation of {of} {movement:r} ({start})| {movement_recommended:r} as recommended"
              "| {movement_without:r} without adaptation",
-             "There is no reserve: with twice this gain it does not come back, or moves the command twice as much.", "adaptive"),
+             "There is no reserve: with twice this gain it is lost or chatters, or with half of it adaptation harms.", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows,
              "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}| mean {mean_error:u}",
              "Mend the loop without adaptation first: {settings}, limits, period."),
@@ -489,9 +484,9 @@ QUESTIONS = (
     Question("box", "Does it come back for every plant in the range of the parameters?", _box,
              "{share_that_come_back:%} of {plants} plants| in the worst case {left:%} of a push left after {pushed}"
              "| relative rms error {error:%} ({start})", "Narrow the range of the parameters, or {slower}."),
-    Question("input_gain", "Does it bear half and twice the gain of the inputs?", _gains,
+    Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains,
              "it comes back at {least} to {most} times their gain", "{slower}: with more gain of the inputs it is lost."),
-    Question("latency", "Does it bear three cycles of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
+    Question("latency", "Does it bear a cycle of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
              "| with {cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
              "| commands change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency"
              "| {left:%} of a push left after {pushed}", "{late}."),
@@ -503,7 +498,7 @@ QUESTIONS = (
              "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| {left:%} of a push left after {pushed}",
              "States without a task go off: weigh them in the cost, or control another output."),
     Question("noise", "Is the chatter from noise small?", _noise,
-             "noise changes {of} by {rms_change:u} rms per cycle, {rms_step:%} of its range ({start})"
+             "noise changes {of} by {rms_change:u} rms per cycle, {rms_step:%} of what it covers ({start})"
              "| total variation {movement:r}| {movement_without_noise:r} without noise"
              "| relative rms error {error:%}| {error_without_noise:%} without noise", "{quieter}."),
     Question("bias", "Does it bear a bias of the measured response?", _bias,
@@ -513,8 +508,8 @@ QUESTIONS = (
     Question("model", "Does adaptation leave a right model alone?", _model, "model as the plant, without noise and disturbances: "
              "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
              "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
-    Question("pays", "Does adaptation lower the error?", _pays, "rms error of {of} {error_without:u} without adaptation"
-             "| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "
+    Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "rms error of {of} {error_without:u} without "
+             "adaptation| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "
              "({counted})| divided by {divided_by}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...",
              "adaptive"),
 )  # fmt: skip

@@ -94,6 +94,17 @@ def test_what_is_recommended_under_noise_is_calm_in_a_run(gain, remedy):
     assert calm[1] < without[1]
 
 
+def test_a_caution_of_the_gain_names_one_that_a_run_shows():
+    """Twice the gain chatters; half of it has the error that is told, and bears a cycle of latency that the gain does not."""
+    problem = mass(limits=LIMITS)
+    own, half = (answers(problem, torque(gain)) for gain in (-2.0, -1.0))
+    assert (own["gain"].verdict, own["gain"].change) == ("caution", "Set the gain to -1.")
+    made = fp.measure(problem, fp.simulate(problem, torque(-1.0), seed=0, compiled=False))
+    assert own["gain"].numbers["error_recommended"] == pytest.approx(made.rms_error["q"])  # of a motion of 1 m
+    assert [one["latency"].verdict for one in (own, half)] == ["caution", "yes"]
+    assert half["gain"].verdict == "yes"
+
+
 def test_no_gain_is_recommended_where_none_is_calm():
     """The least gain that is tried moves the command by more than twice as much as no adaptation."""
     told = answers(noisy(1.0), torque())["gain"]
