@@ -15,6 +15,8 @@ def affine(effective_gain: float) -> fp.Affine:
 
 
 class Scalar:
+    """A map of one coordinate with its memory, cycle by cycle."""
+
     def __init__(self, deformation: Deformation) -> None:
         self.layout = deformation.memory(("q",))
         r, f, d, m = (ca.SX.sym(n, k) for n, k in zip("rfdm", (1, 1, 1, self.layout.size), strict=True))
