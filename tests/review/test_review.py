@@ -42,12 +42,6 @@ def test_a_good_problem_is_ready():
         assert found["returns"].verdict == found["pays"].verdict == "yes"
 
 
-def test_a_wrong_sign_is_found_before_the_run():
-    found = answers(mass(), torque(gain=0.5))
-    assert found["pays"].verdict == "no"
-    assert "no" in {found["returns"].verdict, found["follows"].verdict}
-
-
 @pytest.mark.parametrize("wrong", [-1.0, 100.0, math.nan])
 def test_a_mismatch_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(ValueError, match="mismatch"):
@@ -101,8 +95,7 @@ def test_a_caution_of_the_gain_names_one_that_a_run_shows():
     assert (own["gain"].verdict, own["gain"].change) == ("caution", "Set the gain to -1.")
     made = fp.measure(problem, fp.simulate(problem, torque(-1.0), seed=0, compiled=False))
     assert own["gain"].numbers["error_recommended"] == pytest.approx(made.rms_error["q"])  # of a motion of 1 m
-    assert [one["latency"].verdict for one in (own, half)] == ["caution", "yes"]
-    assert half["gain"].verdict == "yes"
+    assert [one["latency"].verdict for one in (own, half)] == ["caution", half["gain"].verdict] == ["caution", "yes"]
 
 
 def test_no_gain_is_recommended_where_none_is_calm():
