@@ -145,6 +145,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "wrong sign": (fp.Cascade(STATIC, fp.Affine(gain=0.5), LAGGED), "use the other sign"),
     "paired inside": (fp.Cascade(STATIC, fp.Paired(affine(0.5), cycles=3), LAGGED), "Paired pairs by itself"),
     "model-referenced inside": (fp.Cascade(STATIC, fp.ModelReferenced(affine(0.5)), LAGGED), "already compares"),
+    "no scale": (fp.Cascade(STATIC, fp.Sigmoid(gain=-0.5), LAGGED), "scale"),
     "two lags": (fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=(5.0, 3.0))), "1 controlled coordinates"),
     "too late": (fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=5.0, dead_time=1e5)), "more than 1000"),
 }
