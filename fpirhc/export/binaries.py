@@ -8,11 +8,10 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from fpirhc.errors import CompileError, package
-from fpirhc.symbolic.native import find_compiler
+from fpirhc.symbolic.native import command_of, find_compiler
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.
 _FLAGS = ("-std=c99", "-O2", "-s", "-ffp-contract=off")
@@ -41,8 +40,7 @@ def shared_library(files: Mapping[str, str]) -> Library | None:
     own = find_compiler()
     machine = platform.machine().lower()
     here = f"{_MACHINES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
-    command = [own] if own else [sys.executable, "-m", "ziglang", "cc"] if find_spec("ziglang") else None
-    return None if command is None else Library(here, _compiled(files, [*command, *_SHARED], here))
+    return None if own is None else Library(here, _compiled(files, [*command_of(own), *_SHARED], here))
 
 
 def web_module(files: Mapping[str, str]) -> bytes:

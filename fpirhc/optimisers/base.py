@@ -11,14 +11,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.describe import Same
-from fpirhc.errors import NotSupported
+from fpirhc.errors import CompileError, NotInstalled, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout, sizes_along
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, registered
 from fpirhc.symbolic.expression import FINITE, Matrix, is_finite
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.native import Native, native
+from fpirhc.symbolic.native import find_compiler, native, why_no_compiler
 
 FEASIBLE = 1e-4  # largest violation of a state bound, as a share of its unit, that still counts as kept
 KEPT = 1e-6  # the same for an optimiser that keeps limits more closely
@@ -351,16 +351,35 @@ def first_plan(
 LAST = "(arg[5] ? *arg[5] : 0)"
 
 
-def plan_library(ocp: OptimalControl, name: str, driver: Driver, memory: int) -> Native:
-    """Return the compiled Function (s0, data, lower, upper, memory, last) -> (U, diagnostics, memory), or why there is none.
+def require_compiler() -> None:
+    """Raise where there is no C compiler.
 
-    It has one argument more than a step, a number that its text reads as `LAST`: one library serves a loop and plans in open loop.
+    Raises:
+        NotInstalled: with how to get one.
+    """
+    if find_compiler() is None:
+        raise NotInstalled(
+            f"plans with limits of states need a C compiler (the system's, or pip install ziglang): {why_no_compiler()}"
+        )
+
+
+def compiled_plan(ocp: OptimalControl, name: str, driver: Driver, memory: int) -> ca.Function:
+    """Return the Function (s0, data, lower, upper, memory, last) -> (U, diagnostics, memory) of a driver, as a compiled library.
+
+    It has one argument more than a step, a number that its text reads as `LAST`. In generated C it is the driver itself.
+
+    Raises:
+        NotInstalled: there is no C compiler.
+        CompileError: it failed.
     """
     results = [ca.MX.zeros(*size) for size in ((ocp.input.size, ocp.stages), (5, 1), (memory, 1))]
     arguments = [*call_arguments(ocp, memory), ca.MX.sym("last")]
-    if not driver.fits:
-        return Native(ca.Function(name, arguments, results), False, "its model calls Functions")
-    return native(ca.Function(registered(name, driver), arguments, results))
+    unique = registered(name, driver)
+    require_compiler()
+    library = native(ca.Function(unique, arguments, results), required=True)
+    if not library.compiled:
+        raise CompileError(library.reason)  # else the plans would be zeros
+    return ca.Function(unique, arguments, library.function.call(arguments))
 
 
 def with_last(ocp: OptimalControl, library: ca.Function, last: int) -> ca.Function:

@@ -6,6 +6,7 @@ states the iteration is that of `fpirhc.optimisers.limited`; it ends where the p
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -14,14 +15,13 @@ import numpy as np
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import CompileError, InvalidValue, NotInstalled, NotSupported
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, first_plan, paid, sane, stage_later
-from fpirhc.optimisers.limited import limited_step, shifted_limited
-from fpirhc.optimisers.limited_settings import MU_WARM, LimitedSettings, limited_memory
+from fpirhc.optimisers.base import Optimiser, first_plan, paid, require_compiler, sane, stage_later
 from fpirhc.optimisers.plain import CLOSE, PlainSettings, plain_memory, plain_step, shifted_plain
+from fpirhc.optimisers.state_limits import MU_WARM, LimitedSettings, limited_memory, limited_step, shifted_limited
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 
@@ -76,11 +76,14 @@ class FixedPoint(Optimiser):
         """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.
 
         Raises:
+            NotInstalled: limits of states without a C compiler.
             NotSupported: a discretised model that runs away along the reference, as Runge-Kutta steps of fast modes do;
                 a cost whose quadratic model has no minimum; a model-referenced map.
             InvalidValue: a tolerance below the rounding of inputs.
         """
         require_map_of_plan("FixedPoint", self.map)
+        if ocp.bounds_states:
+            require_compiler()
         reach = np.abs(np.concatenate([ocp.input_lower, ocp.input_upper, ocp.nodes[1].ravel()]))
         rounding = _DIGITS * float(reach[np.isfinite(reach)].max(initial=0.0))
         if self.tolerance is not None and self.tolerance < rounding:
@@ -118,10 +121,11 @@ class FixedPoint(Optimiser):
         return _of_two_starts(ocp, one, self.memory(ocp)) if self.second_start else one
 
     def rescue(self, ocp: OptimalControl) -> ca.Function | None:
-        if ocp.bounds_states:
-            return None
-        limited = limited_step(ocp, self._limited(ocp, _MOST_LIMITED))
-        return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
+        with contextlib.suppress(NotInstalled, CompileError):
+            if not ocp.bounds_states:
+                limited = limited_step(ocp, self._limited(ocp, _MOST_LIMITED))
+                return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
+        return None
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]

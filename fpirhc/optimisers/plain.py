@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -9,6 +10,7 @@ from importlib import resources
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation
+from fpirhc.errors import CompileError, NotInstalled
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.riccati import BOX_PIVOT, rounds
@@ -16,7 +18,7 @@ from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import (
     LAST,
     clip,
-    plan_library,
+    compiled_plan,
     sane,
     shift,
     shift_gains,
@@ -30,7 +32,6 @@ from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
-from fpirhc.symbolic.native import Native
 
 MOST = 100  # iterations of one converging call
 CAP = 50  # the same of one in a loop
@@ -82,17 +83,17 @@ def plain_memory(ocp: OptimalControl) -> Layout:
 
 def plain_step(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
-    if plans_are_compiled():
-        alike = replace(settings, converging=False)
-        library = _LIBRARIES.of((ocp, settings.map), (alike,), lambda: _library(ocp, alike))
-        if library.compiled:
-            return with_last(ocp, library.function, int(settings.converging))
+    with contextlib.suppress(NotInstalled, CompileError):
+        if plans_are_compiled():
+            alike = replace(settings, converging=False)
+            library = _LIBRARIES.of((ocp, settings.map), (alike,), lambda: _library(ocp, alike))
+            return with_last(ocp, library, int(settings.converging))
     name = "fpirhc_fixed_point_converging" if settings.converging else "fpirhc_fixed_point"
     driver = plain_driver(ocp, settings, settings.stops)
     return with_driver(name, driver, lambda unique: plain_graph(ocp, settings, unique))
 
 
-def _library(ocp: OptimalControl, settings: PlainSettings) -> Native:
+def _library(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
     """The driver alone as a library, whose last argument says whether a call stops where the plan is converged."""
     converging = f"({LAST} > 0)"
     stops: dict[str, object] = {
@@ -101,10 +102,10 @@ def _library(ocp: OptimalControl, settings: PlainSettings) -> Native:
         "ITERATIONS": f"({converging} ? {MOST} : {settings.iterations or CAP})",
     }
     driver = plain_driver(ocp, settings, stops)
-    return plan_library(ocp, "fpirhc_fixed_point_both", driver, plain_memory(ocp).size)
+    return compiled_plan(ocp, "fpirhc_fixed_point_both", driver, plain_memory(ocp).size)
 
 
-_LIBRARIES: Latest[Native] = Latest(8)
+_LIBRARIES: Latest[ca.Function] = Latest(8)
 
 
 def shifted_plain(ocp: OptimalControl, memory: ca.MX) -> ca.MX:

@@ -1,8 +1,8 @@
 """Bodies in C for Functions whose composed graph is slow to run as generated code.
 
-A driver is a hand-written loop around generated leaf functions, with the same results as a composed Function. The composed
-Function stays the definition: the virtual machine runs it, and it is compiled where a driver does not fit. When C is generated
-for a Function that calls it, its body is replaced by a call of the driver. The first one finds out whether a column is finite.
+A driver is a hand-written loop around generated leaf functions. The virtual machine runs a composed Function in its place, which
+has the same results, or calls its compiled library. When C is generated for a Function that calls it, its body is replaced by a
+call of the driver. The first one finds out whether a column is finite.
 """
 
 from __future__ import annotations
@@ -73,18 +73,12 @@ _LATEST: Latest[ca.Function] = Latest(16)
 class Driver:
     """The C text of a driver."""
 
-    # C code that defines `int ENTRY(arg, res, iw, w, mem)`, CasADi's C signature, and calls the leaves by their keys. ROOM
-    # is defined there as the numbers that it has in w. Leaves are scalar code, which needs no w and no iw; all their
-    # arguments and results have an address.
+    # C code that defines `int ENTRY(arg, res, iw, w, mem)`, with ROOM numbers in w, and calls the leaves by their keys, without w
+    # and iw: one that needs room for its work, as tables of `ca.interpolant` do, has its own. No argument or result is absent.
     text: str
     leaves: Mapping[str, ca.Function]  # generated Functions by key
     constants: Mapping[str, object]  # preprocessor definitions by name
     room: int = 0  # numbers that the driver needs in w
-
-    @property
-    def fits(self) -> bool:
-        """Whether its loops can call the leaves: one that calls a table of `ca.interpolant` needs memory for its work."""
-        return all(map(works_alone, self.leaves.values()))
 
     def source(self) -> str:
         """Return the whole C file, in which the entry is called ENTRY."""
@@ -94,33 +88,44 @@ class Driver:
             generator.add(leaf)
         # The leaves belong to this file alone: the same names in other drivers must not meet in one library.
         generated = re.sub(r"^CASADI_SYMBOL_EXPORT ", "static ", generator.dump(), flags=re.MULTILINE)
-        generated = _ABSENT.sub(lambda found: found[2] or "", generated)
-        defined = {**self.constants, **{name: f"fpirhc_leaf_{name}" for name in self.leaves}, "ROOM": self.room}
-        definitions = (f"#define {name} {value}" for name, value in defined.items())
-        return "\n".join([of_type(generated), WORDS, *definitions, _FAST, self.text])
+        working = [leaf for leaf in named if leaf.find_functions()]
+        if not working:
+            generated = _ABSENT.sub(lambda found: found[2] or "", generated)
+        called = {
+            k: f"{f.name()}{'_at_work' * bool(f.find_functions())}" for k, f in zip(self.leaves, named, strict=True)
+        }
+        definitions = (
+            f"#define {name} {value}" for name, value in {**self.constants, **called, "ROOM": self.room}.items()
+        )
+        return "\n".join([of_type(generated), *map(_at_work, working), WORDS, *definitions, _FAST, self.text])
+
+
+def _at_work(leaf: ca.Function) -> str:
+    """A C function that calls a leaf with room for its work."""
+    name, given, made = leaf.name(), leaf.sz_arg(), leaf.sz_res()
+    return f"""static int {name}_at_work{SIGNATURE} {{
+  const casadi_real* given[{max(given, 1)}];
+  casadi_real *made[{max(made, 1)}], work[{max(leaf.sz_w(), 1)}];
+  casadi_int places[{max(leaf.sz_iw(), 1)}], k;
+  for (k = 0; k < {leaf.n_in()}; ++k) given[k] = arg[k];
+  for (k = 0; k < {leaf.n_out()}; ++k) made[k] = res[k];
+  (void)iw, (void)w, (void)mem;
+  return {name}(given, made, places, work, 0);
+}}"""
 
 
 def with_driver(name: str, driver: Driver, build: Callable[[str], ca.Function]) -> ca.Function:
-    """Return `build(unique name)` with this driver as its body in C, where it fits; the same body has the same Function."""
-    unique = registered(name, driver) if driver.fits else _unique(name, driver.source())
+    """Return `build(unique name)` with this driver as its body in C; the same body has the same Function."""
+    unique = registered(name, driver)
     return _LATEST.of((), (unique,), lambda: build(unique))
 
 
 def registered(name: str, driver: Driver) -> str:
     """Return the unique name of a driver: a Function of this name has it as its body in C."""
     source = driver.source()
-    unique = _unique(name, source)
+    unique = f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     _drivers[unique] = driver, source
     return unique
-
-
-def _unique(name: str, source: str) -> str:
-    return f"{name}_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-
-
-def works_alone(function: ca.Function) -> bool:
-    """Return whether the C of a Function needs no memory for its work: scalar code without calls has variables of its own."""
-    return bool(function.is_a("SXFunction")) and not function.find_functions()
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache, cached_property
+from importlib.util import find_spec
 from pathlib import Path
 
 import casadi as ca
@@ -51,7 +52,7 @@ class Native:
 
 
 def find_compiler() -> str | None:
-    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc or clang; None where FPIRHC_CC is 'none' or there is none.
+    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc, clang or ziglang; None where FPIRHC_CC is 'none' or there is none.
 
     Where FPIRHC_CC names a compiler, no other one replaces it.
     """
@@ -62,7 +63,13 @@ def find_compiler() -> str | None:
         path = shutil.which(name) if name else None
         if path:
             return path
-    return None
+    package = find_spec("ziglang")
+    return shutil.which("zig", path=str(Path(package.origin).parent)) if package and package.origin else None
+
+
+def command_of(compiler: str) -> tuple[str, ...]:
+    """Return how a compiler of `find_compiler` is called: that of ziglang is a part of zig, whose checks would end the process."""
+    return (compiler, "cc", "-fno-sanitize=undefined") if Path(compiler).stem == "zig" else (compiler,)
 
 
 def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False, calls: int = 0) -> Native:
@@ -165,12 +172,12 @@ def why_no_compiler() -> str:
         return "compilation is turned off (FPIRHC_CC=none)"
     if setting:
         return f"the C compiler '{setting}', asked for by FPIRHC_CC, was not found"
-    return "no C compiler was found (looked for CC, cc, gcc, clang)"
+    return "no C compiler was found (looked for CC, cc, gcc, clang, ziglang)"
 
 
 @cache
 def _version(compiler: str) -> str:
-    process = _run([compiler, "--version"])
+    process = _run([*command_of(compiler)[:2], "--version"])
     return process.stdout + process.stderr
 
 
@@ -199,7 +206,7 @@ class _Unit:
 
 def _unit(source: str, compiler: str, more: Sequence[str]) -> _Unit:
     level = "-O3" if len(source) < _LARGE else "-O1"
-    return _Unit(source, (compiler, level, *_FLAGS, *_machine_flags(), *more, "-c"))
+    return _Unit(source, (*command_of(compiler), level, *_FLAGS, *_machine_flags(), *more, "-c"))
 
 
 @cache
@@ -231,7 +238,7 @@ class _Library:
     def __init__(self, function: ca.Function, compiler: str, flags: Sequence[str], calls: int) -> None:
         flags = *flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", ""))
         self._what, self._compiler, self._flags = (function, calls), compiler, flags
-        self._link = (compiler, *flags, *_LINK)
+        self._link = (*command_of(compiler), *flags, *_LINK)
         try:
             content = function.serialize()
         except RuntimeError:

@@ -14,6 +14,12 @@ from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_t
 
 NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
 _PART = re.compile(r"^(?=/\* \w+:\(.*\*/\nstatic int casadi_f\d+\(|CASADI_SYMBOL_EXPORT )", re.MULTILINE)
+# What CasADi writes about libraries, which the virtual machine calls in place of drivers: C has the drivers themselves.
+_LIBRARIES = "/* External functions */\n"
+_LIBRARY = re.compile(
+    r"^(?:int|void) fpirhc_\w+\([^)]*\);\n|^(?:CASADI_SYMBOL_EXPORT )?void \w+_(?:in|de)cref\(void\) \{[^}]*\}\n+",
+    re.MULTILINE,
+)
 _OWN = re.compile(r"/\* (?P<name>\w+):\(.*\*/\nstatic int (?P<place>casadi_f\d+)\([^{]*\{\n")
 
 
@@ -22,7 +28,7 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
 
     `function`: the Function. `calls`: number of calls in a row, as in `chained`; 0: it is called once.
     """
-    called = function.find_functions()
+    called = _called(function)
     if any(f.is_a("External") for f in called):
         raise NoCode("it calls a Function that is already compiled; compile the whole instead")
     if calls:
@@ -52,12 +58,18 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
     return of_type(_with_bodies(source, bodies, declared)), *map(file_of, drivers)
 
 
+def _called(function: ca.Function) -> list[ca.Function]:
+    """The Functions that a Function calls, and those that these call; what a driver calls is replaced by it."""
+    found = {f.name(): f for f in ([] if is_driver(function.name()) else function.find_functions(0))}
+    return list({f.name(): f for one in found.values() for f in (one, *_called(one))}.values())
+
+
 def _with_bodies(source: str, bodies: Mapping[str, str], declared: str) -> str:
     """The C in which some Functions have other bodies, and without what the old ones alone called.
 
     What is dead is most of the text of a plan, and would have it compiled with less optimising.
     """
-    head, *parts = _PART.split(source)
+    head, *parts = _PART.split(_LIBRARY.sub("", source) if _LIBRARIES in source else source)
     written, waiting = dict[str, str](), list[str]()
     for k, part in enumerate(parts):
         own = _OWN.match(part)

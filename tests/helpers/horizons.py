@@ -1,20 +1,14 @@
 """Optimal control problems that are posed by hand, and plans rolled out stage by stage."""
 
-import shutil
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
-import pytest
 
 import fpirhc as fp
 from fpirhc.conformance import posed
 from helpers.plants import pendulum
-
-NEEDS_C = pytest.mark.skipif(
-    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="this machine has no C compiler"
-)
 
 
 def horizon_of(

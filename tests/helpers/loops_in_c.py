@@ -1,4 +1,4 @@
-"""Horizons on which the loops in C are compared with the graphs that define them, call by call and number by number."""
+"""Horizons on which the loops in C are compared with what the virtual machine runs, call by call and number by number."""
 
 import os
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ REST = fp.Trajectory(lambda t: {"a": 0.3 * ca.sin(t), "b": 0 * t})
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A composed graph and the same Function as compiled loops."""
+    """A step as the virtual machine runs it, and the same Function as compiled loops."""
 
     ocp: Any
     data: np.ndarray
@@ -30,7 +30,7 @@ class Pair:
         return int(self.graph.size1_in(4))
 
     def both(self, *arguments) -> Iterator[list[np.ndarray]]:
-        """Plan, diagnostics and memory by the graph, and by the loops."""
+        """Plan, diagnostics and memory in the virtual machine, and by the loops."""
         for function in (self.graph, self.loops):
             yield [np.asarray(v.full()) for v in function(*arguments)]
 
@@ -58,28 +58,22 @@ def _terms(v):
     }
 
 
-def _bent(v):
-    return {**_terms(v), "bent": -18.0 * v.state.b**2}
-
-
 def _terminal(v):
     return 90.0 * (v.state.a - v.reference.a) ** 2 + 40.0 * v.state.b**2 + 9.0 * v.state["a'"] ** 2
 
 
 @cache
-def coupled(limits: fp.Limits | None = None, stages: int = 4, *, convex: bool = True) -> tuple[Any, np.ndarray]:
+def coupled(limits: fp.Limits | None = None, stages: int = 4) -> tuple[Any, np.ndarray]:
     """The horizon of these two with a cost whose curvature changes with states and inputs, and couples them."""
-    cost = fp.CustomCost(terms=_terms if convex else _bent, terminal=_terminal, feedforward=True)
+    cost = fp.CustomCost(terms=_terms, terminal=_terminal, feedforward=True)
     horizon, plant = fp.Horizon(stages=stages, step=0.15), coupled_plant()
     return horizon_of(plant, REST, horizon, cost, limits, time=0.3)
 
 
 @cache
-def pair(
-    kind: str, optimiser: fp.FixedPoint, limits: fp.Limits | None = None, stages: int = 4, *, convex: bool = True
-) -> Pair:
+def pair(kind: str, optimiser: fp.FixedPoint, limits: fp.Limits | None = None, stages: int = 4) -> Pair:
     """Graph and loops of `step` or `converging`."""
-    ocp, data = coupled(limits, stages, convex=convex)
+    ocp, data = coupled(limits, stages)
     graph = getattr(optimiser, kind)(ocp)
     return Pair(ocp, data, graph, compiled(graph))
 

@@ -194,7 +194,7 @@ def same_optimum(seed: int) -> bool:
 
 
 def test_what_the_roll_out_of_a_solved_plan_adds_to_a_limit_is_no_failure():
-    """A rocket's plan with gaps keeps its limits to 1e-8 of their ranges, and rolled out to 4e-8: OK, in C and in the graph."""
+    """A rocket's plan with gaps keeps its limits to 1e-8 of their ranges, and rolled out to 4e-8: OK, whole and alone."""
     case, number = FOREIGN["rocket"](), 112
     ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, case.limits, time=11.2)
     start = case.first(ocp, first_states(case, 150, 3)[:, number])

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from foreign import FOREIGN
-from helpers.horizons import horizon_of
+from helpers.horizons import called, horizon_of
 
 import fpirhc as fp
 from fpirhc.conformance import compiled
@@ -38,10 +38,6 @@ def warm(name):
     return ocp, first, data, OPTIMISER.first_memory(ocp, first, data)
 
 
-def called(function, ocp, first, data, memory):
-    return [np.asarray(v.full()) for v in function(first, data, ocp.input_lower, ocp.input_upper, memory)]
-
-
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_every_plan_of_a_loop_with_a_wrong_model_is_converged(iterations):
     """The quadrotor, 13 % lighter than its model: what `iterations` says without limits of states does not matter with them."""
@@ -58,11 +54,11 @@ def test_every_plan_of_a_loop_with_a_wrong_model_is_converged(iterations):
 def test_a_remembered_plan_of_a_state_that_moved_beyond_its_limit_is_told_in_few_iterations():
     """Jumps of the temperature by up to 6 K, and back: the plan and the verdict are those from nothing, INFEASIBLE above 3 K."""
     ocp, first, data, memory = warm("reactor")
-    step, verdicts = compiled(OPTIMISER.step(ocp)), []
+    step, bounds, verdicts = compiled(OPTIMISER.step(ocp)), (ocp.input_lower, ocp.input_upper), []
     for jump in (3.0, 5.0, -3.0, 6.0, 0.0, 4.0, -5.0):
         moved = first + np.array([0.0, jump, 0.0])
-        _, diagnostics, memory = called(step, ocp, moved, data, memory)
-        fresh = called(step, ocp, moved, data, OPTIMISER.memory(ocp).start())[1]
+        _, diagnostics, memory = called(step, moved, data, *bounds, memory)
+        fresh = called(step, moved, data, *bounds, OPTIMISER.memory(ocp).start())[1]
         assert diagnostics[4, 0] == fresh[4, 0]
         assert diagnostics[3, 0] < 40
         verdicts.append(int(diagnostics[4, 0]) == fp.Status.INFEASIBLE)

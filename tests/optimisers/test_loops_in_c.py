@@ -4,12 +4,12 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.horizons import NEEDS_C
 from helpers.loops_in_c import pair, within_its_arrays
+from helpers.machine import needs_compiler
 
 import fpirhc as fp
 
-pytestmark = NEEDS_C
+pytestmark = needs_compiler
 WIDE = np.array([-9.0, -900.0]), np.array([9.0, 900.0])
 NARROW = np.array([-0.7, -110.0]), np.array([1.2, 40.0])
 

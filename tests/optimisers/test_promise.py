@@ -1,10 +1,13 @@
 """Status OK is a promise about the plan that is sent: on an unstable plant a plan that is not solved says so."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
 
 import fpirhc as fp
+from fpirhc.errors import CompileError, NotInstalled
 
 LEVITATION = fp.Plant.of_states(
     states={"g": "mm", "w": "mm/s", "i": "A"},
@@ -60,3 +63,20 @@ def test_a_ball_that_is_held_is_held_by_plans_that_are_ok(optimiser):
     error, status = levitated(optimiser)
     assert error[500:].max() < 1e-3
     assert (status == fp.Status.OK).all()
+
+
+ASKED = r"need a C compiler \(the system's, or pip install ziglang\): compilation is turned off"
+
+
+@pytest.mark.parametrize(
+    ("compiler", "error", "words"), [("none", NotInstalled, ASKED), ("false", CompileError, "failed")]
+)
+def test_limits_of_states_need_a_compiler(monkeypatch, compiler, error, words):
+    """No plan is made of zeros: without a compiler, or where it fails, such plans are refused; others run without it."""
+    monkeypatch.setenv("FPIRHC_CC", compiler)
+    short = replace(PROBLEM, duration=3e-3, measure_from=0.0)
+    limited = replace(short, limits=fp.Limits(inputs=short.limits.inputs, states={"g": (2.0, 20.0)}))
+    controller = fp.RecedingHorizon(fp.FixedPoint(tolerance=1e-3))
+    with pytest.raises(error, match=words):
+        fp.simulate(limited, controller, seed=0, compiled=False)
+    assert not fp.simulate(short, controller, seed=0).compiled

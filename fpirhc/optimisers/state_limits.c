@@ -1,9 +1,33 @@
 /* FixedPoint with limits of states, or where its plain iteration does not contract: pure and interior steps.
 
-   The same mathematics as the composed graph in limited.py, which is the reference it is tested against. Before this text stand
-   kernels.c, limited_sweep.c, limited_bounds.c, what they need, and the stage function guess, the sizes ITERATIONS and MEMORY, the
-   settings and the constants of the search. One turn of the loop expands one plan, judges it, and finds the next by a sweep. */
+   Before this text stand kernels.c, state_limits_sweep.c, what they need, and the stage function guess, the sizes ITERATIONS and
+   MEMORY, and the settings. One turn of the loop expands one plan, judges it, and finds the next one by a sweep. A phase of pure
+   steps accepts a plan that halves the scaled error E of the first-order conditions, with patience for a few steps, because a change
+   of the active limits raises E at first. A phase of interior steps accepts a plan by a filter of infeasibility theta and barrier
+   function phi, as in IPOPT. Where the filter accepts none, a Levenberg-Marquardt term grows, then another first plan is tried, and
+   at last descents: rollouts that carry a share of the gaps and lower phi + price sum |gaps| / unit (docs/theory.md). */
 
+#define PATIENCE 3     /* pure steps in a row that may fail to halve the error: the active limits are changing */
+#define HOPELESS 1e2   /* scaled error from which on there is no patience: multipliers are at their largest value */
+#define AHEAD 0.1      /* of the tolerance: where one more step by Gauss-Newton is expected to arrive, the exact Hessian is not computed */
+#define PURE_STEPS 10
+#define ROLLED_OUT 10.0 /* times FEASIBLE at which what is sent counts as converged: the roll-out of a plan moves it in its limits */
+#define MU_WARM 1e-4   /* barrier parameter of a remembered plan, and how far it is raised, in units of the cost */
+#define MU_MOST 0.1
+#define MU_END 1e-5    /* where pure steps are tried first, and last: there limits whose multipliers nearly vanish are 1e-7 of a unit away */
+#define MU_LEAST 1e-15
+#define MU_ROUNDS 8    /* reductions after one accepted plan */
+#define FILTER 64      /* pairs that the filter holds */
+#define POOR 0.1       /* share of a step from a remembered plan below which its barrier is raised, at most so often in a call */
+#define MOST_REWARMS 3
+#define MOST_RAISES 12 /* of the Levenberg-Marquardt term before another first plan is tried */
+#define ROUNDING OF_TYPE(1e-12, 1e-5) /* of the cost: smaller differences are rounding */
+#define LEAST_DAMPING 1e-7 /* of the Levenberg-Marquardt term of descents, and of the fall that a plan of theirs must bring */
+#define NEARLY 1.1     /* the price of gaps of a descent, in units of the largest costate: at least, and where it must rise */
+#define ABOVE 2.0
+
+/* First plans: the state held, its inputs rolled out, the reference; and, where all of these failed, those two for descents. */
+enum { HELD, ROLLED, REFERENCE, DESCENT, LAST_START };
 enum { PURE, INTERIOR };
 enum { BEGINS, ENDS };                   /* where a pure phase stands: before an interior one, or after it */
 enum { KEPT, COLD, WARM };               /* how an interior phase gets its slacks */
@@ -224,6 +248,7 @@ static int rewarmed(Machine* m) {
   return ++m->rewarms;
 }
 
+/* Sources: R. Fletcher, S. Leyffer, Math. Program. 91, 2002; A. Waechter, L. T. Biegler, Math. Program. 106, 2006, section 2.3. */
 static int passes(Machine* m, casadi_real theta, casadi_real phi) {
   int k, falls, descends;
   casadi_real slack = ROUNDING * (COST + fabs(m->phi));
@@ -325,7 +350,7 @@ static int judged(Machine* m, Point* old, Point* p, int ok, int rolled, In s0, I
 static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   int ok;
   if (m->phase == PURE) {
-    pure_terms(&m->limits, p, &m->room->y, m->room->g, m->last.gap < 1e-6, m->room->weight, m->room->lean);
+    pure_terms(&m->limits, p, &m->room->y, m->room->g, m->last.gap < CLOSED, m->room->weight, m->room->lean);
   } else {
     if (m->slacks != KEPT) put_inside(&m->limits, p, &m->room->y, m->mu, m->slacks == WARM);
     if (m->descends) put_on_path(&m->limits, p, &m->room->y, m->mu, m->slacks == COLD);

@@ -1,15 +1,16 @@
-"""The loops in C with limits of states are the composed graph: plan, numbers and memory, after a few turns and at the end."""
+"""The loops in C with limits of states: whatever they are called with, after a few turns and at the end."""
 
 import sys
 
 import numpy as np
 import pytest
-from helpers.horizons import NEEDS_C
+from helpers.horizons import rolled
 from helpers.loops_in_c import Pair, pair, within_its_arrays
+from helpers.machine import needs_compiler
 
 import fpirhc as fp
 
-pytestmark = NEEDS_C
+pytestmark = needs_compiler
 LIMITS = fp.Limits(inputs={"Ma": (-2.0, 2.5), "Mb": (-150.0, 120.0)}, states={"a": (-0.5, 0.6), "a'": (-np.inf, 1.2)})
 END = 60  # more turns than any of these horizons needs
 
@@ -19,31 +20,18 @@ def loops(turns: int, kind: str = "step") -> Pair:
     return pair(kind, fp.FixedPoint(iterations=1, tolerance=1e-7, most_iterations=turns), LIMITS, 3)
 
 
-def same(one: list[np.ndarray], other: list[np.ndarray], allowed: float = 1e-7) -> None:
-    """Equal entries to rounding: barriers make large numbers, of which the same digits count."""
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_allclose(a, b, rtol=allowed, atol=allowed)
-
-
 def called(both: Pair, first: np.ndarray, memory: np.ndarray, bounds=None, data=None) -> tuple[np.ndarray, ...]:
-    """What the loops give, compared with the graph."""
+    """What the plan gives: finite, and the same bits as a library and in a whole loop."""
     lower, upper = bounds or (both.ocp.input_lower, both.ocp.input_upper)
     one, other = both.both(first, both.data if data is None else data, lower, upper, memory)
-    same(one[:2], other[:2])
-    same(one[2:], other[2:], 1e-5)  # rounding is multiplied in what is only remembered
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
     plan, diagnostics, after = other
+    assert np.isfinite(np.concatenate([plan.ravel(), diagnostics.ravel()])).all()
     return plan, diagnostics[:, 0], after
 
 
-SEEN = {
-    1: {fp.Status.NOT_CONVERGED},
-    3: {fp.Status.NOT_CONVERGED},
-    8: {fp.Status.NOT_CONVERGED, fp.Status.OK},
-    END: {fp.Status.OK, fp.Status.INFEASIBLE},
-}
-
-
-@pytest.mark.parametrize("turns", SEEN)
+@pytest.mark.parametrize("turns", [1, 3, 8, END])
 def test_calls_that_are_cut_off_after_every_turn(turns):
     """From nothing and from what was remembered of a state nearby, of one far away, and of one outside its limits."""
     both, random, statuses = loops(turns), np.random.default_rng(0), set()
@@ -52,14 +40,7 @@ def test_calls_that_are_cut_off_after_every_turn(turns):
         for _ in range(3):
             _, diagnostics, memory = called(both, size * random.normal(size=3), memory)
             statuses.add(int(diagnostics[4]))
-    assert statuses >= SEEN.get(turns, set())
-
-
-def test_remembered_plans_that_their_limits_block():
-    """The state has moved to a limit, again and again: the barrier of the remembered plan is raised until a step is possible."""
-    both, memory = loops(END), np.zeros(loops(END).size)
-    for k in range(8):
-        _, _, memory = called(both, np.array([0.1 + 0.06 * k, 0.2, (-1.0) ** k * (0.4 + 0.1 * k)]), memory)
+    assert statuses >= ({fp.Status.OK, fp.Status.INFEASIBLE} if turns == END else {fp.Status.NOT_CONVERGED})
 
 
 def test_a_solution_stays():
@@ -76,29 +57,29 @@ def test_a_solution_stays():
 
 @pytest.mark.parametrize("turns", [3, 8])
 def test_any_memory(turns):
-    """Barriers, dampings and multipliers of any size, what no run would remember, and inputs alone as a guess."""
+    """Barriers, dampings and multipliers of any size, and what no run would remember."""
     both, random = loops(turns), np.random.default_rng(1)
     for barrier in (1e-4, 1e-2, 1.0, 0.0, -1.0):
         for damping in (0.0, 1e-3, 10.0):
             memory = 0.3 * random.normal(size=both.size)
             memory[-2:] = barrier, damping
             memory[45:54:4] = 0.0  # of the limit that is not there
-            called(both, 0.3 * random.normal(size=3), memory)
-    guess = np.zeros(both.size)
-    guess[:6] = random.normal(size=6)
-    called(both, 0.3 * random.normal(size=3), guess)
+            _, diagnostics, after = called(both, 0.3 * random.normal(size=3), memory)
+            assert np.isfinite(after).all()
+            assert int(diagnostics[4]) != fp.Status.NON_FINITE
 
 
 def test_bounds_of_the_call_count():
     """Narrower bounds than the problem's, none at all on one side, and an empty box."""
     both = loops(END)
     first, inf = np.array([0.2, -0.1, 0.3]), np.inf
-    for low, high in (
+    boxes = (
         ([-0.3, -20.0], [0.4, 10.0]),
         ([-inf, -50.0], [1.0, inf]),
         ([-inf, -inf], [inf, inf]),
-        ([0.4, -100.0], [0.4, 100.0]),
-    ):
+        ([0.4, -9.0], [0.4, 9.0]),
+    )
+    for low, high in boxes:
         plan, _, _ = called(both, first, np.zeros(both.size), (np.array(low), np.array(high)))
         assert (plan >= np.array(low)[:, None] - 1e-12).all()
         assert (plan <= np.array(high)[:, None] + 1e-12).all()
@@ -114,17 +95,11 @@ def test_what_is_not_finite(bad):
     """A state or data that are no numbers are told and leave a memory alone; a memory that is none is forgotten."""
     both = loops(END)
     memory = called(both, np.array([0.2, 0.1, -0.2]), np.zeros(both.size))[2]
-    for entry in range(3):
-        first = np.array([0.2, 0.1, -0.2])
-        first[entry] = bad
-        plan, diagnostics, after = called(both, first, memory)
-        assert int(diagnostics[4]) == fp.Status.NON_FINITE
-        assert np.isfinite(plan).all()
-        np.testing.assert_array_equal(after, memory)
-    for place in (0, both.data.size // 2, both.data.size - 1):
-        data = both.data.copy()
-        data.flat[place] = bad
-        _, diagnostics, after = called(both, np.array([0.2, 0.1, -0.2]), memory, data=data)
+    rest, size = np.array([0.2, 0.1, -0.2]), both.data.size
+    for place in (0, 1, 2, 3, 3 + size // 2, 2 + size):
+        values = np.concatenate([rest, both.data.ravel()])
+        values[place] = bad
+        plan, diagnostics, after = called(both, values[:3], memory, data=values[3:].reshape(both.data.shape))
         assert int(diagnostics[4]) == fp.Status.NON_FINITE
         np.testing.assert_array_equal(after, memory)
     plan, _, _ = called(both, np.full(3, bad), np.full(both.size, bad))
@@ -137,18 +112,6 @@ def test_what_is_not_finite(bad):
         assert np.isfinite(after).all()
 
 
-def test_a_model_that_overflows():
-    """First states, and remembered plans, under which nothing is finite: another first plan, or NON_FINITE and zeros."""
-    both = loops(END)
-    for first in (np.array([0.1, 1e200, 0.1]), np.array([1e160, 0.0, 0.0])):
-        called(both, first, np.zeros(both.size))
-    memory = called(both, np.array([0.2, 0.1, -0.2]), np.zeros(both.size))[2]
-    memory[6:9] = 1e200
-    _, diagnostics, after = called(both, np.array([0.2, 0.1, -0.2]), memory)
-    assert np.isfinite(after).all()
-    assert int(diagnostics[4]) != fp.Status.NON_FINITE
-
-
 def test_a_plan_that_leaves_a_limit_is_never_called_ok():
     """What the loops call OK keeps the limits when it is simulated, and is stationary; what leaves them is not OK."""
     both, random = loops(END), np.random.default_rng(5)
@@ -156,24 +119,11 @@ def test_a_plan_that_leaves_a_limit_is_never_called_ok():
     for _ in range(12):
         first = np.array([0.5, 0.4, 1.0]) * random.normal(size=3)
         plan, diagnostics, _ = called(both, first, np.zeros(both.size))
-        state, worst = first, 0.0
-        for k in range(both.ocp.stages):
-            state = np.asarray(both.ocp.dynamics(state, plan[:, k], both.data[:, k]).full())[:, 0]
-            broken = np.maximum(both.ocp.state_lower - state, state - both.ocp.state_upper).max()
-            worst = max(worst, float(broken))
+        states = rolled(both.ocp, first, plan, both.data).states[:, 1:].T
+        worst = float(np.maximum(both.ocp.state_lower - states, states - both.ocp.state_upper).max())
         assert diagnostics[2] == pytest.approx(max(worst, 0.0), abs=1e-9)
         verdicts.add((int(diagnostics[4]) == fp.Status.OK, worst <= 1e-6))
     assert verdicts == {(True, True), (False, False)}
-
-
-def test_a_cost_that_bends_downwards():
-    """Where neither quadratic model is convex the step is damped."""
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-7, most_iterations=12, hessian=fp.ExactHessian())
-    both, random = pair("step", optimiser, LIMITS, 3, convex=False), np.random.default_rng(6)
-    for size in (0.2, 0.6, 1.0):
-        memory = np.zeros(both.size)
-        for _ in range(2):
-            _, _, memory = called(both, size * random.normal(size=3), memory)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it needs the traps of GCC or Clang on Linux")

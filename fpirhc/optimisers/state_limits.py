@@ -1,19 +1,21 @@
-"""The iteration of `FixedPoint` on horizons with limits of states, and where its plain iteration does not contract.
+"""The iteration of `FixedPoint` on horizons with limits of states, and where its plain iteration does not contract: loops in C.
 
 Theory: docs/theory.md.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import resources
 
 import casadi as ca
 import numpy as np
 
+from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import (
     ExactHessian,
     GaussNewton,
+    HessianModel,
     hessian_end,
     hessian_stage,
     partial_count,
@@ -21,40 +23,73 @@ from fpirhc.horizon.hessian_models import (
     split_stage,
 )
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.riccati import PIVOT
-from fpirhc.optimisers import limited_settings as constants
-from fpirhc.optimisers.base import FEASIBLE, KEPT, LAST, plan_library, shift, shift_gains, with_last
-from fpirhc.optimisers.bounds import BOUNDARY, ENOUGH, HAIR, STIFF, Scales, scales
-from fpirhc.optimisers.limited_graph import limited_graph
-from fpirhc.optimisers.limited_phases import guess
-from fpirhc.optimisers.limited_settings import LimitedSettings, limited_memory
+from fpirhc.optimisers.base import FEASIBLE, KEPT, LAST, compiled_plan, shift, shift_gains, with_last
+from fpirhc.optimisers.bounds import Scales, scales
 from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
-from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
+from fpirhc.symbolic.driver import Driver
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.native import Native
+from fpirhc.symbolic.layout import Layout, Signal, discrete
 
-_TEXTS = ("kernels", "limited_sweep", "limited_bounds", "limited")
+MU_WARM = 1e-4  # barrier parameter of a remembered plan, in units of the cost
+_TEXTS = ("kernels", "state_limits_sweep", "state_limits")
+
+
+@dataclass(frozen=True)
+class LimitedSettings:
+    """Settings of one Function."""
+
+    tolerance: float  # of the stationarity, in the unit of the inputs
+    feasible: float  # violation of a state bound, as a share of its unit, below which a call may end
+    map: Deformation  # the deformation of pure steps
+    hessian: (
+        HessianModel | None
+    )  # second derivatives; None: exact, and Gauss-Newton first where a remembered plan is improved
+    damping: float  # added to the curvature of the inputs, in units of it
+    iterations: int  # most iterations of one call
+
+
+def limited_memory(ocp: OptimalControl) -> Layout:
+    """Return the layout of the plan, its states and costates s_1 ... s_N, its feedback, its multipliers, mu and the damping.
+
+    `plan_barrier` is zero where no plan is remembered.
+    """
+    n, states, inputs = range(ocp.stages), ocp.state.elements, ocp.input.elements
+    rows = (*inputs, *(states[k] for k in scales(ocp).bounded))
+    later = tuple(f"{e}@{k + 1}" for k in n for e in states)
+    multipliers = tuple(f"{side} {e}@{k}" for side in ("lower", "upper") for k in n for e in rows)
+    return Layout(
+        (
+            Signal("plan_inputs", tuple(f"{e}@{k}" for k in n for e in inputs)),
+            Signal("plan_states", later),
+            Signal("plan_costates", later),
+            Signal("plan_gains", tuple(f"{e}/{x}@{k}" for k in n for x in states for e in inputs)),
+            Signal("plan_multipliers", multipliers),
+            discrete("plan_barrier"),
+            discrete("plan_damping"),
+        )
+    )
 
 
 def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
-    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
-    if plans_are_compiled():
-        alike = replace(settings, iterations=0)
-        library = _LIBRARIES.of((ocp, settings.map), (alike,), lambda: _library(ocp, alike))
-        if library.compiled:
-            return with_last(ocp, library.function, settings.iterations)
-    return with_driver("fpirhc_limited", _driver(ocp, settings), lambda name: limited_graph(ocp, settings, name))
+    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
+
+    Raises:
+        NotInstalled: there is no C compiler.
+        CompileError: it failed, as where the model calls what cannot be written as C.
+    """
+    # The number of iterations is an argument of the loops: one library serves a loop and plans in open loop.
+    alike = replace(settings, iterations=0)
+    plan = _PLANS.of((ocp, settings.map), (alike,), lambda: _compiled(ocp, alike))
+    return with_last(ocp, plan, settings.iterations)
 
 
-def _library(ocp: OptimalControl, settings: LimitedSettings) -> Native:
-    """The driver alone as a library, whose last argument is the number of iterations that a call may take."""
-    driver = _driver(ocp, settings, LAST)
-    return plan_library(ocp, "fpirhc_limited_both", driver, limited_memory(ocp).size)
+def _compiled(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
+    return compiled_plan(ocp, "fpirhc_limited", _driver(ocp, settings), limited_memory(ocp).size)
 
 
-_LIBRARIES: Latest[Native] = Latest(8)
+_PLANS: Latest[ca.Function] = Latest(8)
 
 
 def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
@@ -72,8 +107,8 @@ def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
     return layout.join({**parts, **shifted_parts})
 
 
-def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = "") -> Driver:
-    """The loops in C with what they call; `iterations` are those of the settings unless the text is given."""
+def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
+    """The loops in C with what they call."""
     measures = scales(ocp)
     leaves = {
         "evaluate": split_stage(ocp)["evaluate"],
@@ -82,17 +117,17 @@ def _driver(ocp: OptimalControl, settings: LimitedSettings, iterations: str = ""
         "plain": hessian_stage(ocp, GaussNewton()),
         "end": hessian_end(ocp),
         "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
-        "guess": guess(ocp),
+        "guess": _guess(ocp),
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
     sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
-    constants = {**sizes, **_constants(settings, measures), "ITERATIONS": iterations or settings.iterations}
+    constants = {**sizes, **_constants(settings, measures), "ITERATIONS": LAST}
     return Driver("\n".join(texts), leaves, constants, _room(ocp, measures))
 
 
 def _room(ocp: OptimalControl, measures: Scales) -> int:
-    """Numbers of the struct Room of limited.c."""
+    """Numbers of the struct Room of state_limits.c."""
     nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
     inputs, states, limits = n * nu, (n + 1) * ns, n * (nu + len(measures.bounded))
     point = 2 * inputs + states + n * ns * (2 + ns + nu) + ns + ns * ns + 1
@@ -128,23 +163,30 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
         **{s.name: s for s in (Status.NOT_CONVERGED, Status.INFEASIBLE, Status.NON_FINITE)},
     }
     return {
-        **{name: value for name, value in vars(constants).items() if name.isupper()},
         **{name: int(status) for name, status in statuses.items()},
         "COST": repr(float(measures.cost)),
-        "ENOUGH": ENOUGH,
-        "STIFF": STIFF,
-        "BOUNDARY": BOUNDARY,
-        "HAIR": HAIR,
-        "PIVOT": PIVOT,
         "NEAR_LIMIT": FEASIBLE,
         "KEPT_SHARE": KEPT,
-        "ROUNDING": f"OF_TYPE({constants.ROUNDING}, 1e-5)",
         "DAMPING": repr(float(settings.damping)),
         "TOLERANCE": repr(float(settings.tolerance)),
         "FEASIBLE": repr(float(settings.feasible)),
-        "SCALED_TOLERANCE": repr(settings.scaled_tolerance(measures)),
-        "PLAIN_FIRST": int(settings.plain_first),
+        "SCALED_TOLERANCE": repr(float(max(settings.tolerance / measures.inputs.min(), 1e-12))),
+        "PLAIN_FIRST": int(settings.hessian is None),
     }
+
+
+def _guess(ocp: OptimalControl) -> ca.Function:
+    """Function theta -> (reference as a stage's state (ns), feedforward (nu)).
+
+    States without a reference are those of the nodes.
+    """
+    theta = ca.SX.sym("theta", ocp.data.size)
+    reference, forward = (theta[ocp.data.slice(name)] for name in ("reference", "feedforward"))
+    if ocp.inner:
+        reference = ca.vertcat(*(reference[k] if k >= 0 else value for k, value in ocp.inner))
+    rest = ocp.state.size - reference.numel() - ocp.written
+    state = ca.vertcat(reference, *([forward] if rest else []), ca.SX.zeros(ocp.written))
+    return ca.Function("fpirhc_guess", [theta], [ca.densify(state), ca.densify(forward)])
 
 
 def _row(values: np.ndarray) -> str:
