@@ -38,7 +38,7 @@ def warm(name):
     return ocp, first, data, OPTIMISER.first_memory(ocp, first, data)
 
 
-@pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.parametrize("iterations", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_every_plan_of_a_loop_with_a_wrong_model_is_converged(iterations):
     """The quadrotor, 13 % lighter than its model: what `iterations` says without limits of states does not matter with them."""
     p = problem_of("quadrotor", duration=3.0)

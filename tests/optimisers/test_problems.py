@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.horizons import horizon_of
+from helpers.kinds import slow_but
 from helpers.plants import pendulum
 
 import fpirhc as fp
@@ -32,9 +33,7 @@ def test_same_optimum_as_ipopt(name, share):
     np.testing.assert_allclose(plan.inputs, other.inputs, atol=1e-5 * scale)
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in ("two_mass", "cart_pole") else pytest.param(n, marks=pytest.mark.slow) for n in PROBLEMS]
-)
+@pytest.mark.parametrize("name", slow_but(PROBLEMS, "two_mass"))
 def test_one_iteration_per_cycle_is_as_good_as_converged_solving(name):
     """The closed-loop cost is within 1 %, with and without adaptation."""
     task = fp.load_problem(name)
