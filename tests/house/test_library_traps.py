@@ -1,7 +1,6 @@
 """Traps of the libraries below fpirhc: what they do wrong without saying so, and that a guard here catches it."""
 
 import pickle
-import warnings
 from typing import Any
 
 import casadi as ca
@@ -63,17 +62,6 @@ def test_no_adaptation_is_no_frozen_request():
     """A gain of zero would keep the last request for ever; Identity passes on what is desired."""
     request, response, desired = (ca.SX([v]) for v in (1.0, 2.0, 3.0))
     assert float(ca.DM(fp.Identity().step(request, response, desired, {})[0])) == 3.0
-
-
-def test_numpy_on_a_symbol_is_no_silent_array():
-    """It gives a CasADi expression, or refuses; an array of objects would be differentiated as a constant."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            result = np.sin(ca.SX.sym("x"))
-        except (TypeError, AttributeError):
-            return
-    assert isinstance(result, ca.SX)
 
 
 def test_a_power_has_no_finite_derivatives_at_its_kink():
