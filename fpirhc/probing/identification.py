@@ -211,7 +211,7 @@ class Estimates:
         random = np.random.default_rng(seed)
         draws = self.gains + deviations * random.standard_normal((_DRAWS, *self.gains.shape))
         real = np.linalg.eigvals(draws).real
-        self.smallest = float(np.quantile(real.min(axis=1), _QUANTILE))
+        self.smallest, self.least_at_most = map(float, np.quantile(real.min(axis=1), [_QUANTILE, 1 - _QUANTILE]))
         self.largest_real = float(np.quantile(real.max(axis=1), 1 - _QUANTILE))
         self.largest = _largest(draws)
         self.dead, self.lag = (  # the least, the estimated and the greatest of every input, shape (3, n)
@@ -240,9 +240,9 @@ class Estimates:
         """Why nothing may be adapted; empty where something may."""
         if self.largest_real <= 0:
             return "the sign of the gain is wrong: the plant answers against its model; turn the sign of an input in the model"
-        if np.linalg.eigvals(self.gains).real.min() <= 0:
+        if self.least_at_most <= 0:
             return "an eigenvalue of the gains has the wrong sign: an input of the model has, or is paired with the wrong output"
-        if self.uncertain:
+        if self.uncertain or np.linalg.eigvals(self.gains).real.min() <= 0:
             return "the sign of a gain is not certain: excite more or longer (amplitude=, cycles=)"
         return ""
 
