@@ -353,15 +353,17 @@ def rows_of(name: str) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
 
 
 def cells(both: list[tuple[dict, dict]], best: list[np.ndarray], chosen: np.ndarray) -> dict[str, str]:
-    """For every solver the median time of the chosen plans, its ratio to ours in both measurements, and the distance."""
+    """For every solver the median time of the chosen plans, its ratio to ours (mean of both measurements), and the distance."""
     found, unit = {}, [np.median(seconds[OURS][chosen]) for _, seconds in both]
     for way, plans in both[0][0].items():
         middle = [np.median(seconds[way][chosen]) for _, seconds in both]
         away = [float(np.abs(p - b).max() / np.abs(b).max()) for p, b in zip(plans, best, strict=True)]
         away = np.array(away)[chosen]
-        us, ratio = ([f"{m:.3g}" for m in values] for values in (1e6 * np.array(middle), np.divide(middle, unit)))
-        text = f"{us[0]} and {us[1]} us" if way == OURS else f"{us[0]} us, {ratio[0]} and {ratio[1]}"
+        us, ratio = (
+            float(np.exp(np.log(values).mean())) for values in (1e6 * np.array(middle), np.divide(middle, unit))
+        )
         far = int((~(away < 1e-2)).sum())
+        text = f"{us:.0f} us" if way == OURS else f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.2g}"
         found[way] = f"{text}; {np.median(away):.0e}" + (f", {far} far" if far else "")
     return found
 

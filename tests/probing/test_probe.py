@@ -73,6 +73,14 @@ def test_the_estimates_of_a_recording_are_those_of_the_body(gain, dead, lag, noi
     assert found.lines == "deformation=fp.Identity(),"
 
 
+def test_a_gain_that_noise_hides_has_no_certain_sign(tmp_path):
+    """Its estimate is negative, and its interval holds both signs: the input of the model may well be right."""
+    found = fp.probe(recorded(tmp_path / "run.csv", 0.0, 0, 0.0, 0.3), RHC, recording=tmp_path / "run.csv")
+    (gain,) = found.gain["q"].values()
+    assert gain.low < gain.value < 0 < gain.high
+    assert found.why.startswith("the sign of a gain is not certain")
+
+
 def test_a_response_may_be_a_difference_of_speeds(tmp_path):
     problem = recorded(tmp_path / "run.csv", -1.6, 2, 0.0, 0.02, response=False)
     found = fp.probe(problem, RHC, recording=tmp_path / "run.csv")
