@@ -14,7 +14,6 @@ MAP = fp.Affine(gain=-0.4)
 
 
 def plant(wrong: float = 1.5) -> fp.Plant:
-    """A mass on a spring."""
     return fp.Plant(
         coordinates={"y": "m"},
         inputs={"u": "N"},
@@ -40,7 +39,7 @@ def asked(problem: fp.Problem, deformation) -> Any:
 
 
 def lagging() -> fp.Reality:
-    """The same mass behind an actuator: tau du/dt = u_c - u."""
+    """A mass on a spring behind an actuator: tau du/dt = u_c - u."""
     behind = fp.Plant(
         coordinates={"y": "m", "acting": "N"},
         inputs={"u": "N"},

@@ -36,19 +36,15 @@ def drifting(*, exact: float = POLE) -> fp.Problem:
     )
 
 
-def planned(deformation: Deformation | None = None) -> Controller:
-    """A plan with a deformation."""
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-3)
-    return fp.RecedingHorizon(optimiser) if deformation is None else fp.RecedingHorizon(optimiser, deformation)
+def planned(*deformation: Deformation) -> Controller:
+    return fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), *deformation)
 
 
 def alone(problem: fp.Problem, controller: Controller) -> Any:
-    """The answer to the null test."""
     return reviewed.answers(problem, controller)["model"]
 
 
 def rms(problem: fp.Problem, controller: Controller) -> float:
-    """Rms tracking error of a run."""
     run = fp.simulate(problem, controller, seed=0, compiled=False)
     assert run.stop is None
     return float(np.sqrt(np.mean(run["error"][run.time >= problem.measure_from] ** 2)))
