@@ -150,4 +150,4 @@ def _check_self_contained(source: str) -> None:
     # It is not tried even where the header is installed: its library would have to be found and linked too.
     header = re.search(r"^#include <(.+/.+)>", source, re.MULTILINE)
     if header:
-        raise NoCode(f"it calls a solver that cannot be written as C: its own library is needed ({header[1]})")
+        raise NoCode(f"it calls a solver that is not written as C, but linked as a library ({header[1]} is its header)")
