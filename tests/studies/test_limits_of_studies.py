@@ -18,20 +18,10 @@ BOUNDS = (1e-6, 1e6)
 
 def pump(exact: float = 1.0, bounds: tuple[float, float] = BOUNDS, **changes: Any) -> fp.Problem:
     """Y' = b u with a model of gain 1, led from 1 m to rest at zero."""
-    plant = fp.Plant(
-        {"y": "m"},
-        {"u": "V"},
-        {"b": fp.Parameter(1.0, exact, "m/(s V)", bounds=bounds)},
-        lambda q, u, p: {"y": p.b * u.u},
-        order=1,
-    )
-    settings = {
-        "reference": fp.Trajectory(lambda t: {"y": 0 * t}),
-        "start": {"y": 1.0},
-        "period": PERIOD,
-        "duration": 100.0,
-        "measure_from": 80.0,
-    }
+    gain = fp.Parameter(1.0, exact, "m/(s V)", bounds=bounds)
+    plant = fp.Plant({"y": "m"}, {"u": "V"}, {"b": gain}, lambda q, u, p: {"y": p.b * u.u}, order=1)
+    settings = {"reference": fp.Trajectory(lambda t: {"y": 0 * t}), "start": {"y": 1.0}, "period": PERIOD}
+    settings |= {"duration": 100.0, "measure_from": 80.0}
     return fp.Problem(plant=plant, **{**settings, **changes})
 
 
@@ -78,11 +68,9 @@ def test_drawn_plants_are_limited_by_the_largest_of_them():
     """Of a hundred factors up to 1 + P/100 around 0.7 of the limit of the sampled law the largest decides."""
     problem = pump(0.7 * 2 / (PERIOD * RATE), duration=15.0, measure_from=10.0)
     one = limit_of("plants", problem)
-    largest = {
-        percent: max(v.problem.plant.exact[0] for v in fp.Draws(100, percent).of_problem(problem))
-        for percent in (one.holds, one.fails)
-    }
-    assert largest[one.holds] * 0.99 < 2 / (PERIOD * RATE) < largest[one.fails] * 1.01
+    drawn = [fp.Draws(100, percent).of_problem(problem) for percent in (one.holds, one.fails)]
+    holds, fails = (max(variant.problem.plant.exact[0] for variant in some) for some in drawn)
+    assert holds * 0.99 < 2 / (PERIOD * RATE) < fails * 1.01
     assert one.fails <= 1.051 * one.holds
 
 
@@ -108,9 +96,8 @@ def test_lost_samples_are_limited_by_the_held_command():
     lost, share = np.arange(400), 1.5
     growths = np.log(np.abs(1 - share * (1 + lost)))
     limit = next(p for p in np.linspace(0.01, 0.9, 1000) if np.sum((1 - p) * p**lost * growths) > 0)
-    assert near(
-        limit_of("lost", pump(), fp.ComputedTorque(fp.Exponential(share / PERIOD, integral=False))), limit, 0.05
-    )
+    law = fp.ComputedTorque(fp.Exponential(share / PERIOD, integral=False))
+    assert near(limit_of("lost", pump(), law), limit, 0.05)
 
 
 def test_mismatch_grows_up_to_the_bounds_of_the_parameter():
