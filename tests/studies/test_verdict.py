@@ -171,13 +171,8 @@ def test_what_counts_and_what_comes_first():
 
 def tank(**changes: Any) -> fp.Problem:
     """Y' = -2 y + u with u = 3 held: y = 1.5 - 0.5 exp(-2 t) from y = 1; the model's decay is 3 1/s too fast."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "m/s"},
-        order=1,
-        response=lambda q, u, p: {"y": -p.rate * q.y + u.u},
-        parameters={"rate": fp.Parameter(5.0, 2.0, "1/s")},
-    )
+    rate = fp.Parameter(5.0, 2.0, "1/s")
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, {"rate": rate}, lambda q, u, p: {"y": -p.rate * q.y + u.u}, order=1)
     usual: dict[str, Any] = {"reference": fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}), "start": {"y": 0.99}}
     usual |= {"period": 1e-2, "duration": 10.0, "input_before": {"u": 2.0}}
     return fp.Problem(plant, **(usual | changes))
@@ -295,9 +290,8 @@ def test_what_noise_of_the_response_costs_is_what_it_costs():
     first = first if first < quiet.cycles else quiet.cycles // 2
     moved = [np.abs(np.diff(run["command"][first:], axis=0)).sum() for run in runs]
     assert said == pytest.approx(moved[0] / moved[1], rel=0.02)
-    assert not any(
-        "without noise" in text for text in fp.compare(replace(one, problem=noisy), seed=0, controllers=names).verdict
-    )
+    said = fp.compare(replace(one, problem=noisy), seed=0, controllers=names).verdict
+    assert not any("without noise" in text for text in said)
 
 
 def test_the_time_of_a_cycle_has_its_share_of_plans(monkeypatch):
