@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,6 @@ from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper, require_controlled_response
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.deformation.base import with_inner
 from fpirhc.errors import InvalidValue, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative, Positive
@@ -40,11 +39,6 @@ class Predictor(Checked, ABC):
     def residual_time(self) -> float | None:
         """Time constant of the low-passed model residual that `advance` is given, s; None: the residual is zero."""
         return None
-
-    def others(self, late: float) -> tuple[Predictor, ...]:
-        """Return the predictors that may know more over a dead time of `late` s, for questions about this one."""
-        del late
-        return ()
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
@@ -77,9 +71,6 @@ class ByModel(Predictor):
     """
 
     residual_time: Positive | None = None
-
-    def others(self, late: float) -> tuple[Predictor, ...]:
-        return (ByModel(residual_time=late), ByDesired()) if late and self.residual_time is None else ()
 
     def check(self, plant: Plant) -> None:
         """Accept every plant."""
@@ -126,18 +117,21 @@ class ByDesired(Predictor):
         x, u, p = plant.symbols()
         d, w = ca.SX.sym("d", len(plant.controlled_names)), ca.SX.sym("w", len(plant.names))
         seen = plant.equations.output(x, 0 * u, p, 0 * w)
-        elements, later = plant.output.elements, {}
+        elements, later = plant.output.elements, dict[str, Expression]()
         for k, name in enumerate(plant.controlled_names):
             chain = sorted((e for e in elements if e.rstrip("'") == name), key=len)
             values = [seen[elements.index(e)] for e in chain] + [d[k]]
-            for order, element in enumerate(chain):
-                series, factor = ca.SX(0), 1.0
-                for j, value in enumerate(values[order:]):
-                    series += factor * value
-                    factor *= period / (j + 1)
-                later[element] = series
+            later |= {element: sum(_terms(values[j:], period), start=ca.SX(0)) for j, element in enumerate(chain)}
         state_next = [later[elements[place]] for place in plant.equations.known_by_outputs]
         return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*state_next)])
+
+
+def _terms(derivatives: Sequence[Expression], time: Expression | float) -> Iterator[Expression]:
+    """The terms of a Taylor series, of a value and its derivatives."""
+    factor: Expression | float = 1.0
+    for j, value in enumerate(derivatives):
+        yield factor * value
+        factor *= time / (j + 1)
 
 
 @dataclass(frozen=True)
@@ -164,7 +158,7 @@ class Predicted(ControllerWrapper):
     by: Predictor = field(default_factory=ByModel)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        notes, cycles = self.controller.notes(problem), self._queue(problem).cycles
+        notes, cycles = self.controller.notes(problem), self._cycles(problem)
         if self.controller.learns and self.by == ByModel() and cycles:
             notes += (
                 "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
@@ -172,7 +166,7 @@ class Predicted(ControllerWrapper):
             )
         if not given_signals(problem) or not cycles:
             return notes
-        late = f"{cast(float, cycles) * problem.period:g} {problem.time_unit}"
+        late = f"{cycles * problem.period:g} {problem.time_unit}"
         return (
             *notes,
             f"Predicted follows set-points {late} late, announced ones too; give one that is known ahead so much earlier",
@@ -195,69 +189,60 @@ class Predicted(ControllerWrapper):
                 f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
                 f"{type(self.controller).__name__} reads others; use by=ByModel()",
             )
-        if self._length(problem) > MOST:
-            raise InvalidValue(f"Predicted: {self._length(problem)} cycles of dead time, more than {MOST}")
+        if self._cycles(problem) > MOST:
+            raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        plant = built.plant
-        if not self._length(built.problem):
-            return self.controller.blocks(build(built.problem, self.controller))
-        inner = compose_controller(build(built.problem, self.controller), ahead=True)
+        plant, problem = built.plant, built.problem
+        if not self._cycles(problem):
+            return self.controller.blocks(build(problem, self.controller))
+        inner = compose_controller(build(problem, self.controller), ahead=True)
         ahead = {"time": like(time_signal(plant), "time_ahead"), "state": like(plant.state, "state_ahead")}
         ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
         sent = self.by.sent(plant)
-        before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(built.problem))
-        predict = _predict_block(built.problem, self, self._queue(built.problem), before, tuple(ahead.values()))
+        before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
+        predict = self._predict_block(problem, before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
-    def _queue(self, problem: Problem) -> Queue:
-        """The values that are on their way; as many as the cycles over which the state is predicted."""
-        return Queue(float(round((self.inputs + self.measurement) / problem.period)))
+    def _cycles(self, problem: Problem) -> int:
+        """Cycles over which the state is predicted."""
+        return round((self.inputs + self.measurement) / problem.period)
 
-    def _length(self, problem: Problem) -> int:
-        """Most cycles over which the state may be predicted."""
-        return self._queue(problem).length - 1
+    def _predict_block(self, problem: Problem, before: Signal, writes: tuple[Signal, ...]) -> Block:
+        """Block (time, what is measured, parameters, what was sent last) -> what will be when the command acts."""
+        plant, size, by, cycles = problem.plant, before.size, self.by, self._cycles(problem)
+        queue, start = Queue(cycles), by.sent_at_start(problem)
+        # One value more than is on its way: the oldest acted while the response was realised.
+        past = tuple(f"{e}@{k}" for k in range(1, queue.length + 1) for e in before.elements)
+        sent = Signal("sent", past, start=start * queue.length)
+        residual = Signal("residual", plant.names, forcing_units(plant))
+        advance = by.advance(plant, problem.period)
+        corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
+        responses = (plant.response_signal("realised"),) if corrected else ()
+        reads = (time_signal(plant), *measured_signals(plant), *responses, plant.parameter, before)
+        # The state to which a map answered with the response that is measured now is that of the cycle before.
+        answered = replace(plant.state, name="state_answered", start=tuple(map(float, problem.start_state)))
+        last = (answered,) * response_age(plant) if corrected else ()
+        own = (sent, residual, *last) if corrected else (sent,)
+        # An output that is the state is where the state is.
+        outputs_ahead = {s.name: _output_ahead(plant) for s in measured_signals(plant)[1:]}
 
+        def step(s: Signals) -> dict[str, Expression]:
+            queued = queue.pushed(s.sent, s._sent_before)
+            values = {"sent_next": queued}
+            error = expression(ca.MX.zeros(len(plant.names)))
+            if corrected:
+                at = s.state_answered if last else s.state
+                error = corrected(s.residual, at, queue.delayed(queued, size), s.realised, s.parameters)
+                values |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
+            state = queue.driven(advance, s.state, queued, size, [s.parameters, error])
+            for name, function in outputs_ahead.items():
+                time = cycles * problem.period
+                values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
+            return {"time_ahead": s.time + self.inputs, "state_ahead": state, **values}
 
-def _predict_block(
-    problem: Problem, ahead: Predicted, queue: Queue, before: Signal, writes: tuple[Signal, ...]
-) -> Block:
-    plant, size, by = problem.plant, before.size, ahead.by
-    # One value more than is on its way: the oldest acted while the response was realised.
-    past = tuple(f"{e}@{k}" for k in range(1, queue.length + 1) for e in before.elements)
-    sent = Signal("sent", past, start=by.sent_at_start(problem) * queue.length)
-    residual = Signal("residual", plant.names, forcing_units(plant))
-    advance, cycles = by.advance(plant, problem.period), cast(float, queue.cycles)
-    corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
-    responses = (plant.response_signal("realised"),) if corrected else ()
-    reads = (time_signal(plant), *measured_signals(plant), *responses, plant.parameter, before)
-    last = _answered_at(problem) if corrected else ()
-    own = (sent, residual, *last) if corrected else (sent,)
-    # An output that is the state is where the state is.
-    outputs_ahead = {s.name: output_ahead(plant) for s in measured_signals(plant)[1:]}
-
-    def step(s: Signals) -> dict[str, Expression]:
-        queued = queue.pushed(s.sent, s._sent_before)
-        memory_next = {"sent_next": queued}
-        error = expression(ca.MX.zeros(len(plant.names)))
-        if corrected:
-            at = getattr(s, last[0].name) if last else s.state
-            error = corrected(s.residual, at, queue.delayed(queued, size), s.realised, s.parameters)
-            memory_next |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
-        state = queue.driven(advance, s.state, queued, size, [s.parameters, error])
-        for name, function in outputs_ahead.items():
-            time = cycles * problem.period
-            memory_next[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
-        return {"time_ahead": s.time + ahead.inputs, "state_ahead": state, **memory_next}
-
-    return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
-
-
-def _answered_at(problem: Problem) -> tuple[Signal, ...]:
-    """The state to which a map answered with the response that is measured now; none where it is that of now."""
-    state, start = problem.plant.state, tuple(map(float, problem.start_state))
-    return (Signal("state_answered", state.elements, state.units, start),) * response_age(problem.plant)
+        return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
 
 
 def _residual(plant: Plant, time: float, period: float) -> ca.Function:
@@ -278,7 +263,7 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     return ca.Function("fpirhc_residual", [old, x, u, f, p], [ca.densify(old + share * (residual_now - old))])
 
 
-def output_ahead(plant: Plant) -> ca.Function:
+def _output_ahead(plant: Plant) -> ca.Function:
     """Return the Function (measured outputs, state, state ahead, parameters, time ahead) -> outputs ahead.
 
     They are the model's at the predicted state, and the distance d of the measured ones,
@@ -294,20 +279,8 @@ def output_ahead(plant: Plant) -> ca.Function:
     elements, entries = plant.output.elements, []
     for k, element in enumerate(elements):
         higher = [i for i, e in enumerate(elements) if e.startswith(element) and not e[len(element) :].strip("'")]
-        powers = [elements[i].count("'") - element.count("'") for i in higher]
-        terms = (distance[i] * time**n / math.factorial(n) for i, n in zip(higher, powers, strict=True))
-        entries.append(sum(terms, start=ahead[k]))
+        entries.append(sum(_terms([distance[i] for i in higher], time), start=ahead[k]))
     return ca.Function("fpirhc_output_ahead", [y, x, later, p, time], [ca.densify(ca.vertcat(*entries))])
-
-
-def other_predictions(controller: Controller) -> dict[str, Controller]:
-    """Return the controller with the other predictors that its own one names, by their texts; none where nothing predicts."""
-    if isinstance(getattr(controller, "by", None), Predictor):
-        around = cast(Predicted, controller)  # or what has its fields
-        return {str(other): replace(around, by=other) for other in around.by.others(around.inputs + around.measurement)}
-    if controller.inner is None:
-        return {}
-    return {name: with_inner(controller, other) for name, other in other_predictions(controller.inner).items()}
 
 
 def examples(inner: Controller) -> tuple[Example, ...]:
