@@ -126,15 +126,16 @@ class Slotted(Controller):
             own, remembered = _own_cycle(built.plant, one, left_after(built.period, self.blend))
             blocks, delays = [*blocks, *own], [*delays, *remembered]
         counted = warm_up_block(max(one.built.warm_up for one in turns))
-        return [*blocks, _command_block(built, turns), judge_block(), counted], [
-            *delays,
-            Delay(built.before, "command"),
-        ]
+        blocks += [_command_block(built, turns), judge_block(), counted]
+        return blocks, [*delays, Delay(built.before, "command")]
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
         one = build(slot_problem(built.problem, name), self.slots[name])
-        differenced = not _measured(built.problem, one.plant)
-        return Turn(number, name, self.slots[name], replace(one, warm_up=built.warm_up + differenced))
+        place: int | None = number
+        if not _reads_equations(built.problem):
+            same = built.plant.response_orders.get(name) == one.plant.response_orders[name]
+            place = built.plant.controlled_names.index(name) if same else None
+        return Turn(number, name, self.slots[name], replace(one, warm_up=built.warm_up + (place is None)), place)
 
 
 class Turn(NamedTuple):
@@ -144,6 +145,7 @@ class Turn(NamedTuple):
     name: str  # of its coordinate
     slot: Controller
     built: Built  # the slot alone
+    place: int | None  # of its response in what is measured; None: it is the difference of the derivative below
 
     def own(self, name: str) -> str:
         """Return the name of this slot's own copy of a signal, which no table shows."""
@@ -181,12 +183,6 @@ def _reads_equations(problem: Problem) -> bool:
     return problem.sees_plant and problem.of_equations is problem
 
 
-def _measured(problem: Problem, light: Plant) -> bool:
-    """Whether a slot's response is measured; else it is the difference of the derivative below."""
-    orders = problem.plant.response_orders
-    return _reads_equations(problem) or all(orders.get(n) == r for n, r in light.response_orders.items())
-
-
 def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
     estimator = problem.sensing.estimator
     if deformation.form.modelled and not (estimator.of_steps or estimator.shows_response):
@@ -206,45 +202,32 @@ _OUTPUT = "_slot_outputs"  # the outputs of every slot's plant, where the plant 
 
 def _seeing_blocks(built: Built, turns: Sequence[Turn], response: Response) -> list[Block]:
     """Blocks from what is measured to the outputs and the response of every slot."""
-    plant, model, given = built.plant, turns[0].built.plant, response.signal
-    calm = ca.DM.zeros(len(plant.names))
+    plant, model, given, motion = built.plant, turns[0].built.plant, response.signal, measured_output(built.plant)
+    still, calm = ca.DM.zeros(plant.input.size), ca.DM.zeros(len(plant.names))
+    memory = Layout(tuple(scalar(one.own("below")) for one in turns if one.place is None))
+    known = given.name == "realised"
 
     def shown(state: Expression, parameters: Expression) -> Expression:
-        return model.equations.output(state, ca.DM.zeros(plant.input.size), parameters, calm)
+        return model.equations.output(state, still, parameters, calm)
 
-    outputs = Block(
-        "slot_outputs",
-        Layout((plant.state, plant.parameter)),
-        Layout((replace(model.output, name=_OUTPUT),)),
-        lambda s: {_OUTPUT: shown(s.state, s.parameters)},
-    )
-    seen = [] if plant.outputs else [outputs]
-    if _reads_equations(built.problem):
-        split = {one.own("realised"): k for k, one in enumerate(turns)}
-        writes = Layout(tuple(scalar(name) for name in split))
-        return [
-            *seen,
-            Block("slot_responses", Layout((given,)), writes, lambda s: {n: s.realised[k] for n, k in split.items()}),
-        ]
-    motion, places = measured_output(plant), dict(zip(plant.controlled_names, range(len(plant.names)), strict=False))
-    differenced = [one.name for one in turns if not _measured(built.problem, one.built.plant)]
-    memory = Layout(tuple(scalar(one.own("below")) for one in turns if one.name in differenced))
-
-    def step(s: Signals) -> dict[str, Value]:
-        now = getattr(s, motion.name) if plant.outputs else shown(getattr(s, motion.name), s.parameters)
-        values: dict[str, Value] = {}
+    def step(s: Signals) -> dict[str, Expression]:
+        seen = getattr(s, motion.name)
+        outputs = seen if plant.outputs else shown(seen, s.parameters)
+        values = {one.own("realised"): s.realised[one.place] for one in turns if one.place is not None}
         for one in turns:
-            if one.name not in differenced:
-                values[one.own("realised")] = s.realised[places[one.name]]
-                continue
-            below = now[model.output.elements.index(one.name + "'" * (model.chains[one.name] - 1))]
-            values[one.own("realised")] = (below - getattr(s, one.own("below"))) / built.period
-            values[f"{one.own('below')}_next"] = below
-        return {**values, given.name: ca.vertcat(*(values[one.own("realised")] for one in turns))}
+            if one.place is None:
+                below = outputs[model.output.elements.index(one.name + "'" * (model.chains[one.name] - 1))]
+                values[one.own("realised")] = (below - getattr(s, one.own("below"))) / built.period
+                values[f"{one.own('below')}_next"] = below
+        every = {} if known else {given.name: ca.vertcat(*(values[one.own("realised")] for one in turns))}
+        return values | every
 
-    reads = (plant.response_signal("realised"), motion, plant.parameter)
-    writes = Layout((given, *(scalar(one.own("realised")) for one in turns)))
-    return [*seen, Block("slot_responses", Layout(reads), writes, step, memory)]
+    reads = (given if known else plant.response_signal("realised"), motion, plant.parameter)
+    writes = Layout((*((given,) * (not known)), *(scalar(one.own("realised")) for one in turns)))
+    responses = Block("slot_responses", Layout(reads), writes, step, memory)
+    state, output = Layout((plant.state, plant.parameter)), Layout((replace(model.output, name=_OUTPUT),))
+    outputs = Block("slot_outputs", state, output, lambda s: {_OUTPUT: shown(s.state, s.parameters)})
+    return [responses] if plant.outputs else [outputs, responses]
 
 
 def _switch_block(turns: Sequence[Turn]) -> Block:
