@@ -74,12 +74,9 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
         raise _too_large(deformation, spectrum, largest)
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     delay = problem.response_delay
-    pairs = {
-        d: Paired(deformation, cycles=d)
-        for d in (delay, delay + 0.5, delay - 0.5)
-        if d >= 0 and not deformation.form.pairs
-    }
-    best = next((d for d, one in pairs.items() if converges(one, jacobian, weights)), None)
+    pairs = {d: Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0}
+    usable = {d: one for d, one in pairs.items() if not any(against_wrappers(one))}
+    best = next((d for d, one in usable.items() if converges(one, jacobian, weights)), None)
     raise _too_late(problem, deformation, largest, best)
 
 

@@ -171,7 +171,7 @@ def stated_path(problem: Problem) -> Path:
 def model_block(path: Path) -> Block:
     """Block that writes '_modelled', the response that a model-referenced map reads in place of its last request."""
     estimator = path.problem.sensing.estimator
-    return answer_block(path) if estimator.of_steps or estimator.shows_response else _twin(path)
+    return answer_block(path) if estimator.of_steps or estimator.measures_all else _twin(path)
 
 
 def answer_block(path: Path) -> Block:

@@ -233,7 +233,7 @@ def estimated_problem(
     if own.plant.equations.known_on_reference:  # what is judged is what comes after the transient
         start = dict(zip(own.plant.state.elements, map(float, reference_states(own, 2)[:, 0]), strict=True))
     sensing = own.sensing
-    if noise and sensing.estimator.shows_response and sensing.observer is None:  # the response itself is measured
+    if noise and sensing.estimator.measures_all and sensing.observer is None:  # the response itself is measured
         sizes = zip(response_names(own.plant), noise, strict=True)
         noisy = {name: Sensor(noise=Noise(size)) for name, size in sizes if size}
         sensing = replace(sensing, sensors={**sensing.sensors, **noisy})

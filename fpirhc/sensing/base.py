@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -23,32 +23,20 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 Array: TypeAlias = np.ndarray
+_DIGITS = 9  # decimals of a delay in cycles, so that half a cycle is one
 
 
 class DerivativeEstimator(Checked, ABC):
     """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
 
-    @property
-    def measures_all(self) -> bool:
-        """Whether state and response are both measured, so that nothing is estimated."""
-        return False
-
-    @property
-    def of_steps(self) -> bool:
-        """Whether it takes differences of a map's steps; False for derivatives with respect to time."""
-        return False
+    measures_all: ClassVar[bool] = False  # whether state and response are both measured, so that nothing is estimated
+    of_steps: ClassVar[bool] = (
+        False  # whether it takes differences of a map's steps, not derivatives with respect to time
+    )
 
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: state elements, and highest derivatives of controlled coordinates."""
-
-    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        """State elements that follow from these measured quantities alone; by default those among them."""
-        return tuple(e for e in plant.output.elements if e in measured)
-
-    def answers(self, plant: Plant) -> tuple[str, ...]:
-        """Names of the measured quantities that the response follows from; by default all."""
-        return self.measures(plant)
 
     @abstractmethod
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
@@ -61,22 +49,13 @@ class DerivativeEstimator(Checked, ABC):
             seen: signal of the quantities in `measures`.
         """
 
-    @property
-    def shows_response(self) -> bool:
-        """Whether the response itself is measured, and so belongs to this instant; False by default."""
-        return False
-
     @abstractmethod
     def weights(self, order: int, period: float) -> Array:
         """Weights w_1, w_2, ... of past requests in the estimated response of a coordinate of that order."""
 
-    @abstractmethod
-    def delay(self, order: int, period: float) -> float:
-        """Delay of the response in cycles, beyond the ideal pair: the weights' centre."""
-
-    @abstractmethod
-    def fills(self, order: int) -> int:
-        """Number of the first cycle (from 0) whose response depends on this run's samples alone."""
+    def fills(self, order: int) -> int:  # noqa: ARG002
+        """Number of the first cycle (from 0) whose response depends on this run's samples alone; 1 by default."""
+        return 1
 
     def check(self, plant: Plant) -> None:
         """Raise if the estimator cannot serve the plant.
@@ -86,9 +65,10 @@ class DerivativeEstimator(Checked, ABC):
         """
 
 
-def known_by_positions(plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-    """State elements of the coordinates that are measured: their derivatives are estimated."""
-    return tuple(e for e in plant.output.elements if e.rstrip("'") in measured)
+def delay(estimator: DerivativeEstimator, order: int, period: float) -> float:
+    """Return how late the response of a coordinate of that order is, in cycles beyond the ideal pair: the weights' centre."""
+    weights = estimator.weights(order, period)
+    return round(float(weights @ np.arange(weights.size)), _DIGITS)
 
 
 def quantities(plant: Plant) -> tuple[str, ...]:
@@ -130,37 +110,8 @@ def combine(coefficients: Array, samples: Sequence[Expression]) -> Expression:
     return sum(c * s for c, s in zip(coefficients, samples, strict=True) if c != 0)
 
 
-class AtOnce(DerivativeEstimator, ABC):
-    """An estimator whose response answers the last request alone."""
-
-    def weights(self, order: int, period: float) -> Array:
-        del order, period
-        return np.ones(1)
-
-    def delay(self, order: int, period: float) -> float:
-        del order, period
-        return 0.0
-
-    def fills(self, order: int) -> int:
-        del order
-        return 1
-
-
-class OfPositions(DerivativeEstimator, ABC):
-    """An estimator of all derivatives from positions."""
-
-    def measures(self, plant: Plant) -> tuple[str, ...]:
-        return tuple(plant.chains)
-
-    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        return known_by_positions(plant, measured)
-
-    def answers(self, plant: Plant) -> tuple[str, ...]:
-        return plant.controlled_names
-
-
 @dataclass(frozen=True)
-class Measured(AtOnce):
+class Measured(DerivativeEstimator):
     """State and response as the sensors show them, without delay."""
 
     measures_all = True
@@ -168,8 +119,9 @@ class Measured(AtOnce):
     def measures(self, plant: Plant) -> tuple[str, ...]:
         return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))
 
-    def answers(self, plant: Plant) -> tuple[str, ...]:
-        return response_names(plant)
+    def weights(self, order: int, period: float) -> Array:
+        del order, period
+        return np.ones(1)
 
     def block(self, plant: Plant, period: float, start: Array, seen: Signal) -> Block:
         del period, start
@@ -181,8 +133,6 @@ class Measured(AtOnce):
             return {plant.output.name: both[: plant.output.size], "realised": both[responses]}
 
         return Block("estimate", Layout((seen,)), Layout((plant.output, realised)), step)
-
-    shows_response = True
 
 
 EXAMPLES = (Measured(),)
@@ -261,8 +211,6 @@ _NOTHING = 1e-9  # share of a matrix below which a part of it counts as zero
 
 def unobservable(slopes: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
     """Return an orthonormal basis of the errors that never show, shape (nx, number).
-
-    `slopes`: A_i, each (nx, nx), in states of size one. `shown`: C_i, each (number, nx), in states of size one.
 
     Args:
         slopes: A_i, each (nx, nx), in states of size one.

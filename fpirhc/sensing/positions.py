@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,7 +19,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Count, whole
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, OfPositions, backward_difference, combine, spline_weights
+from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -28,8 +27,11 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal
 LONGEST = 1001  # samples: the memory has a fixed size
 
 
-class _Finite(OfPositions, ABC):
+class _Finite(DerivativeEstimator, ABC):
     """Common part of the formulas."""
+
+    def measures(self, plant: Plant) -> tuple[str, ...]:
+        return tuple(plant.chains)
 
     @abstractmethod
     def coefficients(self, order: int) -> Array:
@@ -95,11 +97,6 @@ class PositionDifference(_Finite):
             rows[s, : s + 1] = backward_difference(s)
         return rows
 
-    def delay(self, order: int, period: float) -> float:
-        """(n - 1) / 2."""
-        del period
-        return (order - 1) / 2
-
 
 @dataclass(frozen=True)
 class StepDifference(PositionDifference):
@@ -112,18 +109,9 @@ class StepDifference(PositionDifference):
 
     of_steps = True
 
-    def known(self, plant: Plant, measured: Sequence[str]) -> tuple[str, ...]:
-        """State elements that are measured: the differences are those of earlier cycles."""
-        return DerivativeEstimator.known(self, plant, measured)
-
     def weights(self, order: int, period: float) -> Array:
         del period
         return np.eye(order)[-1]
-
-    def delay(self, order: int, period: float) -> float:
-        """(n - 1)."""
-        del period
-        return float(order - 1)
 
 
 @dataclass(frozen=True)
@@ -184,11 +172,6 @@ class SavitzkyGolay(_Finite):
     def _derivative(self, fit: Array, order: int, place: float) -> Array:
         powers = range(order, self.degree + 1)
         return np.asarray(sum(math.perm(k, order) * place ** (k - order) * fit[k] for k in powers))
-
-    def delay(self, order: int, period: float) -> float:
-        """(window - 1) / 2 - 1 / 2."""
-        del order, period
-        return (self.window - 1) / 2 - 0.5
 
 
 EXAMPLES = (PositionDifference(), StepDifference(), SavitzkyGolay(window=11, degree=4))

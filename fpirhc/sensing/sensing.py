@@ -19,7 +19,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
+from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, delay, quantities, response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
@@ -80,7 +80,7 @@ def uncovered(
     missing = [n for n in estimator.measures(plant) if n not in measured]
     if named is not None and not measured:
         yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-    elif observer is not None and named is None and {*plant.state.elements} <= {*estimator.known(plant, measured)}:
+    elif observer is not None and named is None and not (estimator.of_steps or plant.outputs):
         yield (
             f"observer: everything that {type(estimator).__name__} needs is measured; name what sensors show: "
             f"Sensing(measured={list(measured)!r}, ...)"
@@ -153,7 +153,12 @@ class Sensing(Checked):
 
     def believed_response(self, plant: Plant) -> tuple[str, ...]:
         """Quantities that the response follows from and no sensor shows."""
-        return tuple(n for n in self.estimator.answers(plant) if n not in self.measures(plant))
+        names, measured = self.estimator.measures(plant), self.measures(plant)
+        if {*names} <= {*measured}:
+            return ()
+        block = self.estimator.block(plant, 1.0, np.zeros(plant.output.size), Signal("_seen", names))
+        answers = block.function.jac_sparsity(1, 0).get_triplet()[1]
+        return tuple(n for k, n in enumerate(names) if k in answers and n not in measured)
 
     def check(self, plant: Plant) -> None:
         """Raise if a sensor's quantity is unknown or not measured, or the estimator cannot serve the plant.
@@ -181,7 +186,7 @@ class Sensing(Checked):
 
     def delay(self, plant: Plant, period: float) -> float:
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
-        return max(self.estimator.delay(plant.chains[name], period) for name in plant.controlled_names)
+        return max(delay(self.estimator, plant.chains[name], period) for name in plant.controlled_names)
 
     def warm_up_cycles(self, plant: Plant, late: float) -> float:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""

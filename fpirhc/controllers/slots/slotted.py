@@ -185,7 +185,7 @@ def _reads_equations(problem: Problem) -> bool:
 
 def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
     estimator = problem.sensing.estimator
-    if deformation.form.modelled and not (estimator.of_steps or estimator.shows_response):
+    if deformation.form.modelled and not (estimator.of_steps or estimator.measures_all):
         yield (
             f"ModelReferenced in a slot compares with the model's response of one cycle, and {estimator} gives a mean over "
             "several; use the map inside"
