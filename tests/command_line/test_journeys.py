@@ -296,8 +296,7 @@ def test_what_comes_first_is_light(first, absent, tmp_path):
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
-@pytest.mark.parametrize("command", ["review mine.py -c θ", "run mine.py θ"])
+@pytest.mark.parametrize(("command", "encoding"), [("review mine.py -c θ", "cp1252"), ("run mine.py θ", "ascii")])
 def test_names_that_an_output_cannot_write_are_escaped(command, encoding, tmp_path):
     text = line_text("period=1e-2, duration=0.1").replace('"CTC"', '"θ"').replace('"y"', '"θ"').replace("q.y", "q.θ")
     (tmp_path / "mine.py").write_text(text, encoding="utf-8")

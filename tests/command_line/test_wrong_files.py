@@ -351,7 +351,7 @@ export mine.py RHC --live optimiser.iterations => decides what the loop is made 
 export two_mass RHC --to matlab => the target 'matlab' is unknown. ... Valid: arduino, c, fmu2, library, wasm, lab
 export two_mass CTC --name int => 'int' cannot be the name of a controller in C: expected at most 40 letters,
 export two_mass CTC --live gain =>
-    setting 'gain': neither the controller nor the problem's cost, limits, dead_time, reference
+    setting 'gain': neither the controller nor the problem's cost, limits, reference
 probe mine.py --chatter 0 => expected a number above 0, in the unit of the signal
 probe two_mass --cycles 3 => probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual
 probe mine.py --recording words.csv => recording words.csv ... abc

@@ -42,6 +42,15 @@ def test_a_good_problem_is_ready():
         assert found["returns"].verdict == found["pays"].verdict == "yes"
 
 
+def test_a_limit_that_is_left_has_the_numbers_of_the_run():
+    """By how much it is left, in its unit and of its range, when, and in which share of the cycles."""
+    fast = mass(limits=fp.Limits(states={"q'": (-1.0, 1.0)}))
+    speed = np.abs(fp.simulate(fast, torque(), seed=0, compiled=False)["plant_state.q'"])
+    worst, most = int(speed.argmax()), speed.max() - 1
+    wanted = {"excess": most, "beyond": most / 2, "time_of_it": worst * PERIOD, "share_of_cycles": np.mean(speed > 1)}
+    assert answers(fast)["limits"].numbers == pytest.approx(wanted, rel=5e-3)
+
+
 @pytest.mark.parametrize("wrong", [-1.0, 100.0, math.nan])
 def test_a_mismatch_that_makes_no_sense_is_refused(wrong):
     with pytest.raises(ValueError, match="mismatch"):
