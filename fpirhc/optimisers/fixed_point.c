@@ -1,6 +1,6 @@
 /* The iteration of FixedPoint as loops around generated stage functions.
 
-   The same mathematics as the composed graph in fixed_point.py and search.py, which is the reference it is tested against:
+   The same mathematics as the composed graph in plain.py and search.py, which is the reference it is tested against:
    names follow those files. What is generated stands before this text: the stage functions evaluate, pull, linearise, hessian, end
    and deformed, the sizes NS, NU, NT (entries of the data of a stage), NM (partial derivatives of a stage), N, the constants of the search, and ENTRY, the name of the function. Matrices are column-major, stages follow each other. Nothing is allocated: what is as long as a
    plan lies in the caller's work, ROOM numbers. */
@@ -323,7 +323,7 @@ INLINE void remember(const Search* s, const Plan* best, int good, int posed, In 
 }
 
 /* The gains of the new memory serve as those of the search, and stay the old ones where nothing is posed. */
-INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
+static int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
 #define GIVEN(k) (arg[k] ? arg[k] : nothing)
   In s0 = GIVEN(0), data = GIVEN(1), lower = GIVEN(2), upper = GIVEN(3), memory = GIVEN(4);
@@ -365,4 +365,16 @@ INLINE int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
   }
   remember(s, best, good, posed, memory, lower, upper, res[2]);
   return 0;
+}
+
+int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
+#ifdef PORTABLE /* a device wants all results */
+  (void)iw, (void)mem;
+  return run(arg, res, w);
+#else
+  casadi_real memory[MEMORY], *made[3]; /* in it lie the gains of the search */
+  (void)iw, (void)mem;
+  made[0] = res[0], made[1] = res[1], made[2] = res[2] ? res[2] : memory;
+  return run(arg, made, w);
+#endif
 }

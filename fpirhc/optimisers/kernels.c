@@ -1,18 +1,5 @@
 /* What the loops of the optimisers share: small matrix products and tests of numbers. Matrices are column-major. */
 
-#ifdef PORTABLE
-#define WIDE 0
-#else /* PORTABLE */
-/* Whether the machine has wide registers; ALWAYS_WIDE is defined where that is known. */
-#if defined(ALWAYS_WIDE)
-#define WIDE 1
-#elif defined(__GNUC__) && defined(__x86_64__)
-#define WIDE __builtin_cpu_supports("avx2")
-#else
-#define WIDE 0
-#endif
-#endif /* PORTABLE */
-
 typedef const casadi_real* In;
 typedef casadi_real* Out;
 

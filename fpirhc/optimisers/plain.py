@@ -37,7 +37,7 @@ MOST = 100  # iterations of one converging call
 CAP = 50  # the same of one in a loop
 CLOSE = 1e-4  # of the size of an input: the tolerance unless one is given
 _MOST_PLAIN = 30  # plain steps after which a converging call gives up
-_TEXTS = ("kernels", "fixed_point", "entry")
+_TEXTS = ("kernels", "fixed_point")
 
 
 @dataclass(frozen=True)

@@ -357,8 +357,8 @@ static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
     interior_terms(&m->limits, p, &m->room->y, m->mu, m->room->weight, m->room->lean);
     m->slacks = KEPT;
   }
-  ok = m->use_exact && swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 1, data, &m->room->shared.turn.scratch);
-  ok = ok || swept(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 0, data, &m->room->shared.turn.scratch);
+  ok = m->use_exact && sweep(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 1, data, &m->room->shared.turn.scratch);
+  ok = ok || sweep(&m->room->move, p, m->room->weight, m->room->lean, m->room->costates, m->delta, 0, data, &m->room->shared.turn.scratch);
   m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);

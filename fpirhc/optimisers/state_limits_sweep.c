@@ -118,7 +118,7 @@ INLINE void solved(In lower, In pivots, Out column) {
        forward    du = v + K dx,   dx+ = A dx + B du + c,   lambda = P' dx + p + w.
 
    Source for the gaps: H. G. Bock, K. J. Plitt, IFAC World Congress 1984. */
-INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch* s) {
+static int sweep(Direction* d, const Point* p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch* s) {
   int i, j, l, m;
   In arg[8];
   Out res[8];
@@ -191,23 +191,6 @@ INLINE int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
   }
   return all_finite(d->du, N * NU) && all_finite(d->dx, (N + 1) * NS) && all_finite(d->costates + NS, N * NS);
 }
-
-/* One library runs on every machine of its architecture: wider registers are used where there are some. Without fused
-   multiply-add both round alike. */
-#define SWEEP Direction *d, const Point *p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch *s
-#ifdef PORTABLE
-static int swept(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
-#else /* PORTABLE */
-#if defined(__GNUC__) && defined(__x86_64__)
-__attribute__((target("avx2"), noinline)) static int sweep_wide(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
-__attribute__((noinline)) static int sweep_plain(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
-static int swept(SWEEP) {
-  return (__builtin_cpu_supports("avx2") ? sweep_wide : sweep_plain)(d, p, weight, lean, costates, delta, use_exact, data, s);
-}
-#else
-static int swept(SWEEP) { return sweep(d, p, weight, lean, costates, delta, use_exact, data, s); }
-#endif
-#endif /* PORTABLE */
 
 #define SIGN(side) (1 - 2 * (side))
 

@@ -211,10 +211,10 @@ def _unit(source: str, compiler: str, more: Sequence[str]) -> _Unit:
 
 @cache
 def _machine_flags() -> tuple[str, ...]:
-    """Flags for this machine: where it has wide registers all code uses them, and the optimisers' loops have no other code."""
+    """Flags for this machine: where it has wide registers all code uses them. Without fused multiply-add both round alike."""
     with contextlib.suppress(OSError):
         if platform.machine() == "x86_64" and " avx2 " in Path("/proc/cpuinfo").read_text(encoding="utf-8"):
-            return ("-DALWAYS_WIDE", "-mavx2")
+            return ("-mavx2",)
     return ()
 
 
