@@ -43,14 +43,14 @@ from .learning.estimators.recursive_least_squares import RecursiveLeastSquares a
 from .learning.rules.lyapunov_rule import LyapunovRule as LyapunovRule
 from .learning.rules.projection import Projection as Projection
 from .optimisers.fixed_point import FixedPoint as FixedPoint
-from .optimisers.full_space import FullSpaceFixedPoint as FullSpaceFixedPoint
-from .optimisers.gradient_fixed_point import GradientFixedPoint as GradientFixedPoint
 from .optimisers.nlp import Fatrop as Fatrop
 from .optimisers.nlp import Ipopt as Ipopt
 from .optimisers.nlp import SequentialQuadratic as SequentialQuadratic
 from .optimisers.plan import Plan as Plan
 from .optimisers.plan import solve as solve
-from .optimisers.reduced_gradient import ReducedGradient as ReducedGradient
+from .optimisers.published import FullSpaceFixedPoint as FullSpaceFixedPoint
+from .optimisers.published import GradientFixedPoint as GradientFixedPoint
+from .optimisers.published import ReducedGradient as ReducedGradient
 from .plant.integrators import Collocation as Collocation
 from .plant.integrators import Cvodes as Cvodes
 from .plant.integrators import Euler as Euler

@@ -41,14 +41,6 @@ class Optimiser(Checked, ABC):
         return ""
 
     @property
-    def near_plan(self) -> Optimiser:
-        """The optimiser as it improves a plan that it has solved and remembers, without what looks for other plans.
-
-        Its memory is laid out alike.
-        """
-        return self
-
-    @property
     def most_work(self) -> dict[str, int]:
         """Settings that bound the iterations of a call, by name."""
         return (

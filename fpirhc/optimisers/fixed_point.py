@@ -1,13 +1,13 @@
 """Fixed-point iteration on the reduced gradient, preconditioned by one Riccati sweep: the default optimiser.
 
 U+ = G(U, h, 0) with h = M^-1 g deforms the plan as a control loop deforms its request (docs/theory.md). With limits of
-states the iteration is that of `fpirhc.optimisers.limited`; it ends where the plan is solved, in a loop as in open loop.
+states the iteration is that of `fpirhc.optimisers.state_limits`; it ends where the plan is solved, in a loop as in open loop.
 """
 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -42,8 +42,6 @@ class FixedPoint(Optimiser):
         tolerance: of the stationarity and of the move that a sweep wants (in the unit of the inputs), below which a plan is
             converged; None: 1e-4 of half the smallest range of an input, or of its size along the reference. The status of a call
             is OK where the plan that it returns is below it, and NOT_CONVERGED elsewhere, also after so many iterations.
-        feasible: violation of a state bound, as a share of half its range, below which a call may end; what is sent is rolled out,
-            which moves it, and counts as converged up to ten times as much.
         map: the deformation that makes the next plan; Affine(gain=-2.0) is the full step, a Sigmoid's scale limits it.
         hessian: GaussNewton() or ExactHessian(); None is Gauss-Newton without limits of states; with them the exact Hessian, and
             Gauss-Newton first where a remembered plan is improved.
@@ -60,13 +58,8 @@ class FixedPoint(Optimiser):
     map: Deformation = field(default_factory=lambda: Affine(gain=-2.0))
     hessian: HessianModel | None = None
     damping: NotNegative = 0.0
-    feasible: Positive = 1e-8
     most_iterations: Count = 100
     second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
-
-    @property
-    def near_plan(self) -> Optimiser:
-        return replace(self, second_start=False) if self.second_start else self
 
     @property
     def most_work(self) -> dict[str, int]:
@@ -139,7 +132,7 @@ class FixedPoint(Optimiser):
         return CLOSE * ocp.input_size if self.tolerance is None else self.tolerance
 
     def _limited(self, ocp: OptimalControl, iterations: int) -> LimitedSettings:
-        return LimitedSettings(self._tolerance(ocp), self.feasible, self.map, self.hessian, self.damping, iterations)
+        return LimitedSettings(self._tolerance(ocp), self.map, self.hessian, self.damping, iterations)
 
 
 def _require_rollouts(growth: np.ndarray) -> None:

@@ -30,7 +30,7 @@ from fpirhc.optimisers.base import (
     shift,
     status_of,
 )
-from fpirhc.optimisers.bounds import scales
+from fpirhc.optimisers.state_limits import scales
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal

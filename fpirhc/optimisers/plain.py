@@ -13,7 +13,6 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import CompileError, NotInstalled
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.riccati import BOX_PIVOT, rounds
 from fpirhc.optimisers import search as line_search
 from fpirhc.optimisers.base import (
     LAST,
@@ -26,7 +25,7 @@ from fpirhc.optimisers.base import (
     status_of,
     with_last,
 )
-from fpirhc.optimisers.search import Anchor, Arguments, Search, deformed_move, first_gamma
+from fpirhc.optimisers.search import BOX_PIVOT, Anchor, Arguments, Search, deformed_move, first_gamma, rounds
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.evaluate import Latest

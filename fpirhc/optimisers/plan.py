@@ -14,7 +14,7 @@ from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.fields.checked import ByName, checked_call
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.optimisers.base import Optimiser, feasible_to, first_plan, improved, judge
-from fpirhc.optimisers.bounds import tolerated
+from fpirhc.optimisers.state_limits import tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number, table
 

@@ -11,6 +11,7 @@
 #define HOPELESS 1e2   /* scaled error from which on there is no patience: multipliers are at their largest value */
 #define AHEAD 0.1      /* of the tolerance: where one more step by Gauss-Newton is expected to arrive, the exact Hessian is not computed */
 #define PURE_STEPS 10
+#define FEASIBLE 1e-8  /* violation of a state bound, as a share of its unit, below which a call may end */
 #define ROLLED_OUT 10.0 /* times FEASIBLE at which what is sent counts as converged: the roll-out of a plan moves it in its limits */
 #define MU_WARM 1e-4   /* barrier parameter of a remembered plan, and how far it is raised, in units of the cost */
 #define MU_MOST 0.1

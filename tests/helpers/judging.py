@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from fpirhc.horizon.problem import OptimalControl, rollout
-from fpirhc.optimisers.bounds import scales
+from fpirhc.optimisers.state_limits import scales
 
 _MET = 1e-6  # of the range: nearer limits may have a multiplier
 _ROUGH = 1e-4  # the same for a rough judgement: interior-point methods end that far from limits of small multipliers

@@ -9,7 +9,7 @@ import fpirhc as fp
 
 STEP, WEIGHT = 0.1, 0.1
 OPTIMISERS = {
-    "fixed point": fp.FixedPoint(iterations=3, tolerance=1e-7, feasible=1e-7),
+    "fixed point": fp.FixedPoint(iterations=3, tolerance=1e-7),
     "gradient": fp.GradientFixedPoint(iterations=60, tolerance=1e-6),
     "reduced gradient": fp.ReducedGradient(iterations=60, tolerance=1e-6),
     "full space": fp.FullSpaceFixedPoint(iterations=150, tolerance=1e-6, scaled=True),

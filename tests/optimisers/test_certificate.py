@@ -81,7 +81,7 @@ def test_bounds_hold_with_active_limits_of_states():
     assert exact.input_error < 1e-6
     assert exact.complementarity < 1e-6
     assert "active limits of states" in exact._repr_html_()
-    rough = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-3, feasible=1e-6), first, data)
+    rough = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-3), first, data)
     for plan in (rough, fp.solve(ocp, fp.Ipopt(accuracy=1e-5), first, data)):
         certificate = fp.certify(plan)
         assert np.abs(plan.inputs - best.inputs).max() <= certificate.input_error + 1e-8
