@@ -16,11 +16,9 @@ import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
 from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
-from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
-from fpirhc.summary import line, number, table
 from fpirhc.symbolic.evaluate import Evaluator, require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
@@ -73,8 +71,29 @@ class Spectrum:
         return self.smallest_real > small or self.largest_real < -small
 
 
+def jacobians_along(
+    problem: Problem, real: Array, states: Array, deformed: Array, believed: Array, exact: Array
+) -> Array:
+    """Return J of every row, shape (rows, n, n): over a cycle with a reality, and else at an instant.
+
+    Args:
+        real: states of the reality, shape (rows, its nx); without one they are not read.
+        states: states of the model, shape (rows, nx).
+        deformed: requests, shape (rows, n).
+        believed: parameters of the model, shape (np,), or one set per row.
+        exact: parameters of the reality, one set per row.
+    """
+    believed = np.asarray(believed, dtype=float)
+    if problem.reality is None:
+        return _at_instants(problem.plant, states, deformed, exact, believed)
+    count, n = len(real), deformed.shape[1]
+    rows = (np.broadcast_to(v, (count, v.shape[-1])).T for v in (np.asarray(exact, dtype=float), believed))
+    stacked = _sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, *rows)
+    return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+
+
 @lru_cache(maxsize=16)  # one run needs it several times
-def response_jacobian(plant: Plant) -> ca.Function:
+def _response_jacobian(plant: Plant) -> ca.Function:
     """Return Function (state, deformed, exact, approximate) -> J = df/dr of the controlled coordinates, n x n.
 
         f(r) = response(state, inverse(state, r; approximate); exact)
@@ -93,73 +112,10 @@ def response_jacobian(plant: Plant) -> ca.Function:
     return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])
 
 
-@checked_call
-def spectrum_over_run(
-    plant: Plant, states: Array, deformed: Array, *, exact: Array | None = None, approximate: Array | None = None
-) -> Spectrum:
-    """Return the eigenvalues of J along a run; long runs are thinned to `LARGEST_SAMPLE` cycles.
-
-    Args:
-        states: state of every cycle, shape (cycles, nx): run["state"].
-        deformed: request of every cycle, shape (cycles, n): run["deformed"].
-        exact: parameters of the plant, shape (np,); None: its exact ones.
-        approximate: parameters of the model, shape (np,); None: the plant's approximate ones.
-
-    Raises:
-        InvalidShape: arrays that do not fit the plant or each other.
-        InvalidValue: no finite eigenvalue.
-    """
-    states, deformed = _rows(plant, states, deformed)
-    rows = _thinned(len(states))
-    true = np.tile(plant.exact if exact is None else np.asarray(exact, dtype=float), (len(rows), 1))
-    return _spectrum(response_jacobians(plant, states[rows], deformed[rows], true, approximate))
-
-
-def _rows(plant: Plant, states: Array, deformed: Array) -> tuple[Array, Array]:
-    states, deformed = (np.atleast_2d(np.asarray(rows, dtype=float)) for rows in (states, deformed))
-    widths = (plant.state.size, len(plant.controlled_names))
-    if (states.shape[1], deformed.shape[1]) != widths or not len(states) == len(deformed) > 0:
-        raise InvalidShape(
-            f"states {states.shape} and deformed {deformed.shape}: expected (cycles, {widths[0]}) and (cycles, {widths[1]}), "
-            "of at least one cycle"
-        )
-    return states, deformed
-
-
-def _spectrum(jacobians: Array) -> Spectrum:
-    return Spectrum(np.linalg.eigvals(jacobians[np.isfinite(jacobians).all(axis=(1, 2))]))
-
-
-def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
-    """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); every entry is a number.
-
-    Long runs are evaluated at `LARGEST_SAMPLE` cycles, and in between the last value holds. Where J is singular or not
-    finite nothing contracts, and the factor is 1.
-
-    Args:
-        jacobians_at: function of the numbers of some cycles -> their Jacobians, shape (cycles, n, n).
-    """
-    rows = _thinned(cycles)
-    jacobians = jacobians_at(rows)
-    finite = np.isfinite(jacobians).all(axis=(1, 2))
-    factors = np.ones(len(rows))
-    factors[finite] = np.abs(1 - effective_gain * np.linalg.eigvals(jacobians[finite])).max(axis=1)
-    return factors[np.searchsorted(rows, np.arange(cycles), side="right") - 1]
-
-
-def response_jacobians(plant: Plant, states: Array, deformed: Array, exact: Array, approximate: Array | None) -> Array:
-    """Return J of every row, shape (rows, n, n); not finite where the model's inverse is not.
-
-    Args:
-        states: shape (rows, nx).
-        deformed: requests, shape (rows, n).
-        exact: parameters of the plant, one set per row, shape (rows, np).
-        approximate: parameters of the model, shape (np,), or one set per row; None: the plant's own.
-    """
-    model = plant.approximate if approximate is None else np.asarray(approximate, dtype=float)
-    function, n = response_jacobian(plant), deformed.shape[1]
-    count = len(states)
-    assumed = np.broadcast_to(model, (count, model.shape[-1]))
+def _at_instants(plant: Plant, states: Array, deformed: Array, exact: Array, believed: Array) -> Array:
+    """J of every row, shape (rows, n, n); not finite where the model's inverse is not."""
+    function, count, n = _response_jacobian(plant), len(states), deformed.shape[1]
+    assumed = np.broadcast_to(believed, (count, believed.shape[-1]))
     try:
         [columns] = Evaluator(function.map(count))(states, deformed, exact, assumed)
         return columns.reshape(count, n, n).transpose(0, 2, 1)
@@ -177,6 +133,63 @@ def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:
     except RuntimeError as error:
         require_unsolved(error)
         return np.full((n, n), np.nan)
+
+
+def _sampled_jacobian(problem: Problem) -> ca.Function:
+    """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n)."""
+    model, plant = problem.plant, problem.real_plant
+    matrix = kind(model.equations.inverse_opaque or problem.real_integrator.opaque)
+    x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
+    r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
+    exact, assumed = matrix.sym("exact", len(plant.parameters)), matrix.sym("assumed", len(model.parameters))
+    calm = ca.DM.zeros(len(plant.names))
+    advance = problem.real_integrator.step(plant, problem.period)
+    after = advance(x, u, exact, calm)
+    later = matrix.sym("later", model.input.size)
+    if problem.integrator.steps_maps:
+        response = _differences(problem, advance, after, (later, exact, calm))
+    else:
+        response = problem.truth.function(response_names(model), seen=True)(after, u, exact, calm)
+    gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
+    command = model.equations.inverse(state, r, assumed)
+    jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
+    names = ["reality", "state", "deformed", "exact", "approximate"]
+    arguments = [x, state, r, exact, assumed]
+    return ca.Function("fpirhc_sampled_jacobian", arguments, [ca.densify(jacobian)], names, ["jacobian"])
+
+
+def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tuple[Matrix, Matrix, ca.DM]) -> Matrix:
+    """The divided differences y_{k+r} / T^r of a map's controlled quantities, as far as the command of cycle k changes them.
+
+    `held`: commands of the cycles after it, parameters, no forcing.
+    """
+    model = problem.plant
+    outputs_of = problem.truth.function(model.output.elements, seen=True)
+    states, entries = [after], []
+    for _ in range(1, max(model.chains.values())):
+        states.append(advance(states[-1], *held))
+    for name in model.controlled_names:
+        order = model.chains[name]
+        outputs = outputs_of(states[order - 1], *held)
+        entries.append(outputs[model.output.elements.index(name)] / sampling(model) ** order)
+    return ca.vertcat(*entries)
+
+
+def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
+    """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); every entry is a number.
+
+    Long runs are evaluated at `LARGEST_SAMPLE` cycles, and in between the last value holds. Where J is singular or not
+    finite nothing contracts, and the factor is 1.
+
+    Args:
+        jacobians_at: function of the numbers of some cycles -> their Jacobians, shape (cycles, n, n).
+    """
+    rows = _thinned(cycles)
+    jacobians = jacobians_at(rows)
+    finite = np.isfinite(jacobians).all(axis=(1, 2))
+    factors = np.ones(len(rows))
+    factors[finite] = np.abs(1 - effective_gain * np.linalg.eigvals(jacobians[finite])).max(axis=1)
+    return factors[np.searchsorted(rows, np.arange(cycles), side="right") - 1]
 
 
 def _thinned(cycles: int) -> Array:
@@ -240,123 +253,65 @@ class ContractionReport:
 
     predicted: float  # max|1 - a lambda|, the factor of an error of the request per cycle
     effective_gain: float  # a of the deformation
-    gain_name: str  # name of the gain that the user sets, the deformation's own gain
+    own: tuple[str, float]  # the gain that the user sets, per unit of the effective gain
     linear_limit: tuple[float, float]  # interval of the effective gain in which small errors converge
     sector_limit: tuple[float, float]  # interval of the effective gain in which errors of any size converge
-    own_linear_limit: tuple[float, float]  # the linear limit in the deformation's own gain
-    own_sector_limit: tuple[float, float]  # the sector limit in the deformation's own gain
-    contractive: bool  # whether the effective gain is within the linear limit
-    within_sector: bool  # whether the effective gain is within the sector limit
     text: str  # the verdict and the admissible gains, for a reader
     fault: str = ""  # what is wrong; empty where the deformation converges
     remedy: str = ""  # what would do instead
-
-    def __repr__(self) -> str:
-        return line(self, *(f"{name} {value}" for name, value in self._facts()))
-
-    def _repr_html_(self) -> str:
-        """Factor and limits as a table, for notebooks."""
-        return table("Contraction", ("", "value"), self._facts(), [self.text])
-
-    def _facts(self) -> list[tuple[str, str]]:
-        """Verdict, factor and limits, by name; the limits in the deformation's own gain."""
-        linear, sector = (f"({a:.4g}, {b:.4g})" for a, b in (self.own_linear_limit, self.own_sector_limit))
-        return [
-            ("contractive", "yes" if self.contractive else "no"),
-            ("within the sector limit", "yes" if self.within_sector else "no"),
-            ("predicted factor", number(self.predicted)),
-            (f"linear limit of {self.gain_name}", linear),
-            (f"sector limit of {self.gain_name}", sector),
-        ]
 
 
 def check_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
     """Return the report of a deformation that converges on plants with these eigenvalues.
 
-    A gain between the sector and the linear limit is not refused: `within_sector` is False in its report. Where the response is
-    late by some cycles, the limits are those without this delay, and the text says so.
+    A gain between the sector and the linear limit is not refused. Where the response is late by some cycles, the limits are those
+    without this delay, and the text says so.
 
     Raises:
         NotContractive: eigenvalues with real parts of both signs, or a gain that is zero, of the wrong sign, or beyond the linear
             limit; the message names the admissible gains.
     """
     report = assess_gain(deformation, spectrum, late)
-    if not report.contractive:
+    if report.fault:
         raise NotContractive(report.fault, report.remedy)
     return report
 
 
 def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
-    """Return the report of `check_gain`; where `check_gain` raises, a report with `contractive` False and the same text."""
-    gain = deformation.effective_gain()
-    name, own = own_gain(deformation)
+    """Return the report of `check_gain`; where `check_gain` raises, one with the fault and the same text."""
+    gain, (name, value) = deformation.effective_gain(), own_gain(deformation)
     predicted = predicted_factor(spectrum.eigenvalues, gain)
     try:
-        linear = linear_limit(spectrum.eigenvalues)
+        if gain == 0:
+            raise NotContractive(f"{deformation} does not iterate, so nothing contracts", "use Sigmoid(gain=...)")
+        linear, sector = linear_limit(spectrum.eigenvalues), sector_limit(deformation, spectrum.eigenvalues)
     except NotContractive as error:
-        return _hopeless(predicted, gain, name, error)
-    if gain == 0:
-        fault = f"{deformation} does not iterate, so nothing contracts"
-        return _hopeless(predicted, gain, name, NotContractive(fault, "use Sigmoid(gain=...)"))
-    sector = sector_limit(deformation, spectrum.eigenvalues)
-    own_linear, own_sector = (_scaled(limit, own / gain) for limit in (linear, sector))
-    contractive, within = linear[0] < gain < linear[1], sector[0] < gain < sector[1]
-    admissible = _admissible(name, own_linear, own_sector, late)
-    what = with_its_gain(deformation)
-    fault, remedy = ("", "") if contractive else (f"{what} {_fault(gain, linear, predicted)}", f"use {admissible}")
-    return ContractionReport(
-        predicted=predicted,
-        effective_gain=gain,
-        gain_name=name,
-        linear_limit=linear,
-        sector_limit=sector,
-        own_linear_limit=own_linear,
-        own_sector_limit=own_sector,
-        contractive=contractive,
-        within_sector=within,
-        text=f"{fault}; {remedy}" if fault else _verdict(what, predicted, within, admissible),
-        fault=fault,
-        remedy=remedy,
-    )
-
-
-def _hopeless(predicted: float, gain: float, name: str, refusal: NotContractive) -> ContractionReport:
-    none = (0.0, 0.0)
-    limits, why = (none, none, none, none), (str(refusal), refusal.fault, refusal.remedy)
-    return ContractionReport(predicted, gain, name, *limits, False, False, *why)
-
-
-def _fault(gain: float, linear: tuple[float, float], predicted: float) -> str:
-    if gain * sum(linear) < 0:
-        return "has the wrong sign, so every cycle enlarges the error"
-    return f"is too large: errors grow by the factor {predicted:.3g} per cycle"
-
-
-def _scaled(limit: tuple[float, float], factor: float) -> tuple[float, float]:
-    ends = sorted(end * factor + 0.0 for end in limit)
-    return ends[0], ends[1]
-
-
-def _size(limit: tuple[float, float]) -> float:
-    return max(abs(limit[0]), abs(limit[1]))
-
-
-def _admissible(name: str, linear: tuple[float, float], sector: tuple[float, float], late: float) -> str:
-    sign = "positive" if sum(linear) > 0 else "negative"
-    bounds = f"0 < |{name}| < {_size(linear):.3g}"
-    if not np.isclose(_size(linear), _size(sector)):
-        bounds += f", and below {_size(sector):.3g} to converge from errors of any size"
-    behind = f", without the response's delay of {late:.4g} cycles" if late else ""
-    return f"a {sign} {name}, {bounds}{behind}"
-
-
-def _verdict(what: str, predicted: float, within: bool, admissible: str) -> str:
+        none = (0.0, 0.0)
+        return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error), error.fault, error.remedy)
+    scale, what, fault = value / gain, with_its_gain(deformation), ""
+    admissible = _admissible(name, scale, linear, sector, late)
     text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle"
-    if not within:
+    if not sector[0] < gain < sector[1]:
         text += (
             ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
         )
-    return f"{text}. Admissible: {admissible}."
+    text += f". Admissible: {admissible}."
+    if gain * sum(linear) < 0:
+        fault = f"{what} has the wrong sign, so every cycle enlarges the error"
+    elif abs(gain) >= abs(sum(linear)):
+        fault = f"{what} is too large: errors grow by the factor {predicted:.3g} per cycle"
+    remedy = f"use {admissible}" if fault else ""
+    text = f"{fault}; {remedy}" if fault else text
+    return ContractionReport(predicted, gain, (name, scale), linear, sector, text, fault, remedy)
+
+
+def _admissible(name: str, scale: float, linear: tuple[float, float], sector: tuple[float, float], late: float) -> str:
+    ends = [abs(scale * sum(limit)) for limit in (linear, sector)]  # one end of a limit is zero
+    bounds = f"0 < |{name}| < {ends[0]:.3g}"
+    if not np.isclose(ends[0], ends[1]):
+        bounds += f", and below {ends[1]:.3g} to converge from errors of any size"
+    behind = f", without the response's delay of {late:.4g} cycles" if late else ""
+    return f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, {bounds}{behind}"
 
 
 _WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the transient of a useful gain is shorter
@@ -407,71 +362,3 @@ def _without_trend(rows: Array) -> Array:
     time = np.arange(len(rows))
     line = np.vander(time, 2)
     return np.asarray(rows - line @ np.linalg.lstsq(line, rows, rcond=None)[0])
-
-
-def _sampled_jacobian(problem: Problem) -> ca.Function:
-    """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n)."""
-    model, plant = problem.plant, problem.real_plant
-    matrix = kind(model.equations.inverse_opaque or problem.real_integrator.opaque)
-    x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
-    r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
-    exact, assumed = matrix.sym("exact", len(plant.parameters)), matrix.sym("assumed", len(model.parameters))
-    calm = ca.DM.zeros(len(plant.names))
-    advance = problem.real_integrator.step(plant, problem.period)
-    after = advance(x, u, exact, calm)
-    later = matrix.sym("later", model.input.size)
-    if problem.integrator.steps_maps:
-        response = _differences(problem, advance, after, (later, exact, calm))
-    else:
-        response = problem.truth.function(response_names(model), seen=True)(after, u, exact, calm)
-    gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
-    command = model.equations.inverse(state, r, assumed)
-    jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
-    names = ["reality", "state", "deformed", "exact", "approximate"]
-    arguments = [x, state, r, exact, assumed]
-    return ca.Function("fpirhc_sampled_jacobian", arguments, [ca.densify(jacobian)], names, ["jacobian"])
-
-
-def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tuple[Matrix, Matrix, ca.DM]) -> Matrix:
-    """The divided differences y_{k+r} / T^r of a map's controlled quantities, as far as the command of cycle k changes them.
-
-    `held`: commands of the cycles after it, parameters, no forcing.
-    """
-    model = problem.plant
-    outputs_of = problem.truth.function(model.output.elements, seen=True)
-    states, entries = [after], []
-    for _ in range(1, max(model.chains.values())):
-        states.append(advance(states[-1], *held))
-    for name in model.controlled_names:
-        order = model.chains[name]
-        outputs = outputs_of(states[order - 1], *held)
-        entries.append(outputs[model.output.elements.index(name)] / sampling(model) ** order)
-    return ca.vertcat(*entries)
-
-
-def jacobians_along(
-    problem: Problem, real: Array, states: Array, deformed: Array, believed: Array, exact: Array
-) -> Array:
-    """Return J of every row: over a cycle with a reality, and else at an instant; see `sampled_jacobians`."""
-    if problem.reality is None:
-        return response_jacobians(problem.plant, states, deformed, exact, believed)
-    return sampled_jacobians(problem, real, states, deformed, believed, exact)
-
-
-def sampled_jacobians(
-    problem: Problem, real: Array, states: Array, deformed: Array, believed: Array, exact: Array | None = None
-) -> Array:
-    """Return J of every row with the exact parameters of the reality, shape (rows, n, n).
-
-    Args:
-        real: states of the reality, shape (rows, its nx).
-        states: states of the model, shape (rows, nx).
-        deformed: requests, shape (rows, n).
-        believed: parameters of the model, shape (np,), or one set per row.
-        exact: parameters of the reality, one set per row; None: its exact ones.
-    """
-    count, n = len(real), deformed.shape[1]
-    true = np.asarray(problem.real_plant.exact if exact is None else exact, dtype=float)
-    rows = (np.broadcast_to(v, (count, v.shape[-1])).T for v in (true, np.asarray(believed, dtype=float)))
-    stacked = _sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, *rows)
-    return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)

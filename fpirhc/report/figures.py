@@ -114,9 +114,8 @@ def contraction_figures(comparison: Comparison) -> list[Drawing]:
 
 def _own_gain(report: ContractionReport) -> tuple[str, float]:
     """Name of the user's gain and its size per unit of the effective gain; the effective gain where no gain converges."""
-    own, effective = (max(limit, key=abs) for limit in (report.own_linear_limit, report.linear_limit))
-    # An interval in the user's gain is mirrored where the sign differs, so its far end belongs to the far end.
-    return (report.gain_name, float(f"{own / effective:.9g}")) if effective else ("effective gain", 1.0)
+    name, scale = report.own
+    return (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
 
 
 def _draw_factor(
