@@ -142,12 +142,13 @@ FLAGS: dict[str, tuple[Facts, Facts, Facts, str]] = {
 
 
 def test_flags_turn_a_smaller_error_into_a_doubtful_one():
-    """And only where they are raised; a command that moves more is a remark."""
+    """And only where they are raised, as they alone are listed; a command that moves more is a remark."""
     raised = findings(compared({name: (plain, one) for name, (plain, one, *_) in FLAGS.items()}))
     calm = findings(compared({name: (plain, near) for name, (plain, _, near, _) in FLAGS.items()}))
     assert {n: str(one.outcome) for n, one in raised.items()} == dict.fromkeys(FLAGS, "doubtful")
     assert {n: str(one.outcome) for n, one in calm.items()} == dict.fromkeys(FLAGS, "better")
     assert [n for n, (*_, words) in FLAGS.items() if words not in raised[n].text or words in calm[n].text] == []
+    assert {one.flags for one in calm.values()} == {"none"}
     [moved] = findings(compared({"x": (Facts(), Facts(0.1, size=2.2))})).values()
     assert (str(moved.outcome), "variation of its command is 2.2 times" in moved.text) == ("better", True)
 
@@ -186,6 +187,18 @@ def test_a_held_reference_diverges_where_the_plant_left_alone_does_better():
     table = fp.study(one, fp.CasesOf(), compiled=False).table.set_index("controller")
     assert table.outcome.to_dict() == {"good": "finished", "bad": "diverged"}
     assert table.error["good"] > 1
+
+
+def test_a_failed_null_test_makes_a_smaller_error_doubtful():
+    """The plain form lags behind a moving reference: that is twice the error of a right model, and .01 of the range more."""
+    law = fp.ComputedTorque(fp.Exponential(rate=2.0))
+    moving = tank(reference=fp.Trajectory(lambda t: {"y": 1.5 + 0.5 * ca.sin(2 * t)}), start={"y": 1.5})
+    one = tasks.made(moving, {"law": law, "law+FPI": law.with_deformation(fp.Affine(gain=-0.4))})
+    found = fp.compare(one, seed=0, compiled=False)
+    first, null = found.findings[0], found["law+FPI"].null
+    assert (null.ratio("y") > 2, null.added("y") > 0.01, null.adapted["y"] < found["law"].errors["y"]) == (True,) * 3
+    assert (str(first.outcome), found.view.lists["Flags"]) == ("doubtful", [f"law+FPI: {first.flags}"])
+    assert f"its rms error is {null.ratio('y'):.3g} times that without adaptation" in first.flags
 
 
 @pytest.mark.parametrize(

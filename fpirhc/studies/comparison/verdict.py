@@ -51,7 +51,7 @@ class Finding:
     outcome: Outcome | None = None  # of the pair that it is about; None for a remark
     pair: tuple[str, str] | None = None  # names without and with adaptation
     ratios: Mapping[str, float] = field(default_factory=dict)  # error with adaptation over that without, largest first
-    flags: str = ""  # what all flags measured
+    flags: str = ""  # that are raised, or 'none'
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
@@ -162,11 +162,9 @@ def _grows(pair: Pair) -> float:
 
 
 def _null(pair: Pair) -> float:
-    """How many times as large it makes the error of a right model, where that exceeds what the wrong model costs without it."""
+    """How many times as large it makes the error of a right model, where the null test fails."""
     null = pair.adaptive.null
-    if null is None or not null.fails or null.stuck:
-        return 0.0
-    return null.ratio(null.worst) if null.adapted[null.worst] > pair.plain.errors[null.worst] else 0.0
+    return null.ratio(null.worst) if null is not None and null.fails and not null.stuck else 0.0
 
 
 @dataclass(frozen=True)
@@ -175,33 +173,29 @@ class Flag:
 
     measure: Callable[[Pair], float]
     least: float  # value from which it is raised
-    text: str  # with the {value}, and behind | what it means
+    text: str  # with the {value}
     doubts: bool = False  # whether it turns a smaller error into a doubtful one
 
 
 NULL = "its own model as the plant, the problem's sensors and no disturbances"
 FLAGS = (
     Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
-    Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last| as in an unstable loop", True),
-    Flag(_unsolved, 0.05, "{value:%} of its plans did not converge| give the optimiser more iterations", True),
-    Flag(_at_limit, 0.2, "its command stands at a limit in {value:%} of the cycles| no adaptation can act there", True),
-    Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation| it chatters", True),
+    Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
+    Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
+    Flag(_at_limit, 0.2, "its command stands at a limit in {value:%} of the cycles: no adaptation can act there", True),
+    Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation: it chatters", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
-    Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles| see the gain in fpirhc review"),
+    Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),
 )  # fmt: skip
 
 
-def flags_of(pair: Pair) -> tuple[list[tuple[Flag, str]], str]:
-    """Return the flags that are raised for a pair, each with its sentence, and what all of them measured."""
+def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
+    """Return the flags that are raised for a pair, each with its sentence."""
     every = [(flag, flag.measure(pair)) for flag in FLAGS]
-    raised = [(f, in_words(f.text.replace("|", ":"), {"value": v}, {})) for f, v in every if v > f.least]
+    raised = [(f, in_words(f.text, {"value": v}, {})) for f, v in every if v > f.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
-    kept = [
-        (f, v) for f, v in every if f.measure is not _chatters and (v > 0 or ":%" in f.text)
-    ]  # 0: it does not apply
-    told = "; ".join(in_words(f.text.partition("|")[0], {"value": v}, {}) for f, v in kept)
-    return [one for one in raised if not (chatter and one[0].measure is _moves)], told
+    return [one for one in raised if not (chatter and one[0].measure is _moves)]
 
 
 def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
@@ -225,8 +219,8 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     up, down = any(r > HURTS for r in ratios.values()), any(r < HELPS for r in ratios.values())
     one_way = Outcome.WORSE if up else Outcome.BETTER if down else Outcome.NO_DIFFERENCE
     outcome = Outcome.MIXED if up and down else one_way
-    raised, flags = flags_of(Pair(plain, adaptive, yard, major))
-    said = [text for _, text in raised]
+    raised = flags_of(Pair(plain, adaptive, yard, major))
+    said, flags = [text for _, text in raised], "; ".join(text for _, text in raised) or "none"
     if any(yard.beyond(plain, n) and yard.beyond(adaptive, n) for n in major):
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
