@@ -77,6 +77,8 @@ OF_AN_END = edited(
         lambda v: {"u": v.input.u**2}, terminal=lambda v: -v.state.y**2)""",
 )  # bends down
 BENDS = edited(f"{PLAN},", f"{PLAN[:-1]}, hessian=fp.ExactHessian()),")
+GENTLE, LONG = edited("fp.Sigmoid(gain=-0.5)", "fp.Affine(gain=-0.02)"), edited("duration=1.0", "duration=4.0")
+HARMS = lambda: (GENTLE(), LONG())  # noqa: E731 -- by what the first thousand cycles show
 WRONG_SIGN = edited("gain=-0.5", "gain=0.5, scale=1.0")
 WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.0}})\ncontrollers = {')
 MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
@@ -115,6 +117,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "run line.py", 2, "fpirhc: Missing argument 'CONTROLLER': one of CTC, CTC+FPI"),
         (None, "run lime.py", 2, "fpirhc: no file at 'lime.py'. Did you mean 'line.py'?"),
         (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
+        (HARMS, "run line.py CTC+FPI --no-compile", 0, "- CTC+FPI, t = 0.5 to 2 s: with the wrong model the rms error of y is"),
         (DIVERGING, "run line.py CTC --no-compile", 4, ""),
         (None, "compare line.py --no-compile -c CTC CTC+FPI", 0, MASS),  # a comparison tells it as a result
     ],

@@ -26,7 +26,7 @@ from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.hard_limits import Followed, limits_left
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
-from fpirhc.simulation.model_as_plant import ModelAsPlant
+from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
@@ -344,11 +344,13 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
 
 
 def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:
-    """Return what short runs on the plant and on the model show against the adaptation of a controller."""
+    """Return what runs of a thousand cycles on the plant and on the model show against the adaptation, and the span that counts."""
     if not controller.deformation.adapts:
         return ()
+    short = shortened(problem, 1000)
     try:
-        against = harm_in(*experiment(problem, controller, cycles=1000))
+        against = harm_in(*experiment(short, controller, short.cycles))
     except FpirhcError:
         return ()
-    return (f"{name}: {against}.",) if against else ()
+    span = f"t = {short.measure_from:.4g} to {short.duration:.4g}{with_space(problem.time_unit)}"
+    return (f"{name}, {span}: {against}.",) if against else ()
