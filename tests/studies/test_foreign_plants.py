@@ -60,26 +60,12 @@ def magnet() -> ForeignPlant:
         force = p.inductance * u.current**2 / (2 * 0.05 * (1 + q.gap / 0.05) ** 2)
         return {"gap": 9.81 - (0.001 * v.gap + force) / p.mass}
 
-    plant = fp.Plant(
-        coordinates={"gap": "m"},
-        inputs={"current": "A"},
-        response=response,
-        parameters=known(mass=(0.1, 0.12, "kg"), inductance=(0.01, 0.009, "H")),
-    )
-    return ForeignPlant(
-        fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(lambda t: {"gap": 0.05 + 0.01 * ca.sin(4 * t)}),
-            start={"gap": 0.05, "gap'": 0.04},
-            period=2e-3,
-            duration=1.0,
-            measure_from=0.5,
-            limits=fp.Limits(inputs={"current": (0.5, 12.0)}),
-            input_before={"current": 6.3},
-        ),
-        rate=15.0,
-        gain=-0.6,
-    )
+    parameters = known(mass=(0.1, 0.12, "kg"), inductance=(0.01, 0.009, "H"))
+    motion = fp.Trajectory(lambda t: {"gap": 0.05 + 0.01 * ca.sin(4 * t)})
+    more = {"limits": fp.Limits(inputs={"current": (0.5, 12.0)}), "input_before": {"current": 6.3}}
+    plant, start = fp.Plant({"gap": "m"}, {"current": "A"}, parameters, response), {"gap": 0.05, "gap'": 0.04}
+    task = fp.Problem(plant, motion, start, period=2e-3, duration=1.0, measure_from=0.5, **more)
+    return ForeignPlant(task, rate=15.0, gain=-0.6)
 
 
 def stocking() -> ForeignPlant:
@@ -107,21 +93,10 @@ def stocking() -> ForeignPlant:
         outputs={"adults": fp.Output("kt", lambda x, p: x.adults), "young": fp.Output("kt", lambda x, p: x.young)},
         time_unit="year",
     )
-    return ForeignPlant(
-        fp.Problem(
-            plant=plant,
-            reference=fp.Trajectory(
-                lambda t: {"adults": 60.0 + 8.0 * ca.sin(0.2 * t), "young": 40.0 + 4.0 * ca.sin(0.3 * t)}
-            ),
-            start={"adults": 55.0, "young": 38.0},
-            period=1.0,
-            duration=80.0,
-            measure_from=20.0,
-            limits=fp.Limits(inputs={"effort": (0.0, 3.0), "stocked": (0.0, 100.0)}),
-        ),
-        rate=0.5,
-        chain=chain,
-    )
+    motion = fp.Trajectory(lambda t: {"adults": 60.0 + 8.0 * ca.sin(0.2 * t), "young": 40.0 + 4.0 * ca.sin(0.3 * t)})
+    limits, start = fp.Limits(inputs={"effort": (0.0, 3.0), "stocked": (0.0, 100.0)}), {"adults": 55.0, "young": 38.0}
+    task = fp.Problem(plant, motion, start, period=1.0, duration=80.0, measure_from=20.0, limits=limits)
+    return ForeignPlant(task, rate=0.5, chain=chain)
 
 
 # --- The independent loop ---------------------------------------------------------------------------------------------
