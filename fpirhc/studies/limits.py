@@ -25,7 +25,8 @@ from fpirhc.simulation.hard_limits import hard_limits
 from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.studies.comparison.compare import check_gains, select
-from fpirhc.studies.runs import Kept, Row, Runner, header_of, ranges
+from fpirhc.studies.comparison.verdict import ranges
+from fpirhc.studies.runs import Kept, Row, Runner, header_of
 from fpirhc.studies.variants import Draws, Variant
 from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, number

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import joblib
-import numpy as np
 import pandas as pd
 
 from fpirhc.controllers.check import checked
@@ -29,7 +28,7 @@ from fpirhc.simulation.metrics.base import Metric, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator, with_judgements
 from fpirhc.studies.comparison.compare import select
-from fpirhc.studies.comparison.verdict import left_alone
+from fpirhc.studies.comparison.verdict import left_alone, ranges
 from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.view import Progress, versions
 from fpirhc.summary import in_units
@@ -39,7 +38,6 @@ from fpirhc.task.problem import Problem
 BLOCK = 64  # runs of a job at most
 FEW = 8  # runs, for which no other process is begun
 _LOOPS = 64  # that are kept
-_SAMPLES, _ROUNDING = 2000, 1e-9
 
 Row = dict[str, Any]
 
@@ -143,19 +141,6 @@ def relative(errors: Mapping[str, float], sizes: Mapping[str, float]) -> float:
     shares = [rms / sizes[c] for c, rms in errors.items()]
     error = math.hypot(*shares) / math.sqrt(len(shares))
     return error if math.isfinite(error) else math.inf
-
-
-def ranges(problem: Problem) -> tuple[dict[str, float], frozenset[str]]:
-    """Return the range of the reference of every judged coordinate, its start included, 1 where there is none; and which rest."""
-    times, plant = np.linspace(0.0, problem.duration, _SAMPLES), problem.plant
-    states = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[0].full())
-    places = [plant.output.elements.index(c) for c in problem.judged_names]
-    spans, largest = np.ptp(states[places], axis=1), np.abs(states[places]).max(axis=1)
-    sizes = np.maximum(spans, np.abs(states[places, 0] - problem.start_output[places]))
-    resting = spans <= _ROUNDING * largest
-    names = problem.judged_names
-    whole = {c: float(s) if s > 0 else 1.0 for c, s in zip(names, sizes, strict=True)}
-    return whole, frozenset(c for c, rests in zip(names, resting, strict=True) if rests)
 
 
 def run_variants(

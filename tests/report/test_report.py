@@ -26,11 +26,8 @@ def problem() -> fp.Problem:
 @pytest.fixture(scope="module")
 def comparison() -> Any:
     """A pair of controllers with and without adaptation, and one whose run ends early."""
-    track = fp.Exponential(rate=6.0)
-    controllers = {
-        "plain": fp.ComputedTorque(track),
-        "adaptive": fp.ComputedTorque(track, fp.Sigmoid(gain=-0.5, scale=5.0)),
-    }
+    track, form = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=5.0)
+    controllers = {"plain": fp.ComputedTorque(track), "adaptive": fp.ComputedTorque(track, form)}
     return fp.compare(tasks.made(problem(), controllers, description="Its task."), seed=0, compiled=False)
 
 

@@ -70,37 +70,50 @@ def left_alone(problem: Problem, seed: int) -> dict[str, float]:
     return {} if run.stop is not None else rms_error(problem, run)
 
 
+def ranges(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the range of every judged coordinate, and the size of the set-point of those that rest.
+
+    The range is that of the reference, or how far the start is from it where that is more. Of one that starts where it rests it is
+    the error that weighs one in the cost, or the distance of its limits, or 1.
+    """
+    plant, times = problem.plant, np.linspace(0.0, problem.duration, _SAMPLES)
+    rows = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[0].full())
+    weights = problem.cost.tracked or {} if problem.cost is not None else {}
+    found, resting = dict[str, float](), dict[str, float]()
+    for name in problem.judged_names:
+        place, (low, high) = plant.output.elements.index(name), problem.limits.states.get(name, (0.0, 1.0))
+        size, span = float(np.abs(rows[place]).max()), float(np.ptp(rows[place]))
+        found[name] = max(span, abs(float(rows[place, 0] - problem.start_output[place])))
+        small = max(ROUNDING * size, 1e-300)
+        if found[name] <= small:
+            wide = high - low if math.isfinite(high - low) else 1.0
+            found[name] = weights[name] ** -0.5 if weights.get(name, 0) > 0 else wide
+        resting |= {name: size} if span <= small else {}
+    return found, resting
+
+
 @dataclass(frozen=True)
 class Yardstick:
     """What errors are measured against, by judged coordinate."""
 
-    scales: Mapping[str, float]  # range of the reference, or how far the start is from it where that is more
+    scales: Mapping[str, float]  # the ranges
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
-    moving: frozenset[str]  # coordinates whose references move by themselves
-    resting: Mapping[str, float]  # size of the set-point, or that of the movement left alone where disturbances act
+    resting: Mapping[
+        str, float
+    ]  # of one that rests the set-point's size, or that of the movement left alone under disturbances
     span: str  # of time in which errors count
 
     @staticmethod
     def of(problem: Problem, seed: int) -> Yardstick:
         """Return the yardstick of a problem."""
-        plant, times = problem.plant, np.linspace(0.0, problem.duration, _SAMPLES)
-        rows = np.asarray(problem.reference.function(plant).map(_SAMPLES)(times[None, :])[0].full())
-        places = {n: plant.output.elements.index(n) for n in problem.judged_names}
-        own = {n: float(np.ptp(rows[k])) for n, k in places.items()}
-        both = {n: max(own[n], abs(float(rows[k, 0] - problem.start_output[k]))) for n, k in places.items()}
-        sizes, alone = {n: float(np.abs(rows[k]).max()) for n, k in places.items()}, left_alone(problem, seed)
-        small = {n: max(ROUNDING * size, 1e-300) for n, size in sizes.items()}
+        (scales, sizes), alone = ranges(problem), left_alone(problem, seed)
         resting = {n: max(s, alone.get(n, 0.0)) if problem.disturbances or not s else s for n, s in sizes.items()}
-        weights = (problem.cost.tracked or {}) if problem.cost is not None else {}
-        wide = {n: high - low for n, (low, high) in problem.limits.states.items() if math.isfinite(high - low)}
-        held = {n: weights[n] ** -0.5 if weights.get(n, 0) > 0 else wide.get(n, 1.0) for n in places}
-        scales = {n: size if size > small[n] else held[n] for n, size in both.items()}
         span = f"t = {problem.measure_from:.4g} to {problem.duration:.4g}{with_space(problem.time_unit)}"
-        return Yardstick(scales, alone, frozenset(n for n in places if own[n] > small[n]), resting, span)
+        return Yardstick(scales, alone, resting, span)
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
-        return entry.errors[name] > max(self.scales[name], 0.0 if name in self.moving else self.resting[name])
+        return entry.errors[name] > max(self.scales[name], self.resting.get(name, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
