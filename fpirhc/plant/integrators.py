@@ -11,8 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from types import SimpleNamespace
-from typing import Self, cast
+from typing import ClassVar, cast
 
 import casadi as ca
 import numpy as np
@@ -24,21 +23,16 @@ from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression
 
+_NAMES = ["x", "u", "p", "w"], ["x_next"]
+
 
 class Integrator(Checked, ABC):
-    """Contract: one cycle of the plant as a Function."""
+    """Contract: one cycle of the plant as a Function (state, input, parameters, forcing) -> state after `period`."""
 
-    @property
-    def opaque(self) -> bool:
-        """Whether the step holds operations that scalar expressions cannot."""
-        return False
+    opaque: ClassVar[bool] = False  # whether the step holds operations that scalar expressions cannot
+    steps_maps: ClassVar[bool] = False  # whether it moves maps; False for what integrates differential equations
 
-    @property
-    def steps_maps(self) -> bool:
-        """Whether it moves maps; False for what integrates differential equations."""
-        return False
-
-    def finer(self, times: int) -> Self | None:  # noqa: ARG002
+    def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
         """The same method with about `times` times the work; None where it has no such setting."""
         return None
 
@@ -51,35 +45,53 @@ class Integrator(Checked, ABC):
 
     @abstractmethod
     def step(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
+        """Function (state, input, parameters, forcing) -> state after `period`, in the plant's unit of time."""
+
+    @abstractmethod
+    def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:
+        """Function (state, input, parameters, length) -> state after so many steps at once, up to the longest."""
+
+
+class _OfRates(Integrator):
+    """What integrates x' = f(x, u, p, w)."""
+
+    @abstractmethod
+    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
+        """`step`, of a Function (state, input, parameters, forcing) -> dx/dt."""
+
+    def step(self, plant: Plant, period: float) -> ca.Function:
+        return self.integrate(plant.equations.forced_rate, period)
 
     def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:  # noqa: ARG002
-        """Function (state, input, parameters, length) -> state after so many steps at once: f times the length, over one step.
-
-        Args:
-            plant: the plant.
-            step: time of one step.
-            longest: largest length.
-        """
+        """One step of f times the length."""
         rate, length = plant.equations.forced_rate, ca.SX.sym("length")
         x, u, p, w = _symbols(rate)
-        p_length = ca.vertcat(p, length)
-        slow = ca.Function(
-            "fpirhc_slow", [x, u, p_length, w], [length * rate(x, u, p, w)], ["x", "u", "p", "w"], ["dx"]
-        )
-        one = self.step(cast(Plant, SimpleNamespace(equations=SimpleNamespace(forced_rate=slow))), step)
-        return ca.Function("fpirhc_stretched", [x, u, p, length], [one(x, u, p_length, ca.SX.zeros(w.numel()))])
+        given = [x, u, ca.vertcat(p, length), w]
+        one = self.integrate(ca.Function("fpirhc_slow", given, [length * rate(x, u, p, w)], _NAMES[0], ["dx"]), step)
+        still = one(*given[:3], ca.SX.zeros(w.numel()))
+        return ca.Function("fpirhc_stretched", [x, u, p, length], [still])
 
 
 @dataclass(frozen=True)
-class _Substepped(Integrator):
+class _Substepped(_OfRates):
     """Equal sub-steps of one method; `finer` has more of them, as many as there may be."""
 
     substeps: Few = 1
 
-    def finer(self, times: int) -> Self | None:
+    def finer(self, times: int) -> Integrator | None:
         more = self.substeps * times
         return replace(self, substeps=more) if more <= FEW else None
+
+    @abstractmethod
+    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
+        """Function (x, u, p, w) -> x after one sub-step of length h."""
+
+    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
+        x, u, p, w = _symbols(rate)
+        once, after = self.method(rate, period / self.substeps), x
+        for _ in range(self.substeps):
+            after = once(after, u, p, w)
+        return ca.Function("fpirhc_moved", [x, u, p, w], [after], *_NAMES)
 
 
 @dataclass(frozen=True)
@@ -98,15 +110,15 @@ class RungeKutta4(_Substepped):
         z = np.asarray(modes) / self.substeps
         return np.asarray(np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) ** self.substeps)
 
-    def step(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.equations.forced_rate
-        x, u, p, w = _symbols(rate)
-        h = period / self.substeps
-        x_next = x
-        for _ in range(self.substeps):
-            x_next = runge_kutta_4(lambda s: rate(s, u, p, w), x_next, h)
-        return ca.Function("fpirhc_rk4", [x, u, p, w], [x_next], ["x", "u", "p", "w"], ["x_next"])
+    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
+        def once(x: Expression, *given: Expression) -> Expression:
+            k1 = rate(x, *given)
+            k2 = rate(x + h / 2 * k1, *given)
+            k3 = rate(x + h / 2 * k2, *given)
+            k4 = rate(x + h * k3, *given)
+            return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+        return once
 
 
 @dataclass(frozen=True)
@@ -124,14 +136,8 @@ class Euler(_Substepped):
         """|1 + z/n|^n, n sub-steps."""
         return np.asarray(np.abs(1 + np.asarray(modes) / self.substeps) ** self.substeps)
 
-    def step(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.equations.forced_rate
-        x, u, p, w = _symbols(rate)
-        h, x_next = period / self.substeps, x
-        for _ in range(self.substeps):
-            x_next = x_next + h * rate(x_next, u, p, w)
-        return ca.Function("fpirhc_euler", [x, u, p, w], [x_next], ["x", "u", "p", "w"], ["x_next"])
+    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
+        return lambda x, *given: x + h * rate(x, *given)
 
 
 @dataclass(frozen=True)
@@ -155,29 +161,29 @@ class Collocation(_Substepped):
     degree: Few = 2
     newton: Few = 3
 
-    def step(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.equations.forced_rate
+    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
         x, u, p, w = _symbols(rate)
-        n, d, h = x.numel(), self.degree, period / self.substeps
+        n, d = x.numel(), self.degree
         # x_j' = sum_k slopes_kj x_k / h of the polynomial through x and all x_k; the first row belongs to x.
         slopes = np.asarray(ca.collocation_coeff(ca.collocation_points(d, "radau"))[0])
         points = ca.SX.sym("points", n, d)
         rates = ca.horzcat(*(rate(points[:, j], u, p, w) for j in range(d)))
         left = ca.vec(ca.mtimes(ca.horzcat(x, points), ca.DM(slopes)) - h * rates)
-        newton = ca.vec(points) - _solved(ca.jacobian(left, ca.vec(points)), left)
-        better = ca.Function("fpirhc_newton", [x, points, u, p, w], [ca.cse(ca.reshape(newton, n, d))])
-        x_next = x
-        for _ in range(self.substeps):
-            inside = ca.repmat(x_next, 1, d)
+        change = ca.qr_solve(left, *ca.qr_sparse(ca.jacobian(left, ca.vec(points))), False)
+        newton = ca.cse(ca.reshape(ca.vec(points) - change, n, d))
+        better = ca.Function("fpirhc_newton", [x, points, u, p, w], [newton])
+
+        def once(x: Expression, *given: Expression) -> Expression:
+            inside = ca.repmat(x, 1, d)
             for _ in range(self.newton):
-                inside = better(x_next, inside, u, p, w)
-            x_next = inside[:, d - 1]
-        return ca.Function("fpirhc_collocation", [x, u, p, w], [x_next], ["x", "u", "p", "w"], ["x_next"])
+                inside = better(x, inside, *given)
+            return inside[:, d - 1]
+
+        return once
 
 
 @dataclass(frozen=True)
-class Cvodes(Integrator):
+class Cvodes(_OfRates):
     """SUNDIALS CVODES.
 
     Args:
@@ -191,25 +197,21 @@ class Cvodes(Integrator):
     def finer(self, times: int) -> Cvodes:  # noqa: ARG002
         return Cvodes(self.tolerance / 10)
 
-    def step(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state after `period` seconds."""
-        rate = plant.equations.forced_rate
+    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
         x, u, p, w = symbols = _symbols(rate)
         size, options = ca.SX.sym("size", x.numel()), {"reltol": self.tolerance, "abstol": self.tolerance}
         moved = {"x": x, "p": ca.vertcat(u, p, w, size), "ode": rate(size * x, u, p, w) / size}
         solver = ca.integrator("fpirhc_cvodes", "cvodes", moved, 0.0, period, options)
+        # What is large for each state in a cycle, at most 1; it has no derivative.
+        f = rate(*symbols)
+        large = ca.fabs(x) + period * ca.fabs(f) + period**2 * ca.fabs(ca.jtimes(f, x, f))
+        large = ca.densify(ca.if_else(large > 0, ca.fmin(large, 1), 1))
         xm, *given = (ca.MX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
-        sizes = _sizes(rate(*symbols), symbols, period)(xm, *given)
+        sizes = ca.Function(
+            "fpirhc_cvodes_sizes", list(symbols), [large], {"is_diff_out": [False], "never_inline": True}
+        )(xm, *given)
         x_next = sizes * solver(x0=xm / sizes, p=ca.vertcat(*given, sizes))["xf"]
-        return ca.Function("fpirhc_cvodes_step", [xm, *given], [x_next], ["x", "u", "p", "w"], ["x_next"])
-
-
-def _sizes(rate: ca.SX, symbols: tuple[ca.SX, ...], period: float) -> ca.Function:
-    """Function (state, input, parameters, forcing) -> what is large for each state in a cycle, at most 1, without a derivative."""
-    x = symbols[0]
-    size = ca.fabs(x) + period * ca.fabs(rate) + period**2 * ca.fabs(ca.jtimes(rate, x, rate))
-    column = ca.densify(ca.if_else(size > 0, ca.fmin(size, 1), 1))
-    return ca.Function("fpirhc_cvodes_sizes", list(symbols), [column], {"is_diff_out": [False], "never_inline": True})
+        return ca.Function("fpirhc_cvodes_step", [xm, *given], [x_next], *_NAMES)
 
 
 @dataclass(frozen=True)
@@ -222,7 +224,6 @@ class MapSteps(Integrator):
     steps_maps = True
 
     def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:
-        """Function (state, input, parameters, length) -> state after a whole number of steps, up to the longest."""
         (x, u, p), length = plant.symbols(), ca.SX.sym("length")
         one, after = self.step(plant, step), x
         for k in range(round(longest)):
@@ -231,25 +232,23 @@ class MapSteps(Integrator):
         return ca.Function("fpirhc_stretched", [x, u, p, length], [after])
 
     def step(self, plant: Plant, period: float) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state after `period`, a whole number of the plant's cycles."""
-        x, u, p = plant.symbols()
-        w, after = ca.SX.sym("w", len(plant.names)), x
+        x, u, p, w = _symbols(plant.equations.next)
+        after = x
         for _ in range(max(1, round(period / sampling(plant)))):
             after = plant.equations.next(after, u, p, w)
-        return ca.Function("fpirhc_map", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
+        return ca.Function("fpirhc_map", [x, u, p, w], [after], *_NAMES)
 
 
 def one_step(plant: Plant, period: float) -> ca.Function:
     """Function (state, input, parameters, forcing) -> state one cycle later: one Runge-Kutta step, or the cycle of a map."""
-    return motion_of(plant, RungeKutta4(), RungeKutta4()).step(plant, period)
+    return motion_of(plant, USUAL).step(plant, period)
 
 
-def motion_of(plant: Plant, integrator: Integrator, usual: Integrator) -> Integrator:
+def motion_of(plant: Plant, integrator: Integrator) -> Integrator:
     """Return what moves a plant: the integrator where it fits the plant, else the steps of a map, or the usual integrator."""
-    is_map = plant.step is not None
-    if integrator.steps_maps == is_map:
+    if integrator.steps_maps == (plant.step is not None):
         return integrator
-    return MapSteps() if is_map else usual
+    return USUAL if integrator.steps_maps else MapSteps()
 
 
 def own_steps(plant: Plant, integrator: Integrator, period: float) -> int:
@@ -269,23 +268,7 @@ USUAL = RungeKutta4()
 """The integrator of a problem, or of a horizon, that names none: this very object. A map has its own steps in its place."""
 
 
-def _solved(matrix: ca.SX, right: ca.SX) -> ca.SX:
-    """matrix^-1 right, as the entries of a sparse matrix allow."""
-    v, r, beta, rows, columns = ca.qr_sparse(matrix)
-    return ca.qr_solve(right, v, r, beta, rows, columns, False)
-
-
-def runge_kutta_4(rate: Callable[[Expression], Expression], x: Expression, h: float) -> Expression:
-    """Return x after one classical Runge-Kutta step of length h for x' = rate(x)."""
-    k1 = rate(x)
-    k2 = rate(x + h / 2 * k1)
-    k3 = rate(x + h / 2 * k2)
-    k4 = rate(x + h * k3)
-    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
 def _symbols(rate: ca.Function) -> tuple[ca.SX, ...]:
-    """Symbols (x, u, p, w) of the arguments of the forced derivative."""
     return tuple(ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
 
 
@@ -334,8 +317,6 @@ def spurious_growth(
         states: shape (nx, N).
         commands: shape (nu, N).
     """
-    if plant.step is not None:
-        return np.ones(commands.shape[1])
     points = zip(states.T, commands.T, strict=True)
     modes = [poles(plant, state, command, plant.approximate) for state, command in points]
     return np.array([_spurious(integrator, period, m).max(initial=1.0) if np.isfinite(m).all() else 1.0 for m in modes])

@@ -308,7 +308,7 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return motion_of(self.real_plant, self.truth.integrator or self.integrator, USUAL)
+        return motion_of(self.real_plant, self.truth.integrator or self.integrator)
 
     @cached_property
     def real_start(self) -> np.ndarray:
