@@ -304,7 +304,7 @@ def _steps_inside(
 
     Where stages have several lengths, a shorter one stays at its end.
     """
-    if not horizon.discretisation.steps_maps or not (limits.states or limits.paths):
+    if not (limits.states or limits.paths):
         return []
     one, per_stage = by_single_steps(plant), steps_in(plant, horizon.step)
     u, p, x, views = view.input.vector, data["parameters"], view.state.vector, []

@@ -174,8 +174,6 @@ def nominal_responses(
 
 def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     """Return the signals on which an output of the plant, or a derivative below its relative order, depends."""
-    if not plant.outputs:
-        return ()
     x, u, p = plant.symbols()
     motion = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
     differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.equations.output_orders.get(e, 1)]

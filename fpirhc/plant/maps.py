@@ -6,7 +6,6 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
@@ -109,12 +108,6 @@ def check_time(plant: Plant, model: Plant, orders: Mapping[str, int], mistakes: 
         )
 
 
-def decay_rates(modes: np.ndarray, cycle: float) -> np.ndarray:
-    """Return log|1 + T s| / T of eigenvalues s of a map's divided differences: negative where a mode decays, -inf where it ends."""
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
-
-
 def response_age(plant: Plant) -> int:
     """Return how many cycles before a measured response its state was: at one instant, or one step earlier on a map."""
     return 0 if plant.step is None else 1
@@ -130,13 +123,33 @@ def step_of(plant: Plant, matrix: np.ndarray, time: float) -> np.ndarray:
 
 
 def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from eigenvalues of the rates to the rates with which modes grow: the real part, or that of a map."""
-    return np.real if plant.step is None else partial(decay_rates, cycle=sampling(plant))
+    """Return the function from eigenvalues s of the rates to the growth rates of modes: Re s, or log|1 + T s| / T of a map."""
+    if plant.step is None:
+        return np.real
+    cycle = sampling(plant)
+
+    def rates(modes: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore"):  # a mode that ends has the rate -inf
+            return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
+
+    return rates
 
 
 def time_derivatives(plant: Plant) -> Callable[[Expression, Expression, int], list[Expression]]:
-    """Return the function (motion, time, order) -> (y, y', ..., y^(order)), of a map its divided differences."""
-    return differentiated if plant.step is None else _differences(sampling(plant))
+    """Return the function (motion, time, order) -> (y, y', ..., y^(order)), of a map its divided forward differences."""
+    if plant.step is None:
+        return differentiated
+    cycle = sampling(plant)
+
+    def differences(value: Expression, t: Expression, order: int) -> list[Expression]:
+        nodes = [value] + [ca.substitute(value, t, t + k * cycle) for k in range(1, order + 1)]
+        column = []
+        for k in range(order + 1):
+            column.append(nodes[0] / cycle**k)
+            nodes = [later - earlier for earlier, later in pairwise(nodes)]
+        return column
+
+    return differences
 
 
 def differentiated(value: Expression, t: Expression, order: int) -> list[Expression]:
@@ -145,20 +158,6 @@ def differentiated(value: Expression, t: Expression, order: int) -> list[Express
     for _ in range(order):
         derivatives.append(ca.jacobian(derivatives[-1], t))
     return derivatives
-
-
-def _differences(step: float) -> Callable[[Expression, Expression, int], list[Expression]]:
-    """The divided forward differences of a motion along the steps of a map, in place of its derivatives."""
-
-    def differences(value: Expression, t: Expression, order: int) -> list[Expression]:
-        nodes = [value] + [ca.substitute(value, t, t + k * step) for k in range(1, order + 1)]
-        column = []
-        for k in range(order + 1):
-            column.append(nodes[0] / step**k)
-            nodes = [later - earlier for earlier, later in pairwise(nodes)]
-        return column
-
-    return differences
 
 
 def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:

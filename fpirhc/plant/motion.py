@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Mapping
 from copy import copy
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -56,11 +55,6 @@ def followed(plant: Plant) -> str:
     return "output" if plant.outputs else "coordinate"
 
 
-def disturbed(plant: Plant) -> str:
-    """What quantities are called that disturbances may add to."""
-    return "input, coordinate or output" if plant.outputs else "input or coordinate"
-
-
 def followed_units(plant: Plant) -> dict[str, str]:
     """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
     return {name: one.unit for name, one in plant.outputs.items()} if plant.outputs else dict(plant.coordinates)
@@ -95,17 +89,6 @@ def with_exact_parameters(plant: Plant, exact: np.ndarray) -> Plant:
     other.__dict__.pop("exact", None)
     object.__setattr__(other, "parameters", parameters)
     return other
-
-
-def known_exactly(plant: Plant) -> Plant:
-    """Return the same with the exact parameters as approximate ones."""
-    named = {name: replace(one, approximate=one.exact, spread=None) for name, one in plant.parameters.items()}
-    return replace(plant, parameters=named)
-
-
-def with_outputs_of(plant: Plant, model: Plant) -> Plant:
-    """Return a plant with the outputs of a model; itself where it has the same."""
-    return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)
 
 
 def outside_names(plant: Plant) -> tuple[str, ...]:

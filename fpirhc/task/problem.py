@@ -22,7 +22,7 @@ from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import disturbed, followed, followed_units, with_exact_parameters, words
+from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
@@ -129,7 +129,8 @@ class Problem(Checked):
                 f"disturbances: '{name}' names both an input and a coordinate; write 'input {name}' or 'coordinate {name}'"
             )
         names = [*self.disturbable, *shared]
-        mistakes.unknown(f"disturbances: {disturbed(plant)}", self.disturbances, names)
+        what = "input, coordinate or output" if plant.outputs else "input or coordinate"
+        mistakes.unknown(f"disturbances: {what}", self.disturbances, names)
         instants = np.array([0.0, self.period])
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
         held = self.duration, self.period, self.signal_steps, self.real_integrator

@@ -20,7 +20,7 @@ from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, input_reaches_at, output_order
 from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.maps import check_time, over, unlike
-from fpirhc.plant.motion import followed_units, with_exact_parameters, with_outputs_of
+from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 
 
@@ -256,7 +256,8 @@ class Reality(Checked):
             raise NotSupported(
                 f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out"
             )
-        return with_outputs_of(plant, model)
+        same = tuple(plant.outputs) == tuple(model.outputs)
+        return plant if same else replace(plant, outputs=model.outputs)
 
     def _own(self, name: str, *, seen: bool) -> str:
         """Its coordinate or output for one of the model."""

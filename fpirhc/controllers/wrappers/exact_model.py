@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.contract import ControllerWrapper, PlantModel
-from fpirhc.plant.motion import known_exactly
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
@@ -28,7 +27,7 @@ class ExactModel(ControllerWrapper):
 
     def inner_problem(self, problem: Problem) -> Problem:
         model = self.plant_model(problem)
-        plant = _EXACT.of((model.plant,), (), lambda: known_exactly(model.plant))
+        plant = _EXACT.of((model.plant,), (), lambda: _known(model.plant))
         with signals_of_models():
             return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
 
@@ -41,6 +40,11 @@ class ExactModel(ControllerWrapper):
 
 
 _EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once
+
+
+def _known(plant: Plant) -> Plant:
+    named = {name: replace(one, approximate=one.exact, spread=None) for name, one in plant.parameters.items()}
+    return replace(plant, parameters=named)
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:
