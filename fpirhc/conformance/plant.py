@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.conformance.laws import hold, keep, within
 from fpirhc.errors import Mistakes
-from fpirhc.plant.motion import input_columns
+from fpirhc.plant.motion import input_columns, sampling
 from fpirhc.plant.plant import Plant
 
 _POINTS = 20
@@ -104,21 +104,28 @@ def response_is_pure(trial: _Trial, generator: np.random.Generator) -> None:
 
 
 def derivative_is_the_chain(trial: _Trial, generator: np.random.Generator) -> None:
-    """dx/dt holds the next derivative of every coordinate, in the highest place the response plus the forcing."""
-    plant = trial.plant
-    elements = plant.state.elements
-    for x, u, _ in trial.points(generator):
-        forcing = generator.normal(size=len(plant.names))
-        if plant.steps > 1:  # a forcing of a map acts in each of its steps, and moves the state of the later ones
-            forcing[:] = 0
-        forced = _numbers(plant.equations.response, x, u, plant.exact) + forcing
-        rate = _numbers(plant.equations.forced_rate, x, u, plant.exact, forcing)
-        for k, name in enumerate(elements):
-            higher = f"{name}'"
-            what = x[elements.index(higher)] if higher in elements else forced[plant.names.index(name.rstrip("'"))]
-            hold(
-                within(rate[k] - what, 1e-12 * max(1.0, abs(what))), f"d{name}/dt is {rate[k]:.6g}, expected {what:.6g}"
-            )
+    """Along the motion, or a map's steps, y changes by y', this by y'', ... up to the response; a forcing adds to the highest."""
+    plant, equations, p, names = trial.plant, trial.plant.equations, trial.plant.exact, trial.plant.output.elements
+    held = plant.controlled is not None or len(plant.inputs) == len(plant.chains)
+    for x, u, where in trial.points(generator):
+        rate, forcing = _numbers(equations.rate, x, u, p), generator.normal(size=len(plant.names))
+        step = 1e-5 / max(1.0, float(np.abs(rate).max())) if plant.step is None else sampling(plant)
+        back = step if plant.step is None else 0.0
+        later, earlier, now = (_numbers(equations.output, x + t * rate, u, p, 0) for t in (step, -back, 0.0))
+        known = dict(zip((*names, *plant.state.elements), (*now, *x), strict=True))
+        if held:
+            responses = _numbers(equations.controlled_response, x, u, p)
+            known |= {n + "'" * r: v for (n, r), v in zip(plant.response_orders.items(), responses, strict=True) if r}
+        size = max(1.0, float(np.abs([*now, *rate]).max()))
+        for name, slope in zip(names, (later - earlier) / (step + back), strict=True):
+            want = known.get(f"{name}'", slope)
+            fits = within(slope - want, _SLOPE * max(size, abs(want)))
+            hold(fits, f"d{name}/dt is {slope:.6g}, expected {want:.6g} {where}")
+        forced = _numbers(equations.forced_rate, x, u, p, forcing) - rate
+        added = plant.steps > 1 or within(
+            forced.sum() - forcing.sum(), 1e-9 * size
+        )  # it moves the later steps of a map
+        hold(added, f"a forcing of {forcing} adds {forced} to the derivatives of the states {where}")
 
 
 def slopes_are_true(trial: _Trial, generator: np.random.Generator) -> None:
