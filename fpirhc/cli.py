@@ -248,7 +248,7 @@ def run(
 
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], _folder(out, task.name)
-    from fpirhc.controllers.contract import believing
+    from fpirhc.controllers.contract import resolved
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
     from fpirhc.simulation.metrics import measure
@@ -257,7 +257,7 @@ def run(
 
     if draw is not None:
         one = Draws(draw + 1, mismatch, seed).of(task)[draw]
-        chosen = believing(task.problem, chosen)  # it does not know what is drawn
+        chosen = resolved(task.problem, chosen)  # it does not know what is drawn
         task, seed = replace(task, problem=one.problem), one.seed
     with progress_bars() as progress:
         report = lambda done, total: progress(controller, done, total)  # noqa: E731
@@ -353,7 +353,7 @@ def probe(
 ) -> None:  # fmt: skip
     """Measure an unknown plant and propose an adaptation. Exit code 1 where none is proposed."""
     task = _task(problem)
-    from fpirhc.errors import NotSupported
+    from fpirhc.errors import NotSupported, require
     from fpirhc.probing.probe import probe as ask
     from fpirhc.report.terminal import show_probe
     from fpirhc.studies.comparison.compare import select
@@ -364,8 +364,7 @@ def probe(
         with suppress(NotSupported):
             one.with_deformation(one.deformation)
             able.append(name)
-    if not able:
-        raise NotSupported("probe needs a controller with a deformation: choose another one by --controller")
+    require(able, "probe needs a controller with a deformation: choose another one by --controller")
     name, one = able[0], task.controllers[able[0]]
     settings: dict[str, Any] = {"cycles": cycles, "amplitude": amplitude, "recording": recording, "chatter": chatter}
     answer = ask(task.problem, one, trials=trials, seed=seed, **settings)

@@ -95,6 +95,18 @@ class NotSupported(FpirhcError, ValueError):
     """A valid setting that this member of a family cannot serve; the message names a member that can."""
 
 
+def require(condition: object, refusal: str) -> None:
+    """Raise NotSupported with the sentence, which says what to do instead, unless the condition holds."""
+    if not condition:
+        raise NotSupported(refusal)
+
+
+def refuse(reasons: Iterable[str]) -> None:
+    """Raise NotSupported with the first reason, where there is one."""
+    for reason in reasons:
+        require(False, reason)
+
+
 class NoAnswer(NotSupported):
     """A question that these numbers leave without an answer, as where a run does not stay finite."""
 

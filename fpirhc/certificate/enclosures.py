@@ -14,7 +14,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import require
 
 # Of an operation with its coefficients, or of a function of the standard library.
 _ROUNDING = 16 * float(np.finfo(float).eps)
@@ -220,11 +220,11 @@ class Enclosure:
         self.function = ca.Function("fpirhc_enclosed", [argument], [ca.densify(ca.vec(value))])
         own = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_RULES}
         for k in range(self.function.n_instructions()):
-            if self.function.instruction_id(k) not in own:
-                raise NotSupported(
-                    f"no bounds: the model has an operation without a rule (CasADi operation {self.function.instruction_id(k)}); "
-                    "write it with +, -, *, /, powers, sqrt, exp, log, sin, cos, tan, tanh, atan, fabs, fmin and fmax"
-                )
+            require(
+                self.function.instruction_id(k) in own,
+                f"no bounds: the model has an operation without a rule (CasADi operation {self.function.instruction_id(k)}); "
+                "write it with +, -, *, /, powers, sqrt, exp, log, sin, cos, tan, tanh, atan, fabs, fmin and fmax",
+            )
 
     def at(self, points: np.ndarray) -> np.ndarray:
         """Return the values at points (entries, lanes), shape (results, lanes)."""

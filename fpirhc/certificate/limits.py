@@ -14,11 +14,11 @@ import numpy as np
 
 from fpirhc.certificate.tube import Centre, Chains, Expressions, Sweep, Tube
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import refuse, resolved, tracking_law
+from fpirhc.controllers.contract import resolved, tracking_law
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Form
 from fpirhc.deformation.model_referenced import ModelReferenced
-from fpirhc.errors import NotSupported
+from fpirhc.errors import refuse, require
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Count
 from fpirhc.plant.parameter import exact_ranges
@@ -115,11 +115,11 @@ def _gains(problem: Problem, ready: Controller) -> dict[str, tuple[float, ...]]:
     orders = dict(zip(problem.plant.names, problem.plant.orders, strict=True))
     feedback = {n: None if law is None else law.feedback(orders[n]) for n in problem.plant.controlled_names}
     gains = {name: one.gains for name, one in feedback.items() if one is not None and not one.integral}
-    if len(gains) < len(feedback):
-        raise NotSupported(
-            f"no certificate with {type(law).__name__}: its gains must be constant and it must not integrate, such as "
-            "Exponential(rate=..., integral=False); the deformation removes what is constant"
-        )
+    require(
+        len(gains) == len(feedback),
+        f"no certificate with {type(law).__name__}: its gains must be constant and it must not integrate, such as "
+        "Exponential(rate=..., integral=False); the deformation removes what is constant",
+    )
     return gains
 
 

@@ -19,7 +19,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import build
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.composed import compose_controller
-from fpirhc.controllers.contract import tracking_law, with_optimiser
+from fpirhc.controllers.contract import tracking_law, with_field
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Identity, automatic, with_inner
 from fpirhc.describe import describe
@@ -265,7 +265,7 @@ def facts_hold(trial: Trial, generator: np.random.Generator) -> None:  # noqa: A
         f"its planner is {planner}, and its cycle has {'a' if planner is None else 'no'} signal 'solve'",
     )
     if planner is not None:
-        same = with_optimiser(ready, planner.optimiser)
+        same = with_field(ready, "optimiser", planner.optimiser)
         hold(describe(same) == describe(ready), "with its own optimiser it has another description")
 
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from fpirhc.contraction.delayed import converges, delayed, largest_gain
 from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, linear_limit
-from fpirhc.controllers.contract import Controller, refuse, resolved
+from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
 from fpirhc.deformation.wrappers.delayed import Paired
-from fpirhc.errors import NotContractive
+from fpirhc.errors import NotContractive, refuse
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.open import nominal
 from fpirhc.task.dead_time import every

@@ -6,19 +6,18 @@ controller is built for, unless it overrides them. So the facts pass through any
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal, NoReturn, Self, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar, cast
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
-from fpirhc.errors import NotSupported
+from fpirhc.errors import refuse, require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
@@ -205,7 +204,7 @@ class Controller(Checked, ABC):
             NotSupported: neither it nor an inner controller has a field `deformation`.
         """
         if self.inner is None or replaced(self, "deformation", deformation) is not None:
-            return _replaceable(self, "deformation", deformation, "deformation that can be replaced")
+            return with_field(self, "deformation", deformation)
         return with_inner(self, self.inner.with_deformation(deformation))
 
     def with_defaults(self, problem: Problem) -> Self:
@@ -275,29 +274,13 @@ class ControllerWrapper(Controller, ABC):
         return self.controller.deformation
 
 
-def with_lateness(problem: Problem, controller: Controller, least: float = math.ulp(0.0)) -> Controller:
-    """Return the controller whose deformation believes the problem's dead times, and an external plant's lag, where it is open.
-
-    One with several deformations has its own for each already. `least`: the smallest of these times that is believed.
-    """
-    own = controller.deformation
-    late = late_deformation(own, problem, least)
-    unchanged = late is own or controller.response(problem) is not None
-    return controller if unchanged else controller.with_deformation(late)
-
-
-def believing(problem: Problem, controller: Controller) -> Controller:
-    """Return the resolved controller whose deformation believes this problem's dead times and lags in every other one too."""
-    return with_lateness(problem, resolved(problem, controller), least=0)
-
-
-def late_deformation(deformation: Deformation, problem: Problem, least: float = math.ulp(0.0)) -> Deformation:
-    """Return the deformation with open dead times, to the nearest whole cycle, and lags of at least `least`.
+def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
+    """Return the deformation with the dead times, to the nearest whole cycle, and lags of the problem where it leaves them open.
 
     Inputs that are not one per coordinate have the longest.
     """
     if deformation.inner is not None:
-        inner = late_deformation(deformation.inner, problem, least)
+        inner = late_deformation(deformation.inner, problem)
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
@@ -311,9 +294,8 @@ def late_deformation(deformation: Deformation, problem: Problem, least: float = 
         f.name for f in fields(deformation) if f.metadata.get("of_problem") and getattr(deformation, f.name) is None
     ]
     square = len(inputs) == len(problem.plant.controlled_names)
-    late = [name for name in left_open if max(known[name]) >= least]
-    each = {n: square and len(inputs) > 1 and len({*known[n]}) > 1 for n in late}
-    values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in late}
+    each = {n: square and len(inputs) > 1 and len({*known[n]}) > 1 for n in left_open}
+    values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in left_open}
     return replace(deformation, **values) if values else deformation
 
 
@@ -331,13 +313,12 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
 
 
 def _require_once(wrapper: Controller) -> None:
-    inside = wrapper.inner
+    name, inside = type(wrapper).__name__, wrapper.inner
     while inside is not None:
-        if getattr(wrapper, "once", False) and type(inside) is type(wrapper):
-            name = type(wrapper).__name__
-            raise NotSupported(
-                f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both"
-            )
+        require(
+            type(inside) is not type(wrapper) or not getattr(wrapper, "once", False),
+            f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both",
+        )
         inside = inside.inner
 
 
@@ -349,42 +330,23 @@ def tracking_law(controller: Controller) -> Tracking | None:
 _Own = TypeVar("_Own", bound=Controller)
 
 
-def with_setting(controller: _Own, name: str, value: object) -> _Own | None:
-    """Return the controller with another value of a field, its own or that of an inner one; None where nobody has the field."""
+def with_field(controller: _Own, name: str, value: object) -> _Own:
+    """Return the controller with another content of a field, its own or that of an inner one.
+
+    Raises:
+        NotSupported: nobody has the field.
+    """
     changed = replaced(controller, name, value)
-    if changed is not None or controller.inner is None:
+    if changed is not None:
         return changed
-    inner = with_setting(controller.inner, name, value)
-    return None if inner is None else with_inner(controller, inner)
-
-
-def with_optimiser(controller: Controller, optimiser: Optimiser) -> Controller:
-    """Return the controller with another optimiser in its planner."""
-    return _replaceable(controller, "optimiser", optimiser, "optimiser that can be replaced")
-
-
-def _replaceable(controller: _Own, name: str, value: object, what: str) -> _Own:
-    changed = with_setting(controller, name, value)
-    if changed is None:
-        refuse_without(controller, what)
-    return changed
-
-
-def refuse_without(controller: Controller, what: str) -> NoReturn:
-    """Raise, because the controller lacks what a question or a change is about."""
-    raise NotSupported(f"{type(innermost(controller)).__name__} has no {what}")
+    require(controller.inner is not None, f"{type(controller).__name__} has no {name} that can be replaced")
+    return with_inner(controller, with_field(cast(Controller, controller.inner), name, value))
 
 
 def given_response(problem: Problem, controller: Controller) -> Response | None:
     """Return the response that a controller is given in place of that of the plant's controlled quantities; None: that one."""
     own = controller.response(problem)
     return None if own is None or own.function is None else own
-
-
-def require_controlled_response(problem: Problem, controller: Controller, refusal: str) -> None:
-    """Raise where a controller reads other responses than those of the plant's controlled quantities."""
-    if controller.response(problem) is not None:
-        raise NotSupported(refusal)
 
 
 def innermost(controller: Controller) -> Controller:
@@ -411,12 +373,6 @@ def without_deformation(controller: Controller) -> Controller:
     return controller.with_deformation(Identity()) if controller.deformation.adapts else controller
 
 
-def refuse(reasons: Iterator[str]) -> None:
-    """Raise with the first reason, where there is one."""
-    for reason in reasons:
-        raise NotSupported(reason)
-
-
 def check_chains(problem: Problem, law: str) -> None:
     """Raise for an output of order 0, which has no derivative below its response.
 
@@ -435,7 +391,4 @@ def check_derivatives(problem: Problem, law: str) -> None:
     `law`: what the law does with derivatives, as the beginning of a sentence.
     """
     what = rateless(problem.plant)
-    if what:
-        raise NotSupported(
-            f"{law} a derivative with respect to time, and {what}; use ComputedTorque with a deformation"
-        )
+    require(not what, f"{law} a derivative with respect to time, and {what}; use ComputedTorque with a deformation")

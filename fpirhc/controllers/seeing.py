@@ -12,10 +12,10 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.contract import Controller, refuse
+from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.path import believe_block, stated_path
 from fpirhc.controllers.reference_states import nominal_motion
-from fpirhc.errors import NoAnswer
+from fpirhc.errors import NoAnswer, refuse
 from fpirhc.horizon.nominal import nominal_run, reference_state
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of, response_age

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import require
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.plant import Plant
@@ -31,8 +31,7 @@ _SMALL = 1e-2  # share of the largest gain before a run that is not finite
 
 def require_reference_of_states(plant: Plant, refusal: str) -> None:
     """Raise with the refusal where the reference does not give the whole state."""
-    if not plant.equations.known_on_reference:
-        raise NotSupported(refusal)
+    require(plant.equations.known_on_reference, refusal)
 
 
 def filled(plant: Plant, outputs: np.ndarray) -> np.ndarray:

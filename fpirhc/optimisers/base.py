@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.describe import Same
-from fpirhc.errors import CompileError, NotInstalled, NotSupported
+from fpirhc.errors import CompileError, NotInstalled, require
 from fpirhc.fields.checked import Checked
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout, sizes_along
 from fpirhc.status import Status
@@ -62,8 +62,7 @@ class Optimiser(Checked, ABC):
         inputs = np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any()
         limited = {"inputs": inputs or ocp.bounds_states, "states": ocp.bounds_states, "prices": priced}
         for limit in self.cannot_keep:
-            if limited[limit]:
-                raise NotSupported(f"{type(self).__name__} {_REMEDIES[limit].format(', '.join(priced))}")
+            require(not limited[limit], f"{type(self).__name__} {_REMEDIES[limit].format(', '.join(priced))}")
 
     @abstractmethod
     def memory(self, ocp: OptimalControl) -> Layout:

@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
-from fpirhc.errors import CompileError, InvalidValue, NotInstalled, NotSupported
+from fpirhc.errors import CompileError, InvalidValue, NotInstalled, require
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
@@ -87,12 +87,12 @@ class FixedPoint(Optimiser):
         # With limits of states a plan has states of its own and feedback between them, which holds a plant that runs away itself.
         _require_rollouts(ocp.runaway() if ocp.bounds_states else ocp.along.growth())
         least = ocp.along.least_curvature()
-        if least < -_CONVEX and (self.hessian is None or self.hessian.needs_convex_cost):
-            raise NotSupported(
-                f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
-                f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()) for an "
-                f"economic cost or an output that saturates, or add a convex term to the cost"
-            )
+        require(
+            least >= -_CONVEX or not (self.hessian is None or self.hessian.needs_convex_cost),
+            f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
+            f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()) for an "
+            f"economic cost or an output that saturates, or add a convex term to the cost",
+        )
 
     def memory(self, ocp: OptimalControl) -> Layout:
         return limited_memory(ocp) if ocp.bounds_states else plain_memory(ocp)
@@ -137,13 +137,12 @@ class FixedPoint(Optimiser):
 
 def _require_rollouts(growth: np.ndarray) -> None:
     """Raise if a motion of the model grows so much over the horizon, by these factors per stage, that rollouts have no digits."""
-    if np.prod(growth) <= _GROWTH or not np.isfinite(growth).all():
-        return
-    raise NotSupported(
+    require(
+        np.prod(growth) <= _GROWTH or not np.isfinite(growth).all(),
         f"FixedPoint rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
         f"{np.prod(growth):.1g} over the horizon, so plans have no digits. Where the plant itself does not run away so, a fast "
         f"mode is the cause: use Horizon(discretisation=Collocation()), or RungeKutta4(substeps=...) with more sub-steps; else "
-        f"limit a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages"
+        f"limit a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages",
     )
 
 

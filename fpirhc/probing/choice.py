@@ -23,7 +23,7 @@ from fpirhc.deformation.leaky import default_pole
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.deformation.wrappers.filtered import Filtered
-from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.errors import FpirhcError, require
 from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import outside
 from fpirhc.plant.plant import Plant
@@ -259,8 +259,10 @@ def _plant(model: Plant, gains: np.ndarray, *, drifts: bool) -> tuple[Plant, tup
     without = "the estimated plant of a {} has no equations yet"
     require_rates(model, without.format("map"))
     direct = set(model.controlled_names) == set(model.coordinates)  # else what else the inputs move has to follow
-    if model.equations.inverse_opaque and not direct:
-        raise NotSupported(without.format("plant of outputs of a model that is not affine in its inputs,"))
+    require(
+        direct or not model.equations.inverse_opaque,
+        without.format("plant of outputs of a model that is not affine in its inputs,"),
+    )
     signals = tuple(f"drift_{name}" for name in model.controlled_names) if drifts else ()
     known = {n: one if one.outside else replace(one, exact=one.approximate) for n, one in model.parameters.items()}
     courses = {name: outside(0.0, "1") for name in signals}

@@ -23,7 +23,7 @@ from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import given_states, raw_signal, sensor_ranges
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
-from fpirhc.errors import NotSupported
+from fpirhc.errors import require
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import SECONDS
 from fpirhc.plant.plant import Plant
@@ -229,5 +229,4 @@ def refuse_unbounded(controller: Controller) -> None:
     """Refuse a controller whose optimiser may take any time."""
     planner = controller.planner
     why = planner.optimiser.unbounded if planner is not None else ""
-    if why:
-        raise NotSupported(f"{why}; Stepper(..., bounded=False) accepts it away from a machine")
+    require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a machine")

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import with_optimiser
+from fpirhc.controllers.contract import with_field
 from fpirhc.describe import identity
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.checked import checked_call
@@ -339,7 +339,9 @@ def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str]
     for name, controller in sources.items():
         if name in own:
             tolerance, kept = _tolerance_of(own[name], task.problem), [own[name], *own.values()]
-            varied |= {f"{name} ({n})": with_optimiser(controller, _of_kind(b, tolerance, kept)) for n, b in choices}
+            varied |= {
+                f"{name} ({n})": with_field(controller, "optimiser", _of_kind(b, tolerance, kept)) for n, b in choices
+            }
         elif controllers:
             varied[name] = controller
     return replace(task, controllers=varied, headline=None)

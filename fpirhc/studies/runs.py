@@ -19,7 +19,7 @@ import joblib
 import pandas as pd
 
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import believing, resolved
+from fpirhc.controllers.contract import resolved
 from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
 from fpirhc.problem_files.problem_file import Task, load_problem
@@ -128,7 +128,7 @@ class Runner:
             controller = controller if live else with_settings(controller, own)
             if not paths:
                 checked(base, controller)
-            controller = believing(one.believed, controller) if one.believed else controller
+            controller = resolved(one.believed, controller) if one.believed else controller
             loop = ComposedLoop.of(base, resolved(base, controller), paths)
             # A loop that runs once is worth a compiler where the run is long.
             return loop.simulator(self._compiled and (None if once and not paths else True), known=self._codes)

@@ -16,7 +16,7 @@ from typing import NoReturn, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported
+from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Finite, NotNegative, Positive
 from fpirhc.plant.integrators import Integrator
@@ -131,11 +131,11 @@ class ExternalPlant(Checked):
             InvalidProblem: a value that is not finite or outside its bounds.
             NotSupported: it has no parameters.
         """
-        if not self.parameters:
-            raise NotSupported(
-                "the external plant has no exact parameters that a study could draw; state them, "
-                "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare it without a study"
-            )
+        require(
+            self.parameters,
+            "the external plant has no exact parameters that a study could draw; state them, "
+            "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare it without a study",
+        )
         return replace(self, parameters=with_exact_values(self.parameters, exact))
 
     def as_model(self, model: Plant) -> NoReturn:  # noqa: ARG002

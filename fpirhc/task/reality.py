@@ -14,7 +14,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
+from fpirhc.errors import InvalidProblem, Mistakes, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, input_reaches_at, output_order
@@ -252,10 +252,10 @@ class Reality(Checked):
             differences = [
                 f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
             ]
-        if differences:
-            raise NotSupported(
-                f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out"
-            )
+        require(
+            not differences,
+            f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out",
+        )
         same = tuple(plant.outputs) == tuple(model.outputs)
         return plant if same else replace(plant, outputs=model.outputs)
 

@@ -16,9 +16,8 @@ import numpy as np
 
 from fpirhc.controllers.base import clip, like
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import refuse
 from fpirhc.controllers.path import Pairs
-from fpirhc.errors import InvalidValue
+from fpirhc.errors import InvalidValue, refuse
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.regressor import Combination, Regressor

@@ -19,7 +19,7 @@ from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import InvalidValue, NotContractive, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
@@ -215,13 +215,14 @@ class Cascade(Controller):
         """
         self.controller.check(self.inner_problem(problem))
         self.deformation.largest_step()  # raises where a scale is not set
-        if self.deformation.form.pairs:
-            raise NotSupported(
-                "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself"
-                if self.deformation.form.modelled
-                else f"Cascade: {type(self.deformation).__name__} pairs by itself; give the map inside, and "
-                "ThroughModel(dead_time=...)"
-            )
+        form, name = self.deformation.form, type(self.deformation).__name__
+        require(
+            not form.modelled,
+            "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself",
+        )
+        require(
+            not form.pairs, f"Cascade: {name} pairs by itself; give the map inside, and ThroughModel(dead_time=...)"
+        )
         gain = self.deformation.effective_gain()
         if gain < 0:
             raise NotContractive(

@@ -15,9 +15,9 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, like
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_controller, dependencies_of_command, embedded
-from fpirhc.controllers.contract import ControllerWrapper, Planner, require_controlled_response, with_setting
+from fpirhc.controllers.contract import ControllerWrapper, Planner, innermost, with_field
 from fpirhc.controllers.path import Pairs
-from fpirhc.errors import NotSupported
+from fpirhc.errors import require
 from fpirhc.learning.estimators.base import ParameterEstimator, Seen
 from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
 from fpirhc.plant.maps import response_age
@@ -83,27 +83,26 @@ class Estimating(ControllerWrapper):
         if self.dead_time is not None:
             self.dead_time.check(problem.plant, problem.period)
         lost = problem.sensing.believed_response(problem.plant)
-        if lost and self.estimator.reads_response(modelled.plant):
-            raise NotSupported(
-                f"{type(self.estimator).__name__} learns from the response, which needs {', '.join(lost)}, and no sensor shows it; "
-                "measure it, or use a DisturbanceKalman that measures states alone"
-            )
-        require_controlled_response(
-            modelled,
-            self.controller,
+        require(
+            not (lost and self.estimator.reads_response(modelled.plant)),
+            f"{type(self.estimator).__name__} learns from the response, which needs {', '.join(lost)}, and no sensor shows it; "
+            "measure it, or use a DisturbanceKalman that measures states alone",
+        )
+        require(
+            self.controller.response(modelled) is None,
             f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another",
         )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         modelled = self.inner_problem(built.problem)
-        following = with_setting(self.controller, "follows_model", True) if self.at_once else None
-        controller = following or self.controller
+        follows = self.at_once and hasattr(innermost(self.controller), "follows_model")
+        controller = with_field(self.controller, "follows_model", True) if follows else self.controller
         inner = compose_controller(build(modelled, controller))
-        if "parameters" not in dependencies_of_command(inner):
-            raise NotSupported(
-                f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
-                "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon"
-            )
+        require(
+            "parameters" in dependencies_of_command(inner),
+            f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
+            "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon",
+        )
         outputs = self.estimator.reads_outputs(modelled.plant)
         age = response_age(built.plant) if self.estimator.reads_response(modelled.plant) else 0
         pairs = Pairs(built.problem, self.dead_time or built.problem.dead_time, outputs, age)

@@ -13,10 +13,10 @@ import numpy as np
 from fpirhc.controllers.base import Controller, like
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_controller, embedded
-from fpirhc.controllers.contract import ControllerWrapper, require_controlled_response
+from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.errors import InvalidValue, NotSupported
+from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
@@ -102,10 +102,10 @@ class ByDesired(Predictor):
             e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0
         ]
         free = [e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names]
-        if hidden or free:
-            raise NotSupported(
-                f"ByDesired() does not predict {(hidden or free)[0]}, which no desired response moves; use ByModel()"
-            )
+        require(
+            not (hidden or free),
+            f"ByDesired() does not predict {', '.join(hidden + free)}, which no desired response moves; use ByModel()",
+        )
 
     def sent(self, plant: Plant) -> Signal:
         return plant.response_signal("desired")
@@ -182,13 +182,11 @@ class Predicted(ControllerWrapper):
         """
         self.controller.check(problem)
         self.by.check(problem.plant)
-        if self.by != ByModel():
-            require_controlled_response(
-                problem,
-                self.controller,
-                f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
-                f"{type(self.controller).__name__} reads others; use by=ByModel()",
-            )
+        require(
+            self.by == ByModel() or self.controller.response(problem) is None,
+            f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
+            f"{type(self.controller).__name__} reads others; use by=ByModel()",
+        )
         if self._cycles(problem) > MOST:
             raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.errors import FpirhcError, NotSupported, package
+from fpirhc.errors import FpirhcError, package, require
 from fpirhc.export.binaries import web_module
 from fpirhc.export.device import c_of, literal
 from fpirhc.export.targets.c import template
@@ -130,10 +130,10 @@ def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: P
     problem.require_equations(
         "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
     )
-    if loses(moving(problem)):
-        raise NotSupported(
-            "a page steps its loop without the driver that runs missing cycles afterwards; leave dropout and range out of sensors"
-        )
+    require(
+        not loses(moving(problem)),
+        "a page steps its loop without the driver that runs missing cycles afterwards; leave dropout and range out of sensors",
+    )
     package("ziglang", "compiler", "a lab")
     loops = []
     for name, controller in controllers.items():
