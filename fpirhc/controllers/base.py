@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import reduce
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Controller as Controller
@@ -19,13 +18,12 @@ from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.path import model_block
 from fpirhc.deformation.base import Deformation, Form
 from fpirhc.plant.chain import nominal_responses
-from fpirhc.plant.motion import followed_units, time_signal
+from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar, vector
-from fpirhc.task.problem import Problem
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
 from fpirhc.tracking.base import Tracking
 
 _REQUEST = Form().request
@@ -72,16 +70,8 @@ def reference_block(built: Built) -> Block:
         return {"reference": outputs, "_reference_response": wanted, "error": error}
 
     reads = Layout((time_signal(plant), seen, *built.own))
-    error = error_signal(built.problem, "error")
-    writes = Layout((like(seen, "reference"), plant.response_signal("_reference_response"), error))
-    return Block("reference", reads, writes, step, opaque=built.problem.reference.opaque)
-
-
-def error_signal(problem: Problem, name: str) -> Signal:
-    """Return a signal that holds an error of every judged coordinate."""
-    every = followed_units(problem.plant)
-    units = [every[c] for c in problem.judged_names]
-    return vector(name, problem.judged_names, units)
+    writes = Layout((like(seen, "reference"), plant.response_signal("_reference_response"), built.error))
+    return Block("reference", reads, writes, step, opaque=built.opaque)
 
 
 def rename(name: str, source: Signal, target: Signal) -> Block:
@@ -218,8 +208,8 @@ def _limit_block(built: Built) -> Block:
 def _within_rates(built: Built, command: Expression, before: Expression) -> Expression:
     """The command as far as hard limits of rates let it go in a cycle."""
     entries = []
-    for k, ends in enumerate(np.transpose(built.problem.limits.rate_bounds(built.plant))):
-        low, high = (before[k] + built.period * float(end) if math.isfinite(end) else None for end in ends)
+    for k, ends in enumerate(zip(*built.rates, strict=True)):
+        low, high = (before[k] + built.period * end if math.isfinite(end) else None for end in ends)
         entry = command[k] if low is None else ca.fmax(command[k], low)
         entries.append(entry if high is None else ca.fmin(entry, high))
     return ca.vertcat(*entries)

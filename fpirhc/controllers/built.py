@@ -13,15 +13,17 @@ import casadi as ca
 
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Controller, PlantModel, Response, given_response
-from fpirhc.controllers.path import Path, Told, believed_path
-from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals
-from fpirhc.controllers.seeing import given_states, raw_signal
+from fpirhc.controllers.path import Pairs, Path, Told, believed_path
+from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
+from fpirhc.controllers.seeing import check_believed, given_states, raw_signal
 from fpirhc.deformation.base import Deformation
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
+from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression, Signal, vector
 from fpirhc.task.problem import Problem, cycles_per_plan
 
 
@@ -35,12 +37,19 @@ class Built:
     response: Response | None  # that it is given in place of that of the controlled quantities
     largest: tuple[float, ...]  # response of every controlled quantity that the limits of the inputs allow
     ends: tuple[list[float], list[float]]  # lower and upper limits of the inputs
+    rates: tuple[list[float], list[float]]  # the same of their changes, where these limits are hard
     before: Signal  # the last command; in the first cycle the input before it
+    state: Signal  # with its first values
+    output: Signal  # of the outputs, with theirs
+    pairs: Pairs  # state and command of a measured response
     own: tuple[Signal, ...]  # the reference's own signals
     given: tuple[Signal, ...]  # what is given from outside for it
     motion: ca.Function  # (time, own signals) -> (outputs, response) of the reference
     later: ca.Function  # the same one cycle ahead
-    judged: tuple[int, ...]  # places among the outputs of those whose error is logged
+    aim: Block | None  # that writes the reference's own signals
+    opaque: bool  # whether its motion is a graph of calls
+    error: Signal  # of the judged outputs
+    judged: tuple[int, ...]  # their places among the outputs
     warm_up: float  # number of the first cycle whose response may be used
     raw: Signal | None  # the raw measurements that a step begins with; None where state and response are both measured
     states: tuple[Signal, ...]  # the state, where it is given beside raw measurements of outputs
@@ -66,6 +75,12 @@ class Built:
         """Return the reference's own signals inside a step."""
         return [getattr(s, signal.name) for signal in self.own]
 
+    def inner(self, controller: Controller | None = None) -> Built:
+        """Return what the wrapped controller is built from; `controller`: in its place."""
+        wrapped = controller or self.controller.inner
+        assert wrapped is not None
+        return build(self.controller.inner_problem(self.problem), wrapped)
+
     def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""
         return believed_path(self.problem, deformation)
@@ -82,12 +97,15 @@ _LATEST: Latest[Built] = Latest(8)
 def build(problem: Problem, controller: Controller) -> Built:
     """Return the controller built for the problem: the one place where a pair is checked and its automatic numbers are chosen."""
     ready = checked(problem, controller)
+    check_believed(problem, ready)
     return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _built(problem, ready))
 
 
 def _built(problem: Problem, ready: Controller) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
+    own, before = own_signals(problem), tuple(map(float, problem.inputs_before))
+    units = followed_units(plant)
     return Built(
         problem=problem,
         controller=ready,
@@ -95,11 +113,18 @@ def _built(problem: Problem, ready: Controller) -> Built:
         response=given_response(problem, ready),
         largest=largest_response(problem),
         ends=problem.limits.input_ends(plant),
-        before=replace(plant.input, name="_command_before", start=tuple(map(float, problem.inputs_before))),
-        own=own_signals(problem),
+        rates=tuple(one.tolist() for one in problem.limits.rate_bounds(plant)),
+        before=replace(plant.input, name="_command_before", start=before),
+        state=replace(plant.state, start=tuple(map(float, problem.start_state))),
+        output=replace(plant.output, start=tuple(map(float, problem.start_output))),
+        pairs=Pairs(problem, problem.dead_time),
+        own=own,
         given=given_signals(problem),
         motion=motion_of(problem),
         later=motion_of(problem, ahead=problem.period),
+        aim=problem.reference.block(plant, stages_of(problem), problem.period) if own else None,
+        opaque=problem.reference.opaque,
+        error=vector("error", problem.judged_names, [units[name] for name in problem.judged_names]),
         judged=tuple(plant.output.elements.index(name) for name in problem.judged_names),
         warm_up=problem.warm_up_cycles,
         raw=raw_signal(problem),

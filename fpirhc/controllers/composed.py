@@ -13,8 +13,7 @@ from dataclasses import replace
 from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.path import ACTED, MEASURED_TIME, NOW, measured_output, measured_state
-from fpirhc.controllers.reference_states import with_reference
-from fpirhc.controllers.seeing import check_believed, seeing_blocks
+from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals
@@ -40,7 +39,6 @@ def _composed(built: Built) -> Composite:
     if built.raw is None:
         return compose_controller(built)
     blocks, delays = _blocks_of(built)
-    check_believed(built.problem, built.controller)
     seeing, seen = seeing_blocks(built.problem)
     time, *others = _reads(built).signals
     reads = Layout((time, *built.states, built.raw, *others[1 + len(measured_signals(built.plant)) :]))
@@ -86,7 +84,9 @@ def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
         raise InvalidProblem(
             f"{type(built.controller).__name__}.blocks(built) must return two lists (blocks, delays), got {described(given)}"
         )
-    return with_reference(built.problem, pair[0]), list(pair[1])
+    names = {signal.name for signal in built.own}
+    reads = built.aim is not None and any(names & {*block.reads.names} for block in pair[0])
+    return [*([built.aim] if reads else []), *pair[0]], list(pair[1])
 
 
 def _informed(

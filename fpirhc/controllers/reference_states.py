@@ -9,7 +9,6 @@ remember with multiples of it, so that one absurd but finite sample does not sta
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import casadi as ca
@@ -19,7 +18,6 @@ from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
 from fpirhc.horizon.nominal import filled, nominal_run
 from fpirhc.plant.chain import nominal_responses
-from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
@@ -61,14 +59,6 @@ def preview_of(problem: Problem) -> ca.Function | None:
     if problem.horizon is None:
         return None
     return problem.reference.preview(problem.plant, problem.horizon.nodes)
-
-
-def with_reference(problem: Problem, blocks: Sequence[Block]) -> list[Block]:
-    """Return the blocks of a controller after the reference's own block, where some of them read its signals."""
-    names = {signal.name for signal in own_signals(problem)}
-    read = {signal.name for block in blocks for signal in block.reads.signals}
-    own = problem.reference.block(problem.plant, stages_of(problem), problem.period) if names & read else None
-    return [*([own] if own is not None else []), *blocks]
 
 
 def nominal_motion(problem: Problem) -> ca.Function:

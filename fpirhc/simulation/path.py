@@ -15,14 +15,14 @@ from typing import ClassVar, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Response, error_signal, like, rename
+from fpirhc.controllers.base import Response, like, rename
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import own_step
-from fpirhc.plant.motion import forcing_units, outside_names, time_signal
+from fpirhc.plant.motion import followed_units, forcing_units, outside_names, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
@@ -427,7 +427,9 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     plant = problem.plant
     places = [plant.output.elements.index(c) for c in problem.judged_names]
     own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
-    writes = Layout((error_signal(problem, "true_error"),))
+    writes = Layout(
+        (vector("true_error", problem.judged_names, [followed_units(plant)[c] for c in problem.judged_names]),)
+    )
     if given_signals(problem):
         reads = Layout((like(plant.output, "reference"), motion))
         return Block(

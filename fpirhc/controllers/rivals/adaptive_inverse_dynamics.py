@@ -11,7 +11,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks, fed, like
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.path import MEASURED_TIME, Pairs
+from fpirhc.controllers.path import MEASURED_TIME
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
@@ -108,7 +108,7 @@ class AdaptiveInverseDynamics(Controller):
 
     def _target(self, built: Built) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
-        plant, pairs = built.plant, Pairs(built.problem, built.problem.dead_time)
+        plant, pairs = built.plant, built.pairs
         if not _late(built) or built.given:
             target = like(plant.output, _EARLIER if self._remembers(built) else "_target")
             return lambda s: getattr(s, target.name), (target,)
@@ -136,8 +136,8 @@ _EARLIER = "_target_earlier"
 
 def _earlier_targets(built: Built) -> Block:
     """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
-    plant, period, pairs = built.plant, built.period, Pairs(built.problem, built.problem.dead_time)
-    late = built.problem.dead_time
+    plant, period, pairs = built.plant, built.period, built.pairs
+    late = built.pairs.dead_time
     whole = late.measurement + max(late.inputs.values(), default=0.0)
     queue = Queue(2 * whole / period + built.problem.sensing.delay(plant, period))
     target, time = like(plant.output, "_target"), time_signal(plant)
@@ -155,7 +155,7 @@ def _earlier_targets(built: Built) -> Block:
 
 def _late(built: Built) -> bool:
     """Whether there is dead time, behind which state, reference and response are of other instants."""
-    return bool(built.problem.dead_time.queued)
+    return bool(built.pairs.dead_time.queued)
 
 
 EXAMPLES = (

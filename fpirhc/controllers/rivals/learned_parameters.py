@@ -16,7 +16,6 @@ import numpy as np
 
 from fpirhc.controllers.base import clip, like
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.path import Pairs
 from fpirhc.errors import InvalidValue, refuse
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.plant import Plant
@@ -91,7 +90,7 @@ class Learning:
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
         learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
-        pairs = Pairs(built.problem, built.problem.dead_time)
+        pairs = built.pairs
         late = (pairs.state,) if pairs.waiting else ()
         begins = built.warm_up if self.rule.reads_response else 1
         reads = (

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like, reference_block, under_names
-from fpirhc.controllers.built import Built, build
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation
@@ -233,7 +233,7 @@ class Cascade(Controller):
             self.paired.queue(problem)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        inner = compose_controller(build(self.inner_problem(built.problem), self.controller))
+        inner = compose_controller(built.inner())
         last = [Delay(like(built.plant.input, last), source) for last, source in _COMMANDS.items()]
         blocks = [reference_block(built), self._shift_block(built), under_names(embedded("inner", inner, {}), _RENAMED)]
         return blocks, [Delay(scalar("clipped_last"), "clipped"), *last]

@@ -13,7 +13,7 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, like
-from fpirhc.controllers.built import Built, build
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, dependencies_of_command, embedded
 from fpirhc.controllers.contract import ControllerWrapper, Planner, innermost, with_field
 from fpirhc.controllers.path import Pairs
@@ -94,10 +94,10 @@ class Estimating(ControllerWrapper):
         )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        modelled = self.inner_problem(built.problem)
         follows = self.at_once and hasattr(innermost(self.controller), "follows_model")
         controller = with_field(self.controller, "follows_model", True) if follows else self.controller
-        inner = compose_controller(build(modelled, controller))
+        within = built.inner(controller)
+        inner, modelled = compose_controller(within), within.problem
         require(
             "parameters" in dependencies_of_command(inner),
             f"Estimating learns parameters of the model, and {type(self.controller).__name__} uses none of them: the command "
@@ -105,7 +105,7 @@ class Estimating(ControllerWrapper):
         )
         outputs = self.estimator.reads_outputs(modelled.plant)
         age = response_age(built.plant) if self.estimator.reads_response(modelled.plant) else 0
-        pairs = Pairs(built.problem, self.dead_time or built.problem.dead_time, outputs, age)
+        pairs = replace(built.pairs, dead_time=self.dead_time or built.pairs.dead_time, with_outputs=outputs, age=age)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(built.before, name="_acted")
         blocks = [

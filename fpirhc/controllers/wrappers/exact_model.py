@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built, build
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import ControllerWrapper, PlantModel
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -36,7 +36,7 @@ class ExactModel(ControllerWrapper):
         return PlantModel(plant, really_known(problem.signals), exact=True)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        return self.controller.blocks(build(self.inner_problem(built.problem), self.controller))
+        return self.controller.blocks(built.inner())
 
 
 _EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, like
-from fpirhc.controllers.built import Built, build
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
@@ -49,12 +49,8 @@ class Predictor(Checked, ABC):
         """
 
     @abstractmethod
-    def sent(self, plant: Plant) -> Signal:
-        """Return the signal of the controller that is queued."""
-
-    @abstractmethod
-    def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        """Return the values that are on their way when the run begins."""
+    def sent(self, built: Built) -> Signal:
+        """Return the signal of the controller that is queued, with the values that are on their way when the run begins."""
 
     @abstractmethod
     def advance(self, plant: Plant, period: float) -> ca.Function:
@@ -75,11 +71,8 @@ class ByModel(Predictor):
     def check(self, plant: Plant) -> None:
         """Accept every plant."""
 
-    def sent(self, plant: Plant) -> Signal:
-        return plant.input
-
-    def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        return tuple(map(float, problem.inputs_before))
+    def sent(self, built: Built) -> Signal:
+        return replace(built.before, name=built.plant.input.name)
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         step = one_step(plant, period)
@@ -107,11 +100,8 @@ class ByDesired(Predictor):
             f"ByDesired() does not predict {', '.join(hidden + free)}, which no desired response moves; use ByModel()",
         )
 
-    def sent(self, plant: Plant) -> Signal:
-        return plant.response_signal("desired")
-
-    def sent_at_start(self, problem: Problem) -> tuple[float, ...]:
-        return (0.0,) * len(problem.plant.controlled_names)
+    def sent(self, built: Built) -> Signal:
+        return built.plant.response_signal("desired")
 
     def advance(self, plant: Plant, period: float) -> ca.Function:
         x, u, p = plant.symbols()
@@ -158,7 +148,7 @@ class Predicted(ControllerWrapper):
     by: Predictor = field(default_factory=ByModel)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        notes, cycles = self.controller.notes(problem), self._cycles(problem)
+        notes, cycles = self.controller.notes(problem), self._cycles(problem.period)
         if self.controller.learns and self.by == ByModel() and cycles:
             notes += (
                 "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
@@ -187,40 +177,42 @@ class Predicted(ControllerWrapper):
             f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
             f"{type(self.controller).__name__} reads others; use by=ByModel()",
         )
-        if self._cycles(problem) > MOST:
-            raise InvalidValue(f"Predicted: {self._cycles(problem)} cycles of dead time, more than {MOST}")
+        cycles = self._cycles(problem.period)
+        if cycles > MOST:
+            raise InvalidValue(f"Predicted: {cycles} cycles of dead time, more than {MOST}")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        plant, problem = built.plant, built.problem
-        if not self._cycles(problem):
-            return self.controller.blocks(build(problem, self.controller))
-        inner = compose_controller(build(problem, self.controller), ahead=True)
+        plant = built.plant
+        if not self._cycles(built.period):
+            return self.controller.blocks(built.inner())
+        inner = compose_controller(built.inner(), ahead=True)
         ahead = {"time": like(time_signal(plant), "time_ahead"), "state": like(plant.state, "state_ahead")}
         ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
-        sent = self.by.sent(plant)
-        before = Signal("_sent_before", sent.elements, sent.units, self.by.sent_at_start(problem))
-        predict = self._predict_block(problem, before, tuple(ahead.values()))
+        sent = self.by.sent(built)
+        before = replace(sent, name="_sent_before")
+        predict = self._predict_block(built, before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
 
-    def _cycles(self, problem: Problem) -> int:
+    def _cycles(self, period: float) -> int:
         """Cycles over which the state is predicted."""
-        return round((self.inputs + self.measurement) / problem.period)
+        return round((self.inputs + self.measurement) / period)
 
-    def _predict_block(self, problem: Problem, before: Signal, writes: tuple[Signal, ...]) -> Block:
+    def _predict_block(self, built: Built, before: Signal, writes: tuple[Signal, ...]) -> Block:
         """Block (time, what is measured, parameters, what was sent last) -> what will be when the command acts."""
-        plant, size, by, cycles = problem.plant, before.size, self.by, self._cycles(problem)
-        queue, start = Queue(cycles), by.sent_at_start(problem)
+        plant, period, size, by = built.plant, built.period, before.size, self.by
+        cycles = self._cycles(period)
+        queue = Queue(cycles)
         # One value more than is on its way: the oldest acted while the response was realised.
         past = tuple(f"{e}@{k}" for k in range(1, queue.length + 1) for e in before.elements)
-        sent = Signal("sent", past, start=start * queue.length)
+        sent = Signal("sent", past, start=tuple(before.start_vector()) * queue.length)
         residual = Signal("residual", plant.names, forcing_units(plant))
-        advance = by.advance(plant, problem.period)
-        corrected = _residual(plant, by.residual_time, problem.period) if by.residual_time else None
+        advance = by.advance(plant, period)
+        corrected = _residual(plant, by.residual_time, period) if by.residual_time else None
         responses = (plant.response_signal("realised"),) if corrected else ()
         reads = (time_signal(plant), *measured_signals(plant), *responses, plant.parameter, before)
         # The state to which a map answered with the response that is measured now is that of the cycle before.
-        answered = replace(plant.state, name="state_answered", start=tuple(map(float, problem.start_state)))
+        answered = replace(built.state, name="state_answered")
         last = (answered,) * response_age(plant) if corrected else ()
         own = (sent, residual, *last) if corrected else (sent,)
         # An output that is the state is where the state is.
@@ -236,7 +228,7 @@ class Predicted(ControllerWrapper):
                 values |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
             state = queue.driven(advance, s.state, queued, size, [s.parameters, error])
             for name, function in outputs_ahead.items():
-                time = cycles * problem.period
+                time = cycles * period
                 values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
             return {"time_ahead": s.time + self.inputs, "state_ahead": state, **values}
 
