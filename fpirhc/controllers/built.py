@@ -15,7 +15,7 @@ from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Controller, PlantModel, Response, given_response
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
 from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
-from fpirhc.controllers.seeing import check_believed, given_states, raw_signal
+from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
@@ -55,6 +55,7 @@ class Built:
     states: tuple[Signal, ...]  # the state, where it is given beside raw measurements of outputs
     planned: Problem | None  # the problem as plans have it, with their cost, margins and limits
     every: int  # control cycles from plan to plan
+    opened: bool  # whether some numbers are open
 
     @property
     def plant(self) -> Plant:
@@ -79,7 +80,7 @@ class Built:
         """Return what the wrapped controller is built from; `controller`: in its place."""
         wrapped = controller or self.controller.inner
         assert wrapped is not None
-        return build(self.controller.inner_problem(self.problem), wrapped)
+        return build(self.controller.inner_problem(self.problem), wrapped, opened=self.opened)
 
     def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""
@@ -94,14 +95,16 @@ class Built:
 _LATEST: Latest[Built] = Latest(8)
 
 
-def build(problem: Problem, controller: Controller) -> Built:
-    """Return the controller built for the problem: the one place where a pair is checked and its automatic numbers are chosen."""
-    ready = checked(problem, controller)
-    check_believed(problem, ready)
-    return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _built(problem, ready))
+def build(problem: Problem, controller: Controller, *, opened: bool = False) -> Built:
+    """Return the controller built for the problem: the one place where a pair is checked and its automatic numbers are chosen.
+
+    `opened`: whether numbers of both are open; then they are those of a pair that was checked.
+    """
+    ready = controller if opened else checked(problem, controller)
+    return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _built(problem, ready, opened=opened))
 
 
-def _built(problem: Problem, ready: Controller) -> Built:
+def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
     own, before = own_signals(problem), tuple(map(float, problem.inputs_before))
@@ -131,4 +134,5 @@ def _built(problem: Problem, ready: Controller) -> Built:
         states=given_states(problem),
         planned=planned,
         every=cycles_per_plan(planned.horizon, problem.period) if planned and planned.horizon else 1,
+        opened=opened,
     )

@@ -15,11 +15,11 @@ import numpy as np
 from fpirhc.contraction.delayed import converges, delayed, largest_gain
 from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, resolved
+from fpirhc.controllers.seeing import check_believed
 from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.errors import NotContractive, refuse
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.open import nominal
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
@@ -154,14 +154,11 @@ _CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same cont
 def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
     """Return the resolved controller, checked against the problem.
 
-    A controller with open numbers is checked with the numbers of the build, and returned as it is.
-
     Args:
         numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
     """
-    task, build = nominal(problem), nominal(controller)
-    ready = _CHECKED.of((task, build), (numbers_only, _REFUSES.get()), lambda: _checked(task, build, numbers_only))
-    return ready if build is controller else controller
+    facts = numbers_only, _REFUSES.get()
+    return _CHECKED.of((problem, controller), facts, lambda: _checked(problem, controller, numbers_only))
 
 
 def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
@@ -172,6 +169,7 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
     else:
         ready.check(problem)
     check_form(problem, ready)
+    check_believed(problem, ready)
     if ready.deforms == "target":
         return ready  # its own check judges a gain that acts on targets
     if ready.response(problem) is None:

@@ -77,16 +77,17 @@ def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
     given: object = built.controller.blocks(built)
     pair = given if isinstance(given, tuple) and len(given) == 2 else None
     kinds = (Block, Delay)
-    if pair is None or not all(
-        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
-        for part, kind in zip(pair, kinds, strict=True)
-    ):
+    if pair is None or [part for part, kind in zip(pair, kinds, strict=True) if not _holds(part, kind)]:
         raise InvalidProblem(
             f"{type(built.controller).__name__}.blocks(built) must return two lists (blocks, delays), got {described(given)}"
         )
-    names = {signal.name for signal in built.own}
-    reads = built.aim is not None and any(names & {*block.reads.names} for block in pair[0])
-    return [*([built.aim] if reads else []), *pair[0]], list(pair[1])
+    names = {name for block in pair[0] for name in block.reads.names} if built.aim is not None else set()
+    aim = [built.aim] if built.aim is not None and any(signal.name in names for signal in built.own) else []
+    return [*aim, *pair[0]], list(pair[1])
+
+
+def _holds(part: object, kind: type) -> bool:
+    return isinstance(part, list | tuple) and not [one for one in part if not isinstance(one, kind)]
 
 
 def _informed(
@@ -97,7 +98,7 @@ def _informed(
     `ahead`: whether the time is the one at which the command will act.
     """
     told = built.told
-    compares = any(ACTED in block.reads for block in blocks)
+    compares = bool(told.places) and any(ACTED in block.reads for block in blocks)
     first = told.block(remembers=compares and not ahead)
     if first is None:
         return compose("controller", reads, blocks, delays, outputs=("command",))
@@ -140,6 +141,7 @@ def _measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]
 
 def _at_once(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
     """The blocks with the state, outputs and time that are given in place of the measured ones."""
+    read = {name for block in blocks for name in block.reads.names}
     for name, (_, given) in _measured(plant).items():
-        blocks = [fed(block, name, given) for block in blocks]
+        blocks = [fed(block, name, given) for block in blocks] if name in read else blocks
     return list(blocks)

@@ -16,6 +16,7 @@ from typing import cast
 
 import numpy as np
 
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
@@ -68,15 +69,16 @@ class LiveSettings:
                 controller = changed_at(controller, path, content, copy)
         return problem, controller
 
-    def composed(self, compose: Callable[[Problem, Controller], Composite]) -> Composite:
-        """Return what `compose` makes of problem and controller with open numbers.
+    def composed(self, compose: Callable[[Built], Composite]) -> Composite:
+        """Return what `compose` makes of the controller that is built with open numbers.
 
         Raises:
             NotSupported: a number that the loop does not read, or with which Python computes while the loop is built.
         """
+        checked(self.problem, self.controller)
         opened = Opened(self.start)
         try:
-            composite = compose(*self._with(opened.symbols, copied))
+            composite = compose(build(*self._with(opened.symbols, copied), opened=True))
         except _OF_BUILD as error:
             interruption = unwrapped(error)
             if not isinstance(interruption, Exception):
@@ -92,7 +94,7 @@ class LiveSettings:
                 raise not_live(self.paths, f"block '{block.name}' turns one of them into a number; {ANEW}", " together")
         return composite
 
-    def _refusal(self, error: Exception, compose: Callable[[Problem, Controller], Composite]) -> Exception:
+    def _refusal(self, error: Exception, compose: Callable[[Built], Composite]) -> Exception:
         """The error that names the setting and the place, for an error of the build."""
         if isinstance(error, FpirhcError) and any(f"'{path}'" in str(error) for path in self.start):
             return error

@@ -39,7 +39,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.open import expressed, nominal, numbers, open_numbers, require_closed
+from fpirhc.symbolic.open import expressed, numbers, open_numbers, require_closed
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem
 
@@ -87,6 +87,7 @@ class RecedingHorizon(Controller):
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
         _room(problem, self.replanning)
+        self.planner.check_weights(problem)
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
@@ -169,8 +170,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     data_of = _stage_data(problem, count)
     preview = preview_of(problem)
     running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
-    start = nominal(problem)
-    memory = optimiser.memory(ocp).starting_at(built_first_memory(start, optimiser, ocp, data_of))
+    memory = optimiser.memory(ocp).starting_at(built_first_memory(problem, optimiser, ocp, data_of))
     solve = built(optimiser, ocp, "step")
     low, high = problem.limits.input_ends(plant)
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)), discrete("_solve_status"))

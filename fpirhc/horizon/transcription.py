@@ -35,7 +35,7 @@ from fpirhc.plant.motion import outside_of, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.open import nominal, number_of, open_in, open_numbers
+from fpirhc.symbolic.open import number_of, open_in, open_numbers
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -73,8 +73,6 @@ def _transcribed(
     signals: ca.Function | None,
     start: np.ndarray | None,
 ) -> OptimalControl:
-    nominal(cost).check(plant)
-    limits.check(plant)
     check_names(plant, horizon, limits)
     whole = limits
     if horizon.margins:

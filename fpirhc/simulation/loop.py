@@ -45,11 +45,11 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
     `setpoints` only where the reference is given some.
     """
-    return _closed(problem, controller) if live is None else live.composed(_closed)
+    return _closed(build(problem, controller)) if live is None else live.composed(_closed)
 
 
-def _closed(problem: Problem, controller: Controller) -> Composite:
-    built = build(problem, controller)
+def _closed(built: Built) -> Composite:
+    problem = built.problem
     mover, inner = moving(problem), compose_with_sensing(built)
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
     samples = known_samples(problem) if lost or ranges else 0
@@ -60,7 +60,7 @@ def _closed(problem: Problem, controller: Controller) -> Composite:
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(mover, disturbed)
     around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
-    constants = [Delay(signal, signal.name) for signal in open_settings(around).signals]
+    constants = [Delay(signal, signal.name) for signal in open_settings(around).signals] if built.opened else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
     return compose("loop", reads, around, [*_plant_delays(mover, built.model), *constants], outputs=mover.sent)
 

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, fed, under_names
-from fpirhc.controllers.built import build
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, was_skipped
@@ -205,13 +205,13 @@ def composed_step(
     """
     gates: list[Gate] = []
 
-    def compose(problem: Problem, controller: Controller) -> Composite:
-        inner = compose_with_sensing(build(problem, controller))
+    def compose(built: Built) -> Composite:
+        inner = compose_with_sensing(built)
         samples = known_samples(live.problem)
         gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), max_age=max_age, samples=samples))
         return machine_step(live.problem, ready, gates[-1], monitor)
 
-    composite = live.composed(compose) if live.paths else compose(live.problem, ready)
+    composite = live.composed(compose) if live.paths else compose(build(live.problem, ready))
     return composite, gates[-1].named(composite.memory)
 
 

@@ -157,7 +157,7 @@ class Layout:
         for s in self.signals:
             if s.name in slices:
                 raise InvalidName(f"signal '{s.name}' appears twice in one layout")
-            size = s.size
+            size = len(s.elements) or 1
             if s.start and len(s.start) != size:
                 raise InvalidShape(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
             if not all(map(math.isfinite, s.start)):
