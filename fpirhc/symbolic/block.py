@@ -65,19 +65,17 @@ class Block:
     @cached_property
     def _built(self) -> tuple[ca.Function, Layout]:
         matrix = kind(self.opaque)
-        arguments = [*self.reads.signals, *self.memory.signals]
-        symbols = {s.name: matrix.sym(s.name, s.size) for s in arguments}
+        symbols = {n: matrix.sym(n, size) for n, size in (self.reads.sizes | self.memory.sizes).items()}
         values = self.step(Signals(symbols))
         results = []
-        for key, signal in self._results.items():
+        sizes = (*self.writes.sizes.values(), *self.memory.sizes.values())
+        for key, size in zip(self._results, sizes, strict=True):
             if key not in values:
                 raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, values)}")
             written = values[key]
             value = written if isinstance(written, matrix) else matrix(written)
-            if value.numel() != signal.size:
-                raise InvalidShape(
-                    f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {signal.size}"
-                )
+            if value.numel() != size:
+                raise InvalidShape(f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {size}")
             is_column = value.is_dense() and value.is_column()  # not built anew, which costs more than most operations
             results.append(value if is_column else ca.densify(value.reshape((value.numel(), 1))))
         keys = list(self._results)
@@ -181,15 +179,16 @@ def compose(
 
 def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delays: Sequence[Delay]) -> None:
     """Raise where a signal is read that is not there or has another size, or is written twice."""
-    sizes = {s.name: s.size for s in (*memory.signals, *reads.signals)}
+    sizes = memory.sizes | reads.sizes
     for block in blocks:
-        for s in block.inputs.signals:
-            if sizes.get(s.name) != s.size:
-                _require_size(f"block '{block.name}'", s, s.name, sizes)
-        for s in block.writes.signals:
-            if s.name in sizes:
-                raise InvalidName(f"block '{block.name}' writes '{s.name}', which is already written")
-            sizes[s.name] = s.size
+        inputs = block.inputs
+        for name, size in inputs.sizes.items():
+            if sizes.get(name) != size:
+                _require_size(f"block '{block.name}'", inputs[name], name, sizes)
+        for name, size in block.writes.sizes.items():
+            if name in sizes:
+                raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
+            sizes[name] = size
     for delay in delays:
         _require_size(f"delay '{delay.now.name}'", delay.now, delay.source, sizes)
 
@@ -204,8 +203,9 @@ def scalar_code(function: ca.Function) -> ca.Function:
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
     # Of graphs they are MX, which the stub does not mix with SX.
-    arguments = cast(list[ca.SX], [known[name] for name in (*block.inputs.names, *block.memory.names)])
-    values = block.function.call(arguments)
+    function, reads = block._built
+    arguments = cast(list[ca.SX], [known[name] for name in (*reads.names, *block.memory.names)])
+    values = function.call(arguments)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
         known[name] = results[name]
