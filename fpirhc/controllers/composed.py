@@ -81,9 +81,14 @@ def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
         raise InvalidProblem(
             f"{type(built.controller).__name__}.blocks(built) must return two lists (blocks, delays), got {described(given)}"
         )
-    names = {name for block in pair[0] for name in block.reads.names} if built.aim is not None else set()
+    return with_aim(built, pair[0]), list(pair[1])
+
+
+def with_aim(built: Built, blocks: Sequence[Block]) -> list[Block]:
+    """Return the blocks of a controller after the reference's own block, where some of them read its signals."""
+    names = {name for block in blocks for name in block.reads.names} if built.aim is not None else set()
     aim = [built.aim] if built.aim is not None and any(signal.name in names for signal in built.own) else []
-    return [*aim, *pair[0]], list(pair[1])
+    return [*aim, *blocks]
 
 
 def _holds(part: object, kind: type) -> bool:

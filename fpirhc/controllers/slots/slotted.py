@@ -17,9 +17,9 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, Response, judge_block, like, reference_block, under_names, warm_up_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.check import checked
+from fpirhc.controllers.composed import with_aim
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.path import measured_output
-from fpirhc.controllers.reference_states import with_reference
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
@@ -130,7 +130,7 @@ class Slotted(Controller):
         return blocks, [*delays, Delay(built.before, "command")]
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
-        one = build(slot_problem(built.problem, name), self.slots[name])
+        one = build(slot_problem(built.problem, name), self.slots[name], opened=built.opened)
         place: int | None = number
         if not _reads_equations(built.problem):
             same = built.plant.response_orders.get(name) == one.plant.response_orders[name]
@@ -251,7 +251,7 @@ _OF_TURN = "_law", "_offset", "_request", "_goes_on"  # what the handover adds
 def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list[Delay]]:
     """The slot's own blocks, under names of its own, and what they remember. Its law begins a run with every turn."""
     given, delays = one.slot.blocks(one.built)
-    blocks = [b for b in with_reference(one.built.problem, given) if not {"status", "_warm_up_now"} & {*b.writes.names}]
+    blocks = [b for b in with_aim(one.built, given) if not {"status", "_warm_up_now"} & {*b.writes.names}]
     if not any("_deformation" in b.writes.names for b in blocks):
         raise NotSupported(f"slot '{one.name}': {one.slot} has no law whose response a map deforms; use ComputedTorque")
     delays = [d for d in delays if d.now.name not in _OF_ALL]
