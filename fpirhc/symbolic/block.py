@@ -203,9 +203,8 @@ def scalar_code(function: ca.Function) -> ca.Function:
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
     # Of graphs they are MX, which the stub does not mix with SX.
-    function, reads = block.function, block.inputs
-    arguments = cast(list[ca.SX], [known[name] for name in (*reads.names, *block.memory.names)])
-    values = function.call(arguments)
+    arguments = cast(list[ca.SX], [known[name] for name in (*block.inputs.names, *block.memory.names)])
+    values = block.function.call(arguments)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
         known[name] = results[name]
