@@ -72,7 +72,7 @@ def runs(name: str, stated: Any, plants: np.ndarray) -> tuple[np.ndarray, np.nda
     plans = fp.simulate(problem, stated.controller, seed=0)
     law, gains = stated.controller.planner.tracking, np.zeros((len(plant.controlled_names), plant.state.size))
     for row, coordinate in zip(gains, plant.controlled_names, strict=True):
-        for j, gain in enumerate(law.feedback(plant.chains[coordinate]).gains):
+        for j, gain in enumerate(law.gains(plant.chains[coordinate])):
             row[plant.state.elements.index(coordinate + "'" * j)] = gain
     count, period, move = len(plants), problem.period, plant.equations
     respond, invert, rate = (f.map(count) for f in (move.controlled_response, move.inverse, move.rate))

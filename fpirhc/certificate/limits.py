@@ -113,10 +113,10 @@ def _gains(problem: Problem, ready: Controller) -> dict[str, tuple[float, ...]]:
     """Constant gains of the law, by controlled coordinate."""
     law = tracking_law(ready) if ready.planner is None else ready.planner.tracking
     orders = dict(zip(problem.plant.names, problem.plant.orders, strict=True))
-    feedback = {n: None if law is None else law.feedback(orders[n]) for n in problem.plant.controlled_names}
-    gains = {name: one.gains for name, one in feedback.items() if one is not None and not one.integral}
+    every = {n: None if law is None else law.gains(orders[n]) for n in problem.plant.controlled_names}
+    gains = {name: one for name, one in every.items() if one is not None and len(one) == orders[name]}
     require(
-        len(gains) == len(feedback),
+        len(gains) == len(every),
         f"no certificate with {type(law).__name__}: its gains must be constant and it must not integrate, such as "
         "Exponential(rate=..., integral=False); the deformation removes what is constant",
     )

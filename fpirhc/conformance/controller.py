@@ -159,10 +159,10 @@ def law_is_what_it_does(trial: Trial, generator: np.random.Generator) -> None:  
     on = replay.cycle(k, memory)["reference"]
     at = replay.cycle(k, memory, **{plant.output.name: on})["desired"]
     for row, (name, order) in enumerate(plant.response_orders.items()):
-        feedback = law.feedback(order) if order else None
-        if feedback is None:
+        gains = law.gains(order) if order else None
+        if gains is None:
             continue
-        for s, gain in enumerate(feedback.gains[-order:]):
+        for s, gain in enumerate(gains[-order:]):
             place = plant.output.elements.index(name + "'" * s)
             near = on - _NEAR * (np.arange(on.size) == place)
             moved = replay.cycle(k, memory, **{plant.output.name: near})["desired"]

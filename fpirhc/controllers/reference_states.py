@@ -22,7 +22,7 @@ from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem, nominal_start
-from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.base import Tracking, one_rate
 
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}  # a whole turn by unit
 _NEAR = 0.05  # share of a turn that a jump of whole turns may be off, because the reference moves within a cycle
@@ -210,8 +210,8 @@ def request_of_commands(problem: Problem, parameters: np.ndarray) -> RequestChan
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:
     """Step per cycle with which the plain form comes back from the largest expected error; 0 without a law of one rate."""
-    laws = [law.feedback(order) for order in problem.plant.response_orders.values()] if law else []
-    rates = [(len(one.gains), one.rate) for one in laws if one is not None and one.rate is not None and one.gains]
+    laws = [law.gains(order) for order in problem.plant.response_orders.values()] if law else []
+    rates = [(len(gains), rate) for gains in laws if gains and (rate := one_rate(gains)) is not None]
     if not rates:
         return 0.0
     from fpirhc.contraction.delayed import step_for_basin  # of laws with one rate alone

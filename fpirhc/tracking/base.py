@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 
 import casadi as ca
+import numpy as np
 
 from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import followed_units
@@ -19,23 +20,6 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 
 
-@dataclass(frozen=True)
-class Feedback:
-    """A law that feeds errors back with constant gains, q^(n),Des = q^(n),N + sum of gains times errors.
-
-    Args:
-        gains: of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first.
-        integral: whether the integral of the error is fed back.
-        bumpless: whether the integral starts so that the first desired response is the nominal one.
-        rate: where the law is (d/dt + rate)^m z = 0 with z = e_int or e, and m the number of gains, 1/s; else None.
-    """
-
-    gains: tuple[float, ...]
-    integral: bool
-    bumpless: bool
-    rate: float | None = None
-
-
 class Tracking(Checked, ABC):
     """Contract: q^Des from the nominal motion and the measured state.
 
@@ -43,13 +27,11 @@ class Tracking(Checked, ABC):
     (an integral must not grow into a limit of the command).
     """
 
-    @property
-    def speed(self) -> float | None:
-        """The rate, 1/s, to which control period and dead time are compared; None where the law has none."""
-        return None
+    def gains(self, order: int) -> tuple[float, ...] | None:  # noqa: ARG002
+        """Constant gains for a coordinate of relative order n, q^(n),Des = q^(n),N + sum of gains times errors; None: not constant.
 
-    def feedback(self, order: int) -> Feedback | None:  # noqa: ARG002
-        """The law for a coordinate of that relative order; None where its gains are not constant."""
+        They are those of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first.
+        """
         return None
 
     def within(self, largest: Sequence[float]) -> Self:  # noqa: ARG002
@@ -80,6 +62,13 @@ class Tracking(Checked, ABC):
     @abstractmethod
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """Signals that the law carries to the next cycle."""
+
+
+def one_rate(gains: Sequence[float]) -> float | None:
+    """Return Lambda where the law of these gains is (d/dt + Lambda)^m z = 0; None where its modes differ."""
+    rate = gains[-1] / len(gains)
+    modes = [math.comb(len(gains), s) * rate ** (len(gains) - s) for s in range(len(gains))]
+    return rate if np.allclose(gains, modes, rtol=1e-9) else None
 
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor

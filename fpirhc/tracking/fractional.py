@@ -83,13 +83,9 @@ class Fractional(IntegralLaw):
         """Weights w_1 ... w_L of the past, shape (cycles,)."""
         return np.cumprod(1 - (self.order + 1) / np.arange(1, cycles + 1))
 
-    def gains(self, order: int) -> tuple[float, ...]:
+    def _gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, e', ...) in S below its highest derivative, for relative order n."""
         return tuple(math.comb(order, s) * power(self.rate, order - s) for s in range(order))
-
-    @property
-    def speed(self) -> float:
-        return self.rate
 
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
@@ -132,7 +128,7 @@ class Fractional(IntegralLaw):
     def _useful(self, plant: Plant) -> list[Useful]:
         if not self.largest:
             return []
-        gains = [(*self.gains(order), 1.0, 0.0)[:2] for order in plant.response_orders.values()]
+        gains = [(*self._gains(order), 1.0, 0.0)[:2] for order in plant.response_orders.values()]
         return [Useful(self.rate * i, self.rate * e, most) for (i, e), most in zip(gains, self.largest, strict=True)]
 
     def _useful_decay(self, measured: Expression, last: Expression) -> Expression:
@@ -151,7 +147,7 @@ class Fractional(IntegralLaw):
         """S, and its derivative without e^(n)."""
         decaying, drift = [], []
         for k, chain in enumerate(errors):
-            gains = self.gains(len(chain))
+            gains = self._gains(len(chain))
             whole = [integral[k], *chain]
             decaying.append(whole[-1] + sum(g * e for g, e in zip(gains, whole, strict=False)))
             drift.append(sum(g * e for g, e in zip(gains, chain, strict=True)))

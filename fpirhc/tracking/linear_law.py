@@ -22,7 +22,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, power, total
 from fpirhc.symbolic.layout import Expression
-from fpirhc.tracking.base import Feedback, IntegralLaw, Useful, error_chains, law_signals, own_errors
+from fpirhc.tracking.base import IntegralLaw, Useful, error_chains, law_signals, own_errors
 
 _REAL = 1e-9  # share of an imaginary part that is rounding
 
@@ -121,13 +121,6 @@ class Exponential(LinearLaw):
         degree = order + 1 if self.integral else order
         return tuple([math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree)])
 
-    @property
-    def speed(self) -> float:
-        return self.rate
-
-    def feedback(self, order: int) -> Feedback:
-        return Feedback(self.gains(order), self.integral, self.bumpless, self.rate)
-
 
 @dataclass(frozen=True)
 class ShiftPolynomial(LinearLaw):
@@ -201,16 +194,6 @@ class ShiftPolynomial(LinearLaw):
                 f"one cycle; write step={period:g}, with the poles of that cycle"
             )
         super().check_cycle(plant, period)
-
-    @property
-    def speed(self) -> float | None:
-        """(1 - z) / T of the fastest mode."""
-        every = [self.poles] if not isinstance(self.poles, Sequence) else list(self.poles)
-        return max(abs(1 - z) for z in every) / self.step
-
-    def feedback(self, order: int) -> Feedback:
-        rate = (1 - self.poles) / self.step if not isinstance(self.poles, Sequence) else None
-        return Feedback(self.gains(order), self.integral, self.bumpless, rate)
 
 
 EXAMPLES = (

@@ -67,10 +67,6 @@ class Altered(fp.Exponential):
     rate: float = 6.0
     change: str = ""
 
-    def feedback(self, order):
-        law_facts = super().feedback(order)
-        return replace(law_facts, rate=2 * self.rate) if self.change == "tells another rate" else law_facts
-
     def law(self, plant, period):
         block = super().law(plant, period)
         reads = Layout((*block.reads.signals, scalar("cycle_time"))) if self.change == "reads" else block.reads
@@ -87,6 +83,8 @@ class Altered(fp.Exponential):
                 signals_value["_target_error"] = -signals_value["_target_error"]
             if self.change == "pushes away":
                 signals_value["desired"] = 2 * s.nominal - signals_value["desired"]
+            if self.change == "tells other gains":
+                signals_value["desired"] = 2 * signals_value["desired"] - s.nominal
             if self.change == "extra":
                 signals_value["more"] = s.warm_up
             return signals_value
@@ -133,7 +131,7 @@ class Thawed(Tracking):
         (Altered(change="winds up"), "clipping freezes"),
         (Altered(change="pushes away"), "error decays"),
         (Altered(rate=0.2), "error decays"),
-        (Altered(change="tells another rate"), "feedback is what it does"),
+        (Altered(change="tells other gains"), "gains are what it does"),
     ],
 )
 def test_wrong_tracking_laws_are_caught(wrong, law):

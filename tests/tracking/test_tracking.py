@@ -40,12 +40,6 @@ def test_all_error_modes_are_at_minus_rate(order, rate, integral):
     assert gains == pytest.approx(expected, rel=1e-12)
 
 
-def test_one_pole_in_z_has_the_rate_of_its_decay():
-    """(1 - z) / T, which a wrapper reads; of several poles none."""
-    assert fp.ShiftPolynomial(poles=0.96, step=0.02).feedback(1).rate == pytest.approx(2.0)
-    assert fp.ShiftPolynomial(poles=(0.96, 0.9), step=0.02).feedback(1).rate is None
-
-
 def test_bumpless_start_asks_for_the_nominal_response():
     """With a first error of 1 m the first desired acceleration is the nominal one, zero; without, it is 3 rate^2."""
     bumpless = _run(2, fp.Exponential(6.0), start={"y": -1.0}, duration=0.01)
