@@ -7,14 +7,14 @@ of states keeps these limits too, and they are verified and named like states.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import Mistakes
-from fpirhc.horizon.cost import View
+from fpirhc.horizon.cost import Cost, View, read_by, read_by_cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import GAP
 from fpirhc.plant.plant import Plant
@@ -39,31 +39,27 @@ def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[Const
     return [_entry_of(name, one, view) for name, one in limits.written(plant, step).items()]
 
 
-def check_declared(limits: Limits, view: View) -> None:
-    """Raise where a path uses what a view does not have, whose entries are NaN there.
+def check_feedforward(limits: Limits, plant: Plant, cost: Cost) -> None:
+    """Raise where a path reads the feedforward, which plans have only where the cost reads it.
 
     Raises:
-        InvalidProblem: all such paths, with what declares the entry.
+        InvalidProblem: all such paths.
     """
-    mistakes = Mistakes("limits")
-    for part, lacking, with_own, remedy in _undeclared(view):
-        if not ca.SX(lacking.vector).is_constant():
-            continue
-        stand_in = Named(tuple(lacking), ca.SX.sym(part, len(tuple(lacking))), "input")
-        for name, one in limits.paths.items():
-            if ca.depends_on(one.named_value(name, with_own(stand_in)), stand_in.vector):
-                mistakes.add(f"paths['{name}'] uses {part}, which plans do not have here; {remedy}")
+    mistakes, known = Mistakes("limits"), read_by_cost(plant, cost)
+    for name, one in limits.paths.items():
+        if "feedforward" in _read_by(name, one, plant) - known:
+            way = "leave it out, or take a cost that reads it, such as Quadratic(deviation=...)"
+            mistakes.add(f"paths['{name}'] uses feedforward, which plans do not have here; {way}")
     mistakes.raise_if_any()
 
 
-def _undeclared(view: View) -> list[tuple[str, Named, Callable[[Named], View], str]]:
-    """The entries of a view that limits may lack, by name, with the view that has them, and what declares them."""
-    by_rate = "limit a change by Limits(rates=...), or write a Limit of your own with uses_rate = True"
-    by_cost = "leave it out, or take a cost that has it: Quadratic(deviation=...) or CustomCost(feedforward=True)"
-    return [
-        ("input_before", view.input_before, lambda own: replace(view, input_before=own), by_rate),
-        ("feedforward", view.feedforward, lambda own: replace(view, feedforward=own), by_cost),
-    ]
+def read_before(limits: Limits, plant: Plant, step: float) -> bool:
+    """Return whether a limit reads the input of the stage before."""
+    return any("input_before" in _read_by(name, one, plant) for name, one in limits.written(plant, step).items())
+
+
+def _read_by(name: str, one: Limit, plant: Plant) -> frozenset[str]:
+    return read_by(plant, lambda view: [one.named_value(name, view)])
 
 
 def check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
@@ -104,7 +100,11 @@ def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> 
     """
     nodes_alone, measured_view = limits.soft.keys() | limits.prices.keys(), replace(view, state=seen)
     states = [_entry_of(name, one, measured_view) for name, one in limits.boxes(plant).items()]
-    paths = [_entry_of(name, one, view) for name, one in limits.paths.items() if not one.uses_rate]
+    paths = [
+        _entry_of(name, one, view)
+        for name, one in limits.paths.items()
+        if "input_before" not in _read_by(name, one, plant)
+    ]
     return [replace(w, name=f"{w.name}, step {step}") for w in (*states, *paths) if w.name not in nodes_alone]
 
 

@@ -6,21 +6,24 @@ terminal cost.
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes
+from fpirhc.errors import FpirhcError, InvalidProblem, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.fields.user_code import called
+from fpirhc.plant.motion import outside_of
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.expression import total
-from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.evaluate import Latest
+from fpirhc.symbolic.expression import Value, total
+from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.symbolic.open import stays
 
 
@@ -32,13 +35,44 @@ class View:
     reference: Named  # nominal state; of a plant with outputs, the nominal outputs and their derivatives
     input: Named  # input of the stage
     # input of the stage before; where the stage has another length than `step`, an input from which the change is as large as in
-    # that time, so that rates are the same; NaN unless the cost uses it
+    # that time, so that rates are the same
     input_before: Named
-    feedforward: Named  # the model's input along the reference; NaN unless the cost uses it
+    feedforward: Named  # the model's input along the reference
     parameters: Named  # of the model
     time: Expression  # in the problem's unit of time
     output: Named  # the model's outputs and their derivatives, view.output.bis; the state of a plant without outputs
     outside: Named  # signals from outside at this stage, as the controllers know them, view.outside.price
+
+
+def view_of_symbols(plant: Plant) -> View:
+    """Return a view whose entries are symbols."""
+    state, output, inputs, p = plant.state, plant.output, plant.input, ca.SX.sym("p", plant.parameter.size)
+
+    def named(signal: Signal, symbol: str) -> Named:
+        return Named(signal.elements, ca.SX.sym(symbol, signal.size), signal.name)
+
+    x, y, reference = named(state, "x"), named(output, "y"), named(output, "reference")
+    u, before, feedforward = (named(inputs, name) for name in ("u", "before", "feedforward"))
+    parameters, t = Named(plant.parameter.elements, p, "parameter"), ca.SX.sym("t")
+    return View(x, reference, u, before, feedforward, parameters, t, y, outside_of(plant, p))
+
+
+def read_by(plant: Plant, values: Callable[[View], Iterable[Value]]) -> frozenset[str]:
+    """Return which of `input_before` and `feedforward` expressions of a view read; what is wrong with them is said elsewhere."""
+    view = view_of_symbols(plant)
+    with contextlib.suppress(FpirhcError, AttributeError, NotImplementedError, TypeError):
+        column = ca.vertcat(*(ca.vec(ca.SX(value)) for value in values(view)))
+        entries = {"input_before": view.input_before, "feedforward": view.feedforward}
+        return frozenset(name for name, entry in entries.items() if ca.depends_on(column, entry.vector))
+    return frozenset()
+
+
+def read_by_cost(plant: Plant, cost: Cost) -> frozenset[str]:
+    """Return which of `input_before` and `feedforward` the terms of a cost read."""
+    return _READ.of((plant.equations, cost), (), lambda: read_by(plant, lambda view: cost.stage(view).values()))
+
+
+_READ: Latest[frozenset[str]] = Latest(16)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,16 +104,6 @@ class Cost(Checked, ABC):
     def tracked(self) -> Mapping[str, float] | None:
         """Weights of the squared errors of states along the horizon or at its end, by name; None where unknown."""
         return None
-
-    @property
-    @abstractmethod
-    def uses_rate(self) -> bool:
-        """Whether a term needs the input of the stage before, which then becomes part of the stage's state."""
-
-    @property
-    @abstractmethod
-    def uses_feedforward(self) -> bool:
-        """Whether a term needs the model's input along the reference."""
 
     @abstractmethod
     def check(self, plant: Plant) -> None:
@@ -137,14 +161,6 @@ class Quadratic(Cost):
         at_end = self.terminal if isinstance(self.terminal, Mapping) else {}
         own = {n: w for n, w in self._errors.items() if not stays(w, 0)}
         return {n: w for n, w in {**at_end, **own}.items() if not stays(w, 0)}
-
-    @property
-    def uses_rate(self) -> bool:
-        return bool(self.rate)
-
-    @property
-    def uses_feedforward(self) -> bool:
-        return bool(self.deviation)
 
     def check(self, plant: Plant) -> None:
         """Raise if a name is unknown or a weight is negative or not finite.
@@ -275,22 +291,10 @@ class CustomCost(Cost):
     Args:
         terms: function of a View that returns {term: cost per unit of time of the problem}, 1/min where that is the minute.
         terminal: function of a View that returns the terminal cost; None: zero.
-        rate: whether `terms` uses view.input_before.
-        feedforward: whether `terms` uses view.feedforward.
     """
 
     terms: Callable[[View], Mapping[str, Expression]]
     terminal: Callable[[View], Expression] | None = None
-    rate: bool = False
-    feedforward: bool = False
-
-    @property
-    def uses_rate(self) -> bool:
-        return self.rate
-
-    @property
-    def uses_feedforward(self) -> bool:
-        return self.feedforward
 
     def check(self, plant: Plant) -> None:
         """Accept every plant: mistakes show when the terms are built."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.cost import Cost
+from fpirhc.horizon.cost import Cost, read_by_cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.motion import time_signal
@@ -77,7 +77,7 @@ def stage_data(
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.chains))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
-    needed = feedforward(plant, state, response, p) if cost.uses_feedforward else zero
+    needed = feedforward(plant, state, response, p) if "feedforward" in read_by_cost(plant, cost) else zero
     # These rows come out of the same call where they follow these rows: joining tables would copy both.
     plain = not (horizon.blocks or horizon.terminal or horizon.measured) and not hastened(horizon)
     joined = bool(settings) and plain

@@ -12,7 +12,7 @@ from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
-    check_declared,
+    check_feedforward,
     check_names,
     ends,
     hard,
@@ -20,11 +20,12 @@ from fpirhc.horizon.constraint_states import (
     inside,
     limited,
     measured,
+    read_before,
     soft_names,
     softened,
     state_prices,
 )
-from fpirhc.horizon.cost import Cost, Linearisation, View
+from fpirhc.horizon.cost import Cost, Linearisation, View, read_by_cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along
@@ -97,7 +98,7 @@ def _transcribed(
     if settings:
         nodes = (*nodes[:2], with_rows(nodes[2], [values[path] for path in settings]))
     _check_finite_limits(dynamics, binding, nodes)
-    _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes, cost)
+    _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes)
     functions: dict[object, ca.Function] = {}
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
     lower, upper = hard_state_bounds(limits, plant, horizon.measured)
@@ -162,16 +163,13 @@ _STAGES: Latest[tuple[_Stage, tuple[ca.Function, ...]]] = Latest(8)  # whatever 
 
 def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
     layout = data_layout(plant, horizon)
-    keeps_input = (
-        cost.uses_rate
-        or bool(horizon.blocks)
-        or any(one.uses_rate for one in limits.written(plant, horizon.step).values())
-    )
+    read = read_by_cost(plant, cost)
+    keeps_input = "input_before" in read or bool(horizon.blocks) or read_before(limits, plant, horizon.step)
     x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
     data = layout.split(theta)
     applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
-    view = limited_view = _view(plant, ca.vertcat(x, before), applied, data, cost, keeps_input)
+    view = limited_view = _view(plant, ca.vertcat(x, before), applied, data, read, keeps_input)
     length = data["length"] if horizon.lengths else 1.0
     if hastened(horizon) and keeps_input:
         # A rate is limited as such; its square costs for as long as the change takes, which leaves the root of the haste.
@@ -183,7 +181,7 @@ def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cos
             x_next = stretched(x, applied, view.parameters.vector, length)
         else:
             x_next = advance(x, applied, view.parameters.vector)
-        check_declared(limits, limited_view)
+        check_feedforward(limits, plant, cost)
         written = _written(plant, horizon, limits, limited_view, x_next, data)
         soft = softened(written, limits, plant, _seen(plant, horizon, x, data))
         terms = _joined(_scalar_terms(cost.stage(view)), soft, horizon)
@@ -321,12 +319,11 @@ def _seen(plant: Plant, horizon: Horizon, x: Expression, data: Mapping[str, Expr
 
 
 def _view(
-    plant: Plant, s: Expression, u: Expression, data: Mapping[str, Expression], cost: Cost, keeps_input: bool
+    plant: Plant, s: Expression, u: Expression, data: Mapping[str, Expression], read: frozenset[str], keeps_input: bool
 ) -> View:
     nx, inputs = plant.state.size, plant.input.elements
-    # What the cost does not declare is NaN, so that an undeclared use shows at once.
     before = s[nx:] if keeps_input else ca.SX.nan(len(inputs))
-    feedforward = data["feedforward"] if cost.uses_feedforward else ca.SX.nan(len(inputs))
+    feedforward = data["feedforward"] if "feedforward" in read else ca.SX.nan(len(inputs))
     return View(
         state=Named(plant.state.elements, s[:nx], "state"),
         reference=Named(plant.output.elements, data["reference"], plant.output.name),
@@ -444,7 +441,6 @@ def _check_finite(
     stage_cost: ca.Function,
     terminal_cost: ca.Function,
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
-    cost: Cost,
 ) -> None:
     states, inputs, data = nodes
     values = stage_cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
@@ -453,10 +449,9 @@ def _check_finite(
     mistakes = Mistakes("cost")
     for name, value, where in [*terms, ("terminal", final, "at the end of the horizon")]:
         if not np.isfinite(value):
-            hint = "" if cost.uses_rate else "; say CustomCost(rate=True) if it uses input_before"
-            hint += "" if cost.uses_feedforward else "; say CustomCost(feedforward=True) if it uses feedforward"
+            hint = ""
             if name == "terminal" and np.isnan(value):
-                hint += "; the end of the horizon has no input, so leave view.input out of CustomCost(terminal=...)"
+                hint = "; the end has no input, and input_before and feedforward only where a term of the stages reads them"
             if not np.isfinite(states).all():
                 hint = ": the states that would keep the outputs there grow without bound"
             mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")

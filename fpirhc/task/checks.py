@@ -11,20 +11,17 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import casadi as ca
-
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
-from fpirhc.horizon.cost import Cost, View
+from fpirhc.horizon.cost import Cost, view_of_symbols
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import over
-from fpirhc.plant.motion import followed_units, outside_of
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.open import nominal
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
@@ -127,7 +124,7 @@ _STAGES: Latest[Mistakes] = Latest(8)
 
 def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> Mistakes:
     mistakes = Mistakes("stage")
-    view = _view_of_symbols(plant)
+    view = view_of_symbols(plant)
     parts = (view.state, view.output, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
     symbols = (*(part.vector for part in parts), view.time)
     if cost is not None:
@@ -139,27 +136,6 @@ def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> Mistakes:
         with mistakes.caught():
             path.named_value(name, view, symbols)
     return mistakes
-
-
-def _view_of_symbols(plant: Plant) -> View:
-    state, command, parameter = plant.state, plant.input, plant.parameter
-    x, p = Named(state.elements, ca.SX.sym("x", state.size), "state"), ca.SX.sym("p", parameter.size)
-    elements, what = plant.output.elements, plant.output.name
-
-    def inputs(name: str) -> Named:
-        return Named(command.elements, ca.SX.sym(name, command.size), "input")
-
-    return View(
-        x,
-        Named(elements, ca.SX.sym("reference", len(elements)), what),
-        inputs("u"),
-        inputs("before"),
-        inputs("feedforward"),
-        Named(parameter.elements, p, "parameter"),
-        ca.SX.sym("t"),
-        Named(elements, ca.SX.sym("y", len(elements)), what),
-        outside_of(plant, p),
-    )
 
 
 def check_steps(plant: Plant, limits: Limits, set_points: Mapping[str, Steps]) -> None:

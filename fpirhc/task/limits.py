@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -41,8 +41,6 @@ class Limit(Checked, ABC):
 
     Concrete limits are frozen dataclasses; they stand in `Limits(paths={name: ...})`.
     """
-
-    uses_rate: ClassVar[bool] = False  # whether it reads `view.input_before`, the input of the stage before
 
     if TYPE_CHECKING:
 
@@ -113,8 +111,6 @@ class _Box(Limit):
 @dataclass(frozen=True, eq=False)
 class _Rate(Limit):
     """The change of an input per unit of time, from stage to stage."""
-
-    uses_rate: ClassVar[bool] = True
 
     input: str
     step: float

@@ -107,7 +107,7 @@ problem = replace(
     input_before={"r": 1.0, **dict.fromkeys(SIGNS, FREE)},
     limits=replace(economic.problem.limits, inputs={"r": (0.0, 1.0), **dict.fromkeys(SIGNS, (20.0, FREE))}),
     signals={**economic.problem.signals, "ramp_demand": fp.Known(ramp_demand)},
-    cost=fp.CustomCost(changes, terminal=lambda v: v.state.spent, rate=True),
+    cost=fp.CustomCost(changes, terminal=lambda v: v.state.spent),
     judged=("density",),
 )
 controllers, headline = economic.controllers, economic.headline

@@ -94,9 +94,7 @@ problem = replace(
     signals={name: announced(signal) for name, signal in metering.problem.signals.items()},
     horizon=fp.Horizon(stages=7, step=6 * T, blocks=(1, 1, 5)),
     cost=fp.CustomCost(
-        lambda v: {"change": 0.4 / (6 * T) * (v.input.r - v.input_before.r) ** 2},
-        terminal=lambda v: v.state.spent,
-        rate=True,
+        lambda v: {"change": 0.4 / (6 * T) * (v.input.r - v.input_before.r) ** 2}, terminal=lambda v: v.state.spent
     ),
     measure_from=0.0,
 )

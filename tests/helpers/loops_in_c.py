@@ -65,7 +65,7 @@ def _terminal(v):
 @cache
 def coupled(limits: fp.Limits | None = None, stages: int = 4) -> tuple[Any, np.ndarray]:
     """The horizon of these two with a cost whose curvature changes with states and inputs, and couples them."""
-    cost = fp.CustomCost(terms=_terms, terminal=_terminal, feedforward=True)
+    cost = fp.CustomCost(terms=_terms, terminal=_terminal)
     horizon, plant = fp.Horizon(stages=stages, step=0.15), coupled_plant()
     return horizon_of(plant, REST, horizon, cost, limits, time=0.3)
 

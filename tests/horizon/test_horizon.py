@@ -22,7 +22,6 @@ COSTS = {
             "torque": 0.1 * v.input.torque**4 + 0.01 * (v.input.torque - v.input_before.torque) ** 2,
         },
         terminal=lambda v: 5 * v.state.angle**2,
-        rate=True,
     ),
 }
 
@@ -91,7 +90,6 @@ BAD_COSTS = {
     "state": (fp.Quadratic(states={"angel": 1.0}), "'angel' is unknown. Did you mean 'angle'"),
     "zero": (fp.Quadratic(states={"angle": 0.0}), "every weight is zero"),
     "term": (fp.CustomCost(terms=lambda v: {"log": ca.log(v.state.angle)}), "term 'log' is -inf"),
-    "before": (fp.CustomCost(terms=lambda v: {"a": v.input_before.torque}), "say CustomCost\\(rate=True\\)"),
     "end": (
         fp.CustomCost(lambda v: {"a": v.input.torque**2}, terminal=lambda v: v.input.torque),
         "end .* has no input",

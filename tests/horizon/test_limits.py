@@ -131,7 +131,6 @@ def test_limits_and_the_end_are_kept_in_every_unit(optimiser):
             (),
             "'root' is nan .*stage 0",
         ),
-        (fp.Limits(paths={"jerk": fp.PathConstraint(lambda v: v.input_before.torque)}), (), "input_before.*uses_rate"),
         (
             fp.Limits(paths={"off": fp.PathConstraint(lambda v: vars(v)["feedforward"].torque)}),
             (),
