@@ -86,11 +86,6 @@ class Built:
         """Return the way of the commands to the model, as a deformation believes it."""
         return believed_path(self.problem, deformation)
 
-    def of_plant(self, plant: Plant) -> Built:
-        """Return what blocks of another model of the same plant are made from."""
-        problem = replace(self.problem, plant=plant)
-        return replace(self, problem=problem, largest=largest_response(problem))
-
 
 _LATEST: Latest[Built] = Latest(8)
 

@@ -18,7 +18,6 @@ from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import time_signal
-from fpirhc.plant.regressor import Combination
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -46,8 +45,7 @@ class AdaptiveInverseDynamics(Controller):
     Args:
         tracking: the law that gives the desired response.
         rule: moves the estimate: LyapunovRule or Projection.
-        bounds: parameter or combination -> (lower, upper); these are learned, beginning at their approximate values.
-        combinations: expressions of parameters that enter linearly as a whole, by name.
+        bounds: parameter -> (lower, upper); these are learned, beginning at their approximate values.
         deformation: the fixed-point map between desired response and request.
 
     `check` raises NotSupported where the plant is not fully actuated mechanics, and InvalidValue where parameters enter
@@ -60,7 +58,6 @@ class AdaptiveInverseDynamics(Controller):
     tracking: Exponential
     rule: Rule
     bounds: Mapping[str, tuple[float, float]]
-    combinations: Mapping[str, Combination] = field(default_factory=dict)
     deformation: Deformation = field(default_factory=Identity)
 
     learns = True
@@ -70,9 +67,9 @@ class AdaptiveInverseDynamics(Controller):
         self._learning.check(problem, inverts=True)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        plant, regressor = built.plant, self._learning.regressor(built.problem)
-        closing, delays = closing_blocks(built.of_plant(regressor.believed), self.deformation)
-        believed = like(regressor.believed.parameter, "_believed")
+        plant = built.plant
+        closing, delays = closing_blocks(built, self.deformation)
+        believed = like(plant.parameter, "_believed")
         blocks = [
             *desired_blocks(built, self.tracking),
             *([_earlier_targets(built)] if self._remembers(built) else []),
@@ -84,7 +81,7 @@ class AdaptiveInverseDynamics(Controller):
 
     @property
     def _learning(self) -> Learning:
-        return Learning(self.rule, self.bounds, dict(self.combinations))
+        return Learning(self.rule, self.bounds)
 
     def _learn_block(self, built: Built) -> Block:
         plant, learning = built.plant, self._learning

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -19,7 +19,7 @@ from fpirhc.controllers.built import Built
 from fpirhc.errors import InvalidValue, refuse
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.plant import Plant
-from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.plant.regressor import Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, is_finite, pair
@@ -38,19 +38,16 @@ class Learning:
 
     Args:
         rule: moves the estimate.
-        bounds: parameter or combination -> (lower, upper); these are learned.
-        combinations: expressions of parameters that enter linearly as a whole, by name.
+        bounds: parameter -> (lower, upper); these are learned.
     """
 
     rule: Rule
     bounds: Bounds
-    combinations: dict[str, Combination] = field(default_factory=dict)
 
     def regressor(self, problem: Problem) -> Regressor:
         """Return the plant's regressor for the learned parameters; the same one for the same plant."""
-        same, names = (problem.plant, *self.combinations.values()), tuple(self.bounds)
-        build = lambda: Regressor(problem.plant, names, self.combinations)  # noqa: E731
-        return _REGRESSORS.of(same, (names, tuple(self.combinations)), build)
+        names = tuple(self.bounds)
+        return _REGRESSORS.of((problem.plant,), names, lambda: Regressor(problem.plant, names))
 
     def check(self, problem: Problem, *, inverts: bool) -> None:
         """Raise if plant, bounds, or rule do not fit each other.
@@ -77,7 +74,7 @@ class Learning:
     def block(self, built: Built, extra: Sequence[Signal], gradient: Gradient) -> Block:
         """Return Block (what every controller reads, last command, `extra`) -> (estimate, _believed).
 
-        '_believed' holds the parameters of `Regressor.believed`.
+        '_believed' holds the plant's parameters, the learned ones among them.
 
         Args:
             problem: with the plant.
@@ -85,8 +82,7 @@ class Learning:
             gradient: of the Lyapunov function, for rules that follow it.
         """
         plant, regressor = built.plant, self.regressor(built.problem)
-        believed = like(regressor.believed.parameter, "_believed")
-        others = [k for k in range(len(plant.parameters)) if k not in regressor.covered]
+        believed = like(plant.parameter, "_believed")
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
         learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
@@ -107,7 +103,7 @@ class Learning:
         def step(s: Signals) -> dict[str, Expression]:
             running = s.warm_up > begins - 0.5
             state, command, waiting = pairs.pair(s, s._command_before)
-            old = ca.if_else(running, s.learned, clip(regressor.theta_function(s.parameters), lower, upper))
+            old = ca.if_else(running, s.learned, clip(s.parameters[regressor.places], lower, upper))
             evidence = Evidence(
                 lambda: gradient(s, state, old),
                 lambda: pair(equation(state, s.realised, command, old, s.parameters)),
@@ -116,7 +112,7 @@ class Learning:
             candidate = old + self.rule.change(evidence, self.bounds, built.period)
             good = ca.logic_and(running, is_finite(candidate))
             new = ca.if_else(good, clip(candidate, lower, upper), old)
-            return {"estimate": new, "_believed": ca.vertcat(new, s.parameters[others]), "learned_next": new, **waiting}
+            return {"estimate": new, "_believed": regressor.believed(new, s.parameters), "learned_next": new, **waiting}
 
         return Block(
             "learn", Layout(reads), Layout((regressor.signal, believed)), step, Layout((learned, *pairs.memory))
@@ -159,7 +155,7 @@ def _against(plant: Plant) -> Iterator[str]:
 
 
 def _check_bounds(regressor: Regressor, bounds: Bounds) -> None:
-    first = regressor.theta_function(regressor.plant.approximate).full().ravel()
+    first = regressor.plant.approximate[regressor.places]
     for (name, (lower, upper)), value in zip(bounds.items(), first, strict=True):
         if not lower < upper:
             raise InvalidValue(f"bounds of '{name}' are ({lower!r}, {upper!r}); expected lower < upper")

@@ -16,7 +16,7 @@ from fpirhc.fields.kinds import Positive
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import derivative_unit, places
-from fpirhc.plant.regressor import Combination, Regressor
+from fpirhc.plant.regressor import Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
@@ -42,9 +42,8 @@ class SlotineLi(Controller):
         rate: Lambda, 1/s.
         damping: diagonal of K_D by coordinate, input per unit of rho.
         rule: moves the estimate: LyapunovRule or Projection.
-        bounds: parameter or combination -> (lower, upper); these are learned, beginning at their approximate values. Bounds may be
+        bounds: parameter -> (lower, upper); these are learned, beginning at their approximate values. Bounds may be
             infinite with a LyapunovRule and no deformation.
-        combinations: expressions of parameters that enter linearly as a whole, by name.
         deformation: the map between desired response and request; Identity() is no deformation.
 
     References:
@@ -55,7 +54,6 @@ class SlotineLi(Controller):
     damping: Mapping[str, Positive]
     rule: Rule
     bounds: Mapping[str, tuple[float, float]]
-    combinations: Mapping[str, Combination] = field(default_factory=dict)
     deformation: Deformation = field(default_factory=Identity)
 
     learns = True
@@ -70,13 +68,12 @@ class SlotineLi(Controller):
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         regressor = self._learning.regressor(built.problem)
-        believed = like(regressor.believed.parameter, "_believed")
         front = [reference_block(built), self._sliding_block(built), self._learn_block(built, regressor)]
+        closing, delays = closing_blocks(built, self.deformation)
         if self._deforms:
-            closing, delays = closing_blocks(built.of_plant(regressor.believed), self.deformation)
+            believed = like(built.plant.parameter, "_believed")
             closing = [fed(block, "parameters", believed) for block in closing]
             return [*front, self._demand_block(built, regressor), *closing], [*delays, *learning_delays()]
-        closing, delays = closing_blocks(built, self.deformation)
         # The request of a clipped command comes from the approximate model: the estimated one may have no inverse.
         deform, _, *rest = closing
         return [*front, deform, self._force_block(built, regressor), *rest], [*delays, *learning_delays()]
@@ -87,7 +84,7 @@ class SlotineLi(Controller):
 
     @property
     def _learning(self) -> Learning:
-        return Learning(self.rule, self.bounds, dict(self.combinations))
+        return Learning(self.rule, self.bounds)
 
     def _sliding_block(self, built: Built) -> Block:
         """Block (state, reference) -> (sliding rho, v, v'); v' is also 'desired' where nothing is deformed."""
