@@ -271,8 +271,9 @@ def _inner(case: Case) -> Fact | None:
     if sum(problem.plant.response_orders.values()) >= problem.plant.state.size or problem.integrator.steps_maps:
         return None
     rate, left = max(map(zero_dynamics, case.slopes(9))), bench.back.left
+    rate = 0.0 if abs(rate) * problem.duration < ROUNDING else rate
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
-    numbers = {"rate_with_outputs_held": rate, **_times(rate)}
+    numbers = {"rate_with_outputs_held": rate, **(_times(rate) if rate else {})}
     if rate * problem.duration <= math.log(2):
         return Fact(Verdict.YES, numbers)
     return Fact(held, {**numbers, "left": left})
@@ -505,7 +506,7 @@ QUESTIONS = (
              "a bias of 1 % of the response's range adds {added_by_a_bias:u} to the error of {of} ({late})"
              "| one of {share_of_the_response:%} costs what adaptation gains| relative rms error {error:%} ({start})"
              "| {error_with_right_sensors:%} with right sensors", "Calibrate the sensor: a bias moves the plant.", "adaptive"),
-    Question("model", "Does adaptation leave a right model alone?", _model, "model as the plant, without noise and disturbances: "
+    Question("model", "Does it spoil a right model less than it cures yours?", _model, "model as the plant, without noise and disturbances: "
              "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
              "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "rms error of {of} {error_without:u} without "

@@ -50,6 +50,15 @@ def plans(*, iterations: int | None = 5, tolerance: float | None = 1e-3, gain: f
     return {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": adapted}
 
 
+def slow_room() -> fp.Problem:
+    """Heating costs so much that a room comes back with its own 200 s, of which 1000 cycles of .1 s show half."""
+    loss = fp.Parameter(5e-3, 5e-3, "1/s")
+    room = fp.Plant({"T": "K"}, {"u": "K/s"}, {"loss": loss}, lambda q, u, p: {"T": u.u - p.loss * q["T"]}, order=1)
+    path = fp.Trajectory(lambda t: {"T": 1.0 + 0.1 * ca.sin(t / 50)})
+    plan = {"horizon": fp.Horizon(5, 0.1), "cost": fp.Quadratic({"T": 1e-6}, deviation={"u": 1.0})}
+    return fp.Problem(room, path, {"T": 0.9}, period=0.1, duration=400.0, measure_from=100.0, **plan)
+
+
 def three_lags() -> fp.Problem:
     """At a constant set-point, where the slowest of three lags in a row is the third derivative's share of rounding."""
     plant = fp.Plant.of_states(
