@@ -19,7 +19,7 @@ import numpy as np
 from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import FpirhcError
-from fpirhc.plant.chain import output_order, zero_dynamics
+from fpirhc.plant.chain import zero_dynamics
 from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked, predictor
 from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.status import Status
@@ -80,14 +80,6 @@ def _posed(case: Case) -> Fact | None:
     by_run = min(case.problem.plant.equations.known_by_outputs) < 0  # it has states that are taken from the run
     verdict = Verdict.YES if finite.all() else Verdict.CAUTION if by_run else Verdict.NO
     return Fact(verdict, {"share_finite": finite.mean()}) if len(finite) else None
-
-
-def _orders(case: Case) -> Fact:
-    plant = case.problem.plant
-    found = {name: (float(output_order(plant, name) or 0), order) for name, order in plant.response_orders.items()}
-    name = next((n for n, (own, stated) in found.items() if own != stated), next(iter(found)))
-    own, stated = found[name]
-    return Fact(Verdict.YES if own == stated else Verdict.NO, {"order": own, "stated": stated}, name)
 
 
 def _inverse(case: Case) -> Fact:
@@ -450,9 +442,6 @@ QUESTIONS = (
              "weigh 1 - cos of its error.", "problem"),
     Question("posed", "Has the reference finite commands?", _posed, "finite in {share_finite:%} of the cycles of {whole}",
              "Give it the derivatives that the plant's order needs, away from singular states.", "problem"),
-    Question("orders", "Are the relative orders those of the plant?", _orders,
-             "the input acts on derivative {order} of {of}, stated {stated}",
-             "Write the response as the derivative that the input acts on.", "problem"),
     Question("inverse", "Can the response be inverted where it goes?", _inverse,
              "largest condition number of the scaled input matrix in {whole}: {condition}",
              "Keep the plant away from states where inputs lose their effect.", "problem"),
@@ -506,8 +495,9 @@ QUESTIONS = (
              "a bias of 1 % of the response's range adds {added_by_a_bias:u} to the error of {of} ({late})"
              "| one of {share_of_the_response:%} costs what adaptation gains| relative rms error {error:%} ({start})"
              "| {error_with_right_sensors:%} with right sensors", "Calibrate the sensor: a bias moves the plant.", "adaptive"),
-    Question("model", "Does it spoil a right model less than it cures yours?", _model, "model as the plant, without noise and disturbances: "
-             "rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
+    Question("model", "Does it spoil a right model less than it cures yours?", _model,
+             "model as the plant, without noise and disturbances: rms error of {of} {error_without:u} without adaptation"
+             "| {error_with:u} with it ({counted})",
              "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "rms error of {of} {error_without:u} without "
              "adaptation| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "

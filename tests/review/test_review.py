@@ -15,7 +15,7 @@ from fpirhc.__main__ import main
 
 LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
 NAMES = {  # of numbers by key, which scripts read
-    "turns": {"jumps"}, "posed": {"share_finite"}, "orders": {"order", "stated"}, "inverse": {"condition"},
+    "turns": {"jumps"}, "posed": {"share_finite"}, "inverse": {"condition"},
     "ranges": {"without", "measured"}, "plans": {"not_converged", "error", "error_with_more_iterations"},
     "gain": {"error", "error_recommended", "error_at_half", "error_at_twice", "error_at_four_times", "error_turned",
              "recommended_times", "recommended_gain", "movement", "movement_recommended", "movement_without"},

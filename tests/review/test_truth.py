@@ -61,7 +61,10 @@ CASES: dict[str, Case] = {
     "a room that comes back with the time constant of its loss": Case(
         lambda: (reviewed.slow_room(), {"RHC": plans(iterations=1)["RHC"]}),
         {("RHC", "returns"): "yes"},
-        {("RHC", "returns", "factor"): (np.exp(-0.1 / 200), 2e-5), ("RHC", "returns", "left"): (np.exp(-270 / 200), 0.1)},
+        {
+            ("RHC", "returns", "factor"): (np.exp(-0.1 / 200), 2e-5),
+            ("RHC", "returns", "left"): (np.exp(-270 / 200), 0.1),
+        },
     ),
     "a limit that nothing comes near": Case(
         lambda: (reviewed.untouched_limit(), {"RHC": plans()["RHC"]}),
