@@ -244,22 +244,16 @@ class PairedAtOnce(Undeformed, ABC):
     """Contract: a controller that takes a response for that of the last command, also behind dead time."""
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        late = problem.dead_time
-        age = late.measurement + max(late.inputs.values(), default=0.0)
-        text = (
-            f"{type(self).__name__} takes a response for that of the last command, and it is that of a command {age:.3g} "
-            f"{problem.time_unit} older: dead time is not compensated"
-        )
-        return (text,) if age else ()
+        age = problem.dead_time.measurement + max(problem.dead_time.inputs.values(), default=0.0)
+        text = f"{type(self).__name__} takes a response for that of the last command, and it is that of a command {age:.3g} "
+        return (f"{text}{problem.time_unit} older: dead time is not compensated",) if age else ()
 
 
 @dataclass(frozen=True)
 class ControllerWrapper(Controller, ABC):
     """Contract: a controller around another one, with its deformation."""
 
-    once: ClassVar[bool] = (
-        False  # whether it cannot stand around another one of its kind, because its signals have fixed names
-    )
+    once: ClassVar[bool] = False  # whether it cannot stand around another one of its kind: its signals have fixed names
 
     controller: Controller
 
@@ -284,15 +278,13 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
-    lags, inputs = problem.moves.lag, tuple(problem.plant.inputs)
-    times = problem.dead_time.inputs
+    lags, inputs, times = problem.moves.lag, tuple(problem.plant.inputs), problem.dead_time.inputs
     known = {
         "cycles": [whole(times.get(name, 0.0) / problem.period) for name in inputs],
         "lag": [lags.get(name, 0.0) for name in inputs],
     }
-    left_open = [
-        f.name for f in fields(deformation) if f.metadata.get("of_problem") and getattr(deformation, f.name) is None
-    ]
+    of_problem = [f.name for f in fields(deformation) if f.metadata.get("of_problem")]
+    left_open = [name for name in of_problem if getattr(deformation, name) is None]
     square = len(inputs) == len(problem.plant.controlled_names)
     each = {n: square and len(inputs) > 1 and len({*known[n]}) > 1 for n in left_open}
     values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in left_open}

@@ -70,10 +70,15 @@ class RecedingHorizon(Controller):
     @property
     def planner(self) -> Planner:
         ways = self.replanning
-        adapts = self.deformation.adapts
-        consistent, follows = ways.consistent, self.follows_model
-        facts = (self.margins, consistent, adapts, follows, ways.room is not None)
+        facts = (self.margins, ways.consistent, self.deformation.adapts, self.follows_model, ways.room is not None)
         return Planner(self.optimiser, self.cost, ways.restarts, ways.law, *facts)
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        sensing, planner = problem.sensing, self.planner
+        given = sensing.observer is None and sensing.delay(problem.plant, problem.period) > 0
+        text = "its plans start where the model has the estimated outputs, and those without adaptation at the given state, so the "
+        text += "pair differs with a right model too; FromMeasurement(consistent=False) starts both at the state"
+        return (text,) if given and planner.consistent is None and planner.starts_consistent(problem.plant) else ()
 
     def check(self, problem: Problem) -> None:
         """Raise if the problem has no horizon or cost, or the optimiser does not support it.
@@ -150,8 +155,7 @@ def _room(problem: Problem, replanning: Replanning) -> np.ndarray | None:
         if name not in names:
             raise InvalidName(f"{type(replanning).__name__}: room of input '{name}' is unknown.{nearest(name, names)}")
     room = np.array([float(replanning.room.get(name, 0.0)) for name in names])
-    lower, upper = problem.limits.input_bounds(problem.plant)
-    for name, low, high, own in zip(names, lower, upper, room, strict=True):
+    for name, low, high, own in zip(names, *problem.limits.input_bounds(problem.plant), room, strict=True):
         if low + own >= high - own:
             raise InvalidProblem(
                 f"{type(replanning).__name__}: a room of {own:g} leaves nothing of input '{name}' between {low:g} and {high:g}; "
@@ -196,12 +200,9 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
         status = diagnostics[_SOLVE.index("status")]
-        failed = status > int(Status.NOT_CONVERGED) + 0.5
-        judged = ca.if_else(
-            failed, int(Status.HELD), status
-        )  # the plan is held, of least violation or the last one, shifted
-        after = memory.split(next_memory)
-        remembered_next = {f"{m}_next": v for m, v in after.items()}
+        # else the plan is held, of least violation or the last one, shifted
+        judged = ca.if_else(status > int(Status.NOT_CONVERGED) + 0.5, int(Status.HELD), status)
+        remembered_next = {f"{m}_next": v for m, v in memory.split(next_memory).items()}
         return {
             "planned": inputs[:, 0],
             "solve": diagnostics,

@@ -44,16 +44,8 @@ def circle(plant: fp.Plant, radius: float = 0.1, **settings: Any) -> fp.Problem:
             "y": y0 + radius * ca.sin(2 * t) - 2 * radius * t * ca.exp(-5 * t),
         }
 
-    start = {"a": a, "b": b}
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(motion),
-        start=start,
-        period=2e-3,
-        duration=4.0,
-        measure_from=1.0,
-        **settings,
-    )
+    moved, start = fp.Trajectory(motion), {"a": a, "b": b}
+    return fp.Problem(plant, moved, start, period=2e-3, duration=4.0, measure_from=1.0, **settings)
 
 
 # A curve from the state to what is measured: two first-order parts and a Hill curve, as the depth of anaesthesia.

@@ -26,9 +26,8 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
     drift, noise = {"a": 2.0, "x''": 3.0}, {"b": 0.1}
     measured = {"a": 0.01, "b": 0.01, "x": 0.02, "y'": 0.05, "x''": 0.5}
     problem = replace(circle(arm()), duration=0.3, measure_from=0.0)
-    run = simulated(
-        problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), fp.DisturbanceKalman(drift, measured, noise))
-    )
+    filter = fp.DisturbanceKalman(drift, measured, noise)
+    run = simulated(problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), filter))
 
     plant, mass, period = problem.plant, 1.4, problem.period
     rate = plant.equations.forced_rate
@@ -97,6 +96,12 @@ def test_a_disturbance_of_an_output_is_the_distance_of_the_curves() -> None:
     model = problem.plant.equations.output(run["state"][-1], run["command"][-1], [5.5], np.zeros(2)).full().ravel()
     assert run["estimate.w_depth"][-1] == pytest.approx(run["output.depth"][-1] - model[0], rel=0.01)
     assert abs(run["estimate.w_depth"][-1]) > 5
+    for inner in (LAW, PLAN):
+        [note] = fp.Estimating(inner, SHIFT).notes(planned())
+        assert note.endswith("w_depth, and the offset of an output is taken from the measurement; name states: C, E")
+        assert fp.Estimating(inner, ANSWER).notes(planned()) == ()
+    commands = [simulated(planned(), one)["command"] for one in (PLAN, fp.Estimating(PLAN, SHIFT))]
+    assert commands[0] == pytest.approx(commands[1], rel=1e-6)
 
 
 def test_the_mass_of_an_arm_is_found_from_the_acceleration_of_its_hand() -> None:

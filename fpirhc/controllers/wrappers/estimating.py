@@ -69,6 +69,17 @@ class Estimating(ControllerWrapper):
         planner, at_once = self.controller.planner, self.at_once or self.estimator.acts_at_once
         return replace(planner, follows_model=True) if planner is not None and at_once else planner
 
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        notes, model, names = super().notes(problem), self.inner_problem(problem).plant, self.estimator.learned()
+        (x, u, p), equations, places = model.symbols(), model.equations, map(model.parameter.elements.index, names)
+        moved = ca.vertcat(equations.rate(x, u, p), equations.controlled_response(x, u, p))
+        reached = ca.DM(ca.jacobian_sparsity(moved, p), 1)[:, [*places]].nnz()
+        shifts = self.planner is not None and (not self.planner.restarts or self.planner.starts_consistent(model))
+        if reached or shifts or self.controller.inner is not None or not all(equations.output_orders.values()):
+            return notes
+        text = f"no command changes: no rate or response of the model has {', '.join(names)}, and the offset of an output is taken "
+        return (*notes, f"{text}from the measurement; name states: {', '.join(problem.plant.coordinates)}")
+
     def check(self, problem: Problem) -> None:
         """Raise if the estimator or the wrapped controller does not fit the problem.
 
@@ -108,11 +119,10 @@ class Estimating(ControllerWrapper):
         pairs = replace(built.pairs, dead_time=self.dead_time or built.pairs.dead_time, with_outputs=outputs, age=age)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(built.before, name="_acted")
-        blocks = [
-            _estimate_block(pairs, modelled, self.estimator, believed, acted),
-            embedded("controller", inner, {"parameters": believed}),
+        estimate = _estimate_block(pairs, modelled, self.estimator, believed, acted)
+        return [estimate, embedded("controller", inner, {"parameters": believed})], [
+            Delay(acted, built.plant.input.name)
         ]
-        return blocks, [Delay(acted, built.plant.input.name)]
 
 
 def _estimate_block(
@@ -120,12 +130,10 @@ def _estimate_block(
 ) -> Block:
     """Block (state, realised, parameters, command of the last cycle) -> (corrected parameters, the learned ones among them)."""
     plant, model = pairs.problem.plant, modelled.plant
-    names = estimator.learned()
+    names, count = estimator.learned(), len(plant.parameters)
     places = [model.parameter.elements.index(n) for n in names]
-    count = len(plant.parameters)
     estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
-    memory = estimator.memory(modelled)
-    correct = estimator.step(modelled)
+    memory, correct = estimator.memory(modelled), estimator.step(modelled)
     own = memory + Layout((like(estimate, "estimate_change"), discrete("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
