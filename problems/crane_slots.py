@@ -13,7 +13,7 @@ Errors count from 10.6 s on:
 
     rms error, seed 0    cart [m]    angle [rad]
     slots                    0.49          0.023
-    slots+FPI              0.0048         0.0015
+    slots+FPI              0.0045         0.0015
     slots exact model       0.013         0.0024
     RHC                   6.1e-07        7.8e-07
     RHC+FPI               1.2e-08        1.9e-08

@@ -11,7 +11,7 @@ Errors count from 8 s on:
 
     rms error, seed 0     q1 [m]     q2 [m]
     slots                 0.0053     0.0079
-    slots+FPI            1.2e-07    1.9e-07
+    slots+FPI            1.1e-07    1.8e-07
     slots exact model    1.2e-09    2.8e-09
     RHC                   0.0016     0.0024
     RHC+FPI              4.6e-07    6.8e-07

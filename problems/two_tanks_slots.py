@@ -11,7 +11,7 @@ Errors count from 240 s on:
 
     rms error, seed 0    h1 [dm]    h2 [dm]
     slots                  0.039       0.02
-    slots+FPI            9.2e-05    7.6e-05
+    slots+FPI            8.5e-05    7.1e-05
     slots exact model    2.2e-05    1.8e-05
     RHC                    0.086       0.13
     RHC+FPI                0.035      0.053

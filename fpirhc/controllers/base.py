@@ -14,7 +14,6 @@ import casadi as ca
 
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Controller as Controller
-from fpirhc.controllers.contract import Response as Response
 from fpirhc.controllers.path import model_block
 from fpirhc.deformation.base import Deformation, Form
 from fpirhc.plant.chain import nominal_responses

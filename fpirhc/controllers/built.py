@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import Controller, PlantModel, Response, given_response
+from fpirhc.controllers.contract import Controller, PlantModel
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
 from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
 from fpirhc.controllers.seeing import given_states, raw_signal
@@ -34,7 +34,6 @@ class Built:
     problem: Problem  # as the controller is given it
     controller: Controller  # with every automatic number chosen
     model: PlantModel  # what it knows of its plant
-    response: Response | None  # that it is given in place of that of the controlled quantities
     largest: tuple[float, ...]  # response of every controlled quantity that the limits of the inputs allow
     ends: tuple[list[float], list[float]]  # lower and upper limits of the inputs
     rates: tuple[list[float], list[float]]  # the same of their changes, where these limits are hard
@@ -108,7 +107,6 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         problem=problem,
         controller=ready,
         model=ready.plant_model(problem),
-        response=given_response(problem, ready),
         largest=largest_response(problem),
         ends=problem.limits.input_ends(plant),
         rates=tuple(one.tolist() for one in problem.limits.rate_bounds(plant)),

@@ -170,13 +170,10 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
         ready.check(problem)
     check_form(problem, ready)
     check_believed(problem, ready)
-    if ready.deforms == "target":
-        return ready  # its own check judges a gain that acts on targets
-    if ready.response(problem) is None:
+    if ready.deforms not in ("target", "turns"):  # their own checks judge gains
         check_gain_sign(problem, ready.deformation)
         check_gain_size(problem, ready.deformation)
-        return ready
-    return ready  # its own check judges the gains of its own responses
+    return ready
 
 
 def check_form(problem: Problem, controller: Controller) -> None:

@@ -47,9 +47,9 @@ def _composed(built: Built) -> Composite:
 
 def _reads(built: Built) -> Layout:
     """What a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
-    plant, response = built.plant, built.response
-    realised = response.signal if response else plant.response_signal("realised")
-    return Layout((time_signal(plant), *measured_signals(plant), realised, built.model.plant.parameter, *built.given))
+    plant = built.plant
+    measured = *measured_signals(plant), plant.response_signal("realised")
+    return Layout((time_signal(plant), *measured, built.model.plant.parameter, *built.given))
 
 
 def compose_controller(built: Built, *, ahead: bool = False) -> Composite:

@@ -12,7 +12,6 @@ from copy import copy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar, cast
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
@@ -24,7 +23,6 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import measured_signals, rateless, without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Signal
 from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous
 from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
@@ -34,21 +32,7 @@ if TYPE_CHECKING:
     from fpirhc.controllers.built import Built
     from fpirhc.optimisers.base import Optimiser
 
-Deforms = Literal["response", "command", "target"]
-
-
-@dataclass(frozen=True, eq=False)
-class Response:
-    """A response of the plant.
-
-    Args:
-        signal: named 'realised'.
-        function: Function (state, input, parameters, forcing) -> the response; None where the controller finds it from its
-            measurements.
-    """
-
-    signal: Signal
-    function: ca.Function | None
+Deforms = Literal["response", "command", "target", "turns"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +170,9 @@ class Controller(Checked, ABC):
 
     @property
     def deforms(self) -> Deforms:
-        """What its deformation acts on: the desired response, a command, or the target of an inner controller.
+        """What its deformation acts on: the desired response, a command, the target of an inner controller, or slots in turn.
 
-        Where it is the target, the response is the output itself.
+        Where it is the target, the response is the output itself; in turn, it is that of another quantity in every slot.
         """
         return "response" if self.inner is None else self.inner.deforms
 
@@ -216,10 +200,6 @@ class Controller(Checked, ABC):
             request = request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(self))
             deformation = deformation.with_scale_for(request)
         return self if deformation is own else self.with_deformation(deformation)
-
-    def response(self, problem: Problem) -> Response | None:
-        """Return the response that the controller reads as 'realised'; None: that of the plant's controlled coordinates."""
-        return None if self.inner is None else self.inner.response(self.inner_problem(problem))
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return sentences about the controller on this problem, for a reader of results."""
@@ -333,12 +313,6 @@ def with_field(controller: _Own, name: str, value: object) -> _Own:
         return changed
     require(controller.inner is not None, f"{type(controller).__name__} has no {name} that can be replaced")
     return with_inner(controller, with_field(cast(Controller, controller.inner), name, value))
-
-
-def given_response(problem: Problem, controller: Controller) -> Response | None:
-    """Return the response that a controller is given in place of that of the plant's controlled quantities; None: that one."""
-    own = controller.response(problem)
-    return None if own is None or own.function is None else own
 
 
 def innermost(controller: Controller) -> Controller:

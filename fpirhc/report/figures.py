@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import OutputError
-from fpirhc.simulation.drawing import PALETTE, caption_axes, draw_legend, literal, new_figure
+from fpirhc.simulation.drawing import PALETTE, caption_axes, draw_legend, literal, new_figure, responses_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,7 +94,7 @@ def contraction_figures(comparison: Comparison) -> list[Drawing]:
         _draw_factor(axis, name, scale, same, colours)
     units, cycles = {e.run.unit(f"desired.{n}") for e in entries for n in e.run.layout["desired"].elements}, 0
     for entry in entries:
-        apart = (entry.run["realised"][1:] - entry.run["desired"][:-1])[:_CYCLES]
+        apart = (entry.run[responses_of(entry.run.layout)["realised"]][1:] - entry.run["desired"][:-1])[:_CYCLES]
         cycles = max(cycles, len(apart))
         if len(units) > 1:  # of different units: shares of their own ranges
             apart = apart / np.maximum(np.ptp(entry.run["desired"], axis=0), 1e-300)

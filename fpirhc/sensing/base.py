@@ -85,12 +85,6 @@ def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
     return {**named, **dict(zip(response_names(plant), responses, strict=True))}
 
 
-def names_of_responses(plant: Plant, signal: Signal) -> tuple[str, ...]:
-    """Names of the entries of a signal of responses: highest derivatives of coordinates, and others as they are."""
-    orders = plant.equations.output_orders
-    return tuple(e + "'" * orders.get(e, 0) for e in signal.elements)
-
-
 def spline_weights(order: int) -> Array:
     """Weights A(n, j) / n! of the last n held values of y^(n) in the n-th difference of y over T^n."""
     row = np.ones(1)

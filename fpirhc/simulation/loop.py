@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
-from fpirhc.controllers.contract import PlantModel, Undeformed, given_response
+from fpirhc.controllers.contract import PlantModel, Undeformed
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
@@ -55,7 +55,7 @@ def _closed(built: Built) -> Composite:
     samples = known_samples(problem) if lost or ranges else 0
     acting = Gate(problem, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = disturbance_signals(problem)
-    seeing = sensing_blocks(mover, built.response, predicts="state_ahead" in acting.inner.trace)
+    seeing = sensing_blocks(mover, predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(mover, disturbed)
@@ -75,7 +75,7 @@ def start_memory(
         numbers: of all live settings, by path; None: those of the build.
     """
     mover, whole = moving(problem), loop.memory.start()
-    sensing = [] if problem.sees_plant else sensing_blocks(mover, given_response(problem, controller), predicts=False)
+    sensing = [] if problem.sees_plant else sensing_blocks(mover, predicts=False)
     signals = [s for block in (*sensing, *seeing_blocks(problem)[0]) for s in block.memory.signals]
     signals += [delay.now for delay in _plant_delays(mover, controller.plant_model(problem))]
     if INNER in loop.memory and plans_exactly(loop, problem, controller):

@@ -17,17 +17,15 @@ import numpy as np
 from fpirhc.controllers.base import Controller, fed, under_names
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
-from fpirhc.controllers.contract import given_response
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import given_states, raw_signal, sensor_ranges
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import require
-from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.chain import measured_signals, response_names
 from fpirhc.plant.motion import SECONDS
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import names_of_responses
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.simulation.replay import known_samples
 from fpirhc.status import Status
@@ -91,7 +89,7 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
 def _iterates(problem: Problem, controller: Controller) -> bool:
     """Whether the map compares the last request with its response, undelayed."""
     deformation = controller.deformation
-    direct = not problem.answers_late and controller.response(problem) is None and controller.deforms == "response"
+    direct = not problem.answers_late and controller.deforms == "response"
     return deformation.adapts and of_last_pair(deformation) and direct and deformation.effective_gain() != 0
 
 
@@ -215,14 +213,13 @@ def composed_step(
     return composite, gates[-1].named(composite.memory)
 
 
-def measures(problem: Problem, controller: Controller) -> tuple[str, ...]:
+def measures(problem: Problem) -> tuple[str, ...]:
     """Return the names of what a step is given: the state and the responses, or what the sensors show."""
-    raw, plant, own = raw_signal(problem), problem.plant, given_response(problem, controller)
+    raw, plant = raw_signal(problem), problem.plant
     if raw is not None:
         return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
-    responses = plant.response_signal("realised") if own is None else own.signal
     motions = (e for signal in measured_signals(plant) for e in signal.elements)
-    return (*motions, *names_of_responses(plant, responses))
+    return (*motions, *response_names(plant))
 
 
 def refuse_unbounded(controller: Controller) -> None:

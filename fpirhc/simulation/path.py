@@ -15,7 +15,7 @@ from typing import ClassVar, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Response, like, rename
+from fpirhc.controllers.base import like, rename
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
@@ -45,10 +45,10 @@ _LOST_QUEUE = "lost_samples_queue"
 _PAST, _FULL = "_outputs_past", "_outputs_known"
 
 
-def sensing_blocks(mover: Mover, other: Response | None, *, predicts: bool) -> list[Block]:
+def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
     """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
     problem, plant = mover.problem, mover.problem.plant
-    response = other or Response(plant.response_signal("realised"), problem.truth.function(response_names(plant)))
+    response = plant.response_signal("realised")
     if problem.sees_plant:
         sense = [mover.sense(measured_signals(plant), response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
@@ -179,7 +179,7 @@ class Mover(ABC):
         """What it carries from cycle to cycle inside the loop."""
 
     @abstractmethod
-    def sense(self, motion: Sequence[Signal], response: Response) -> Block:
+    def sense(self, motion: Sequence[Signal], response: Signal) -> Block:
         """Block -> its state and outputs, and its response just before this cycle's command."""
 
     @abstractmethod
@@ -222,16 +222,15 @@ class Equations(Mover):
             Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), self.parameters),
         ]
 
-    def sense(self, motion: Sequence[Signal], response: Response) -> Block:
+    def sense(self, motion: Sequence[Signal], response: Signal) -> Block:
         """Block -> state and outputs, and the response just before this cycle's command; with a reality also its state.
 
         The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
         Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
         """
         problem, truth = self.problem, self.problem.truth
-        signal, answer = response.signal, response.function
-        assert answer is not None  # see `given_response`
-        reads, writes = _real_signals(problem), (*motion, signal)
+        answer = truth.function(response_names(problem.plant))
+        reads, writes = _real_signals(problem), (*motion, response)
         own = () if problem.reality is None else (like(truth.plant.state, REALITY_STATE),)
         shown = {one.name: truth.function(one.elements) for one in motion}
         shifts = bool(problem.disturbed_outputs)
@@ -240,11 +239,11 @@ class Equations(Mover):
 
         def step(s: Signals) -> dict[str, Expression]:
             now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
-            values = {signal.name: answer(*now)}
+            values = {response.name: answer(*now)}
             values |= {name: function(*now) for name, function in shown.items()}
             if shifts:
                 below, answered = added(problem, s.disturbance)
-                sums = {signal.name: answered, motion[-1].name: below}
+                sums = {response.name: answered, motion[-1].name: below}
                 values |= {name: values[name] + more for name, more in sums.items()} | {LOGGED: below}
             return {**values, **{one.name: s._state_before for one in own}}
 
@@ -308,10 +307,10 @@ class Body(Mover):
     def delays(self) -> list[Delay]:
         return []
 
-    def sense(self, motion: Sequence[Signal], response: Response) -> Block:
+    def sense(self, motion: Sequence[Signal], response: Signal) -> Block:
         """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
         names, answered = list(self.measures), response_names(self.problem.plant)
-        wanted = {**{signal.name: signal.elements for signal in motion}, response.signal.name: answered}
+        wanted = {**{signal.name: signal.elements for signal in motion}, response.name: answered}
 
         def step(s: Signals) -> dict[str, Expression]:
             answer = s._foreign
@@ -321,7 +320,7 @@ class Body(Mover):
             }
             return {**shown, "foreign": answer, "foreign_held": s._foreign_held}
 
-        writes = (*motion, response.signal, like(self.reads[0], "foreign"), scalar("foreign_held"))
+        writes = (*motion, response, like(self.reads[0], "foreign"), scalar("foreign_held"))
         return Block("sense", Layout(self.reads), Layout(writes), step)
 
     def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
@@ -338,21 +337,21 @@ class Body(Mover):
         return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)
 
 
-def _true_blocks(mover: Mover, response: Response) -> tuple[list[Block], Shown]:
+def _true_blocks(mover: Mover, response: Signal) -> tuple[list[Block], Shown]:
     """Blocks of the true motion, response and error; and the signals that sensors see."""
     problem, motion = mover.problem, mover.motion
-    hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response.signal, "_seen")
+    hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response, "_seen")
     if not mover.shows_truth:
-        return [mover.sense(hidden[0], Response(hidden[1], response.function))], hidden
-    true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response.signal, "plant_realised")
-    sense = mover.sense(true[0], Response(true[1], response.function))
+        return [mover.sense(*hidden)], hidden
+    true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response, "plant_realised")
+    sense = mover.sense(*true)
     if problem.sensing.estimator.of_steps:
         sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if not problem.truth.seen:
         return blocks, true
     direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
-    shown = (motion, response.signal) if direct else hidden
+    shown = (motion, response) if direct else hidden
     return [*blocks, _seen_block(problem, shown)], shown
 
 

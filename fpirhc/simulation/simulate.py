@@ -448,7 +448,7 @@ def judgements(
     if problem.cost is not None and problem.horizon is not None and whole:
         judged.append(attempted("the signal 'cost'", _costs, problem, layout, log, broken=broken))
     gain = controller.deformation.effective_gain()
-    of_responses = controller.response(problem) is None and controller.deforms != "target"
+    of_responses = controller.deforms in ("response", "command")
     if gain != 0 and log.shape[0] and of_responses:
         named = "the signal 'contraction'"
         factors = attempted(named, _contraction, problem, controller, layout, log, broken=broken)

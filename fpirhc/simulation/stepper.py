@@ -182,7 +182,7 @@ class Stepper(NumbersNow, Checked):
         backend = native(self.function, required=bool(step.settings.paths)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = composite.trace
-        self.measures = measures(problem, step.ready)  # names of the raw measurements
+        self.measures = measures(problem)  # names of the raw measurements
         self.why_failed = ""
         self._title = f"{problem.name or 'problem'}, {name_in_task(controller)}"
         self._may_fail = composite.opaque  # scalar code cannot fail

@@ -157,7 +157,7 @@ def test_offset_decays_with_the_blend(name, blend):
     assert abs(offset[at]) > 0.1
     np.testing.assert_allclose(offset[at:], expected, atol=1e-9)
     np.testing.assert_allclose((result["desired.cart"] - own_law(result, "cart", 1.0))[:at], 0, atol=1e-12)
-    begins = result["realised.angle"] if name == "slots+FPI" else result["deformed.angle"]
+    begins = result["realised_of_slots.angle"] if name == "slots+FPI" else result["deformed.angle"]
     assert result["desired.angle"][at] == pytest.approx(begins[at], rel=1e-9)
 
 

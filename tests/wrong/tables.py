@@ -61,7 +61,6 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
     "notes": "notes are sentences",
     "plant_model": "model is of the plant",
     "planner": "facts hold",
-    "response": "writes a command and a status",
     "with_defaults": "facts hold",
     "with_deformation": "deformation acts",
 }

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, Response, judge_block, like, reference_block, under_names, warm_up_block
+from fpirhc.controllers.base import Controller, judge_block, like, reference_block, under_names, warm_up_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.composed import with_aim
@@ -65,13 +65,7 @@ class Slotted(Controller):
         """The deformation of the first slot that adapts; Identity() where no slot does."""
         return next((s.deformation for s in self.slots.values() if s.deformation.adapts), Identity())
 
-    def response(self, problem: Problem) -> Response:
-        """Return the response y^(r) of every slot's coordinate: by the equations of what moves, or from what is measured."""
-        plants = [slot_problem(problem, name).plant for name in self.slots]
-        known = _reads_equations(problem)
-        signal = _by_slot(plants, "realised" if known else "realised_of_slots")
-        names = [f"{n}{chr(39) * order}" for plant in plants for n, order in plant.response_orders.items()]
-        return Response(signal, problem.truth.function(names) if known else None)
+    deforms = "turns"
 
     def with_deformation(self, deformation: Deformation) -> Slotted:
         return replace(self, slots={n: slot.with_deformation(deformation) for n, slot in self.slots.items()})
@@ -119,7 +113,7 @@ class Slotted(Controller):
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         turns = [self._turn(built, k, name) for k, name in enumerate(self.slots)]
-        blocks = [reference_block(built), *_seeing_blocks(built, turns, self.response(built.problem))]
+        blocks = [reference_block(built), *_seeing_blocks(built, turns)]
         blocks += [self.schedule.block(list(self.slots), built.problem), _switch_block(turns)]
         delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(discrete("_slot_before"), "slot")]
         for one in turns:
@@ -131,10 +125,8 @@ class Slotted(Controller):
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
         one = build(slot_problem(built.problem, name), self.slots[name], opened=built.opened)
-        place: int | None = number
-        if not _reads_equations(built.problem):
-            same = built.plant.response_orders.get(name) == one.plant.response_orders[name]
-            place = built.plant.controlled_names.index(name) if same else None
+        same = built.plant.response_orders.get(name) == one.plant.response_orders[name]
+        place = built.plant.controlled_names.index(name) if same else None
         return Turn(number, name, self.slots[name], replace(one, warm_up=built.warm_up + (place is None)), place)
 
 
@@ -178,11 +170,6 @@ def _by_slot(plants: Sequence[Plant], name: str) -> Signal:
     return Signal(name, tuple(e for s in parts for e in s.elements), tuple(u for s in parts for u in s.units))
 
 
-def _reads_equations(problem: Problem) -> bool:
-    """Whether y^(r) is given as the equations of what moves have it: nothing is measured otherwise, or late."""
-    return problem.sees_plant and problem.of_equations is problem
-
-
 def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
     estimator = problem.sensing.estimator
     if deformation.form.modelled and not (estimator.of_steps or estimator.measures_all):
@@ -200,12 +187,12 @@ def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
 _OUTPUT = "_slot_outputs"  # the outputs of every slot's plant, where the plant itself has none
 
 
-def _seeing_blocks(built: Built, turns: Sequence[Turn], response: Response) -> list[Block]:
+def _seeing_blocks(built: Built, turns: Sequence[Turn]) -> list[Block]:
     """Blocks from what is measured to the outputs and the response of every slot."""
-    plant, model, given, motion = built.plant, turns[0].built.plant, response.signal, measured_output(built.plant)
+    plant, model, motion = built.plant, turns[0].built.plant, measured_output(built.plant)
+    every = _by_slot([one.built.plant for one in turns], "realised_of_slots")
     still, calm = ca.DM.zeros(plant.input.size), ca.DM.zeros(len(plant.names))
     memory = Layout(tuple(scalar(one.own("below")) for one in turns if one.place is None))
-    known = given.name == "realised"
 
     def shown(state: Expression, parameters: Expression) -> Expression:
         return model.equations.output(state, still, parameters, calm)
@@ -219,11 +206,10 @@ def _seeing_blocks(built: Built, turns: Sequence[Turn], response: Response) -> l
                 below = outputs[model.output.elements.index(one.name + "'" * (model.chains[one.name] - 1))]
                 values[one.own("realised")] = (below - getattr(s, one.own("below"))) / built.period
                 values[f"{one.own('below')}_next"] = below
-        every = {} if known else {given.name: ca.vertcat(*(values[one.own("realised")] for one in turns))}
-        return values | every
+        return {**values, every.name: ca.vertcat(*(values[one.own("realised")] for one in turns))}
 
-    reads = (given if known else plant.response_signal("realised"), motion, plant.parameter)
-    writes = Layout((*((given,) * (not known)), *(scalar(one.own("realised")) for one in turns)))
+    reads = (plant.response_signal("realised"), motion, plant.parameter)
+    writes = Layout((every, *(scalar(one.own("realised")) for one in turns)))
     responses = Block("slot_responses", Layout(reads), writes, step, memory)
     state, output = Layout((plant.state, plant.parameter)), Layout((replace(model.output, name=_OUTPUT),))
     outputs = Block("slot_outputs", state, output, lambda s: {_OUTPUT: shown(s.state, s.parameters)})

@@ -100,8 +100,8 @@ class Estimating(ControllerWrapper):
             "measure it, or use a DisturbanceKalman that measures states alone",
         )
         require(
-            self.controller.response(modelled) is None,
-            f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} reads another",
+            self.controller.deforms != "turns",
+            f"Estimating needs the response of the controlled coordinates; {type(self.controller).__name__} has others in turn",
         )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:

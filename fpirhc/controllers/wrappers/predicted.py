@@ -173,9 +173,9 @@ class Predicted(ControllerWrapper):
         self.controller.check(problem)
         self.by.check(problem.plant)
         require(
-            self.by == ByModel() or self.controller.response(problem) is None,
-            f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, but "
-            f"{type(self.controller).__name__} reads others; use by=ByModel()",
+            self.by == ByModel() or self.controller.deforms != "turns",
+            f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, and "
+            f"{type(self.controller).__name__} has others in turn; use by=ByModel()",
         )
         cycles = self._cycles(problem.period)
         if cycles > MOST:

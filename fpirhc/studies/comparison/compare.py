@@ -305,7 +305,7 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     """Return what white noise of the response costs in as many cycles as a review runs; None where it has some."""
     names, sensing = {*response_names(problem.plant)}, problem.sensing
     right = names <= {*sensing.measures(problem.plant)} - {n for n, sensor in sensing.sensors.items() if sensor.acts}
-    if not right or not problem.equations_known or controller.deforms == "target" or run.stop is not None:
+    if not right or not problem.equations_known or controller.deforms in ("target", "turns") or run.stop is not None:
         return None
     bench = Bench(problem, controller, short=True, seed=run.seed)
     quiet = run.first(bench.cycles)

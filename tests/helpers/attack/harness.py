@@ -51,12 +51,8 @@ class Bench:
         self.limits = problem.limits.input_bounds(plant)
         self._advance = problem.integrator.step(plant, problem.period)
         x, u, p = plant.symbols()
-        coordinates = ca.vertsplit(plant.equations.response(x, u, p))  # also of those that only a slot controls
-        own = dict(zip((n + "'" * k for n, k in zip(plant.names, plant.orders, strict=True)), coordinates, strict=True))
-        values = {**own, **values_of(plant, x, u, p)}
+        values = values_of(plant, x, u, p)
         self._names = [name + "'" * order for name, order in plant.response_orders.items()]
-        if not self.stepper.estimates:  # time slots are given the responses of all their coordinates
-            self._names = list(self.stepper.measures[plant.state.size :])
         rows = ca.densify(ca.vertcat(*(values[name] for name in self._names)))
         self._response = ca.Function("response", [x, u, p], [rows])
         self._calm = np.zeros(len(plant.names))
