@@ -115,11 +115,6 @@ class OptimalControl:
         return float(sizes.min())
 
     @property
-    def equations(self) -> np.ndarray:
-        """Which states have limits that are an equation and no range (ns,): those that are equal, and what the end must meet."""
-        return np.asarray((self.state_lower == self.state_upper) | self._meets)
-
-    @property
     def _meets(self) -> np.ndarray:
         return np.arange(self.state.size) >= self.state.size - self.met
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass, replace
-from typing import ClassVar, Literal, cast
+from typing import ClassVar, Literal, TypeAlias, cast
 
 import casadi as ca
 import numpy as np
@@ -22,6 +22,7 @@ from fpirhc.symbolic.native import find_compiler, native, why_no_compiler
 
 FEASIBLE = 1e-4  # largest violation of a state bound, as a share of its unit, that still counts as kept
 KEPT = 1e-6  # the same for an optimiser that keeps limits more closely
+Columns: TypeAlias = Sequence[np.ndarray]
 _ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
@@ -88,9 +89,9 @@ class Optimiser(Checked, ABC):
         """Function like `step`, for open-loop solves: it may stop where the plan is converged, and it may work longer."""
         return self.step(ocp)
 
-    def rescue(self, ocp: OptimalControl) -> ca.Function | None:  # noqa: ARG002
-        """Function (arguments of `converging`, its results) -> better results, for calls that do not end OK; or None."""
-        return None
+    def rescued(self, ocp: OptimalControl, call: Columns, results: Columns) -> Columns:  # noqa: ARG002
+        """Return better results than those of a call of `converging` that did not end OK, or the same."""
+        return results
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:  # noqa: ARG002
         """Return the memory with which a run begins; the memory's start unless an optimiser overrides it.
@@ -298,18 +299,18 @@ def improved(
     Returns:
         Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.
     """
-    step, bounds, rescue = built(optimiser, ocp, "converging"), (ocp.input_lower, ocp.input_upper), None
+    step, fixed = (
+        built(optimiser, ocp, "converging"),
+        (np.asarray(ca.DM(data).full()), ocp.input_lower, ocp.input_upper),
+    )
     status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
     inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
     while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
-        arguments = (state, data, *bounds, memory)
-        results = step(*arguments)
-        if int(results[1][4]) != Status.OK:
-            # Built only here, because most horizons do not need it.
-            rescue = rescue or optimiser.rescue(ocp)
-            results = rescue(*arguments, *results) if rescue else results
-        inputs, diagnostics, memory = (np.asarray(v.full()) for v in results)
-        diagnostics, memory = diagnostics.ravel(), memory.ravel()
+        call = state, *fixed, memory
+        results: Columns = [np.asarray(v.full()) for v in step(*call)]
+        if results[1][4, 0] != Status.OK:
+            results = optimiser.rescued(ocp, call, results)
+        inputs, diagnostics, memory = results[0], results[1].ravel(), results[2].ravel()
         iterations += diagnostics[3]
         status, count = Status(int(diagnostics[4])), count + 1
         better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation

@@ -19,7 +19,7 @@ from fpirhc.errors import CompileError, InvalidValue, NotInstalled, require
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Optimiser, first_plan, paid, require_compiler, sane, stage_later
+from fpirhc.optimisers.base import Columns, Optimiser, first_plan, paid, require_compiler
 from fpirhc.optimisers.plain import CLOSE, PlainSettings, plain_memory, plain_step, shifted_plain
 from fpirhc.optimisers.state_limits import MU_WARM, LimitedSettings, limited_memory, limited_step, shifted_limited
 from fpirhc.status import Status
@@ -113,12 +113,14 @@ class FixedPoint(Optimiser):
     def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
         return _of_two_starts(ocp, one, self.memory(ocp)) if self.second_start else one
 
-    def rescue(self, ocp: OptimalControl) -> ca.Function | None:
+    def rescued(self, ocp: OptimalControl, call: Columns, results: Columns) -> Columns:
+        state, data, lower, upper, _ = call
+        posed = np.isfinite(state).all() and np.isfinite(data).all() and (lower <= upper).all()
         with contextlib.suppress(NotInstalled, CompileError):
-            if not ocp.bounds_states:
+            if posed and not ocp.bounds_states:
                 limited = limited_step(ocp, self._limited(ocp, _MOST_LIMITED))
-                return _rescue(ocp, self.converging(ocp), self.memory(ocp), limited)
-        return None
+                return _better(ocp, self.memory(ocp), limited, call, results)
+        return results
 
     def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
         memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]
@@ -150,55 +152,31 @@ EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, 
 CHOICES = {"fixed-point": ("FPI", lambda tolerance: FixedPoint(iterations=1, tolerance=tolerance))}
 
 
-def _rescue(ocp: OptimalControl, plain: ca.Function, layout: Layout, limited: ca.Function) -> ca.Function:
-    """Function (arguments of `plain`, its results) -> the better results of `plain` and `limited`, with the memory of `plain`.
+def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Columns, first: Columns) -> Columns:
+    """The better results of a call of the plain iteration and of the one with limits, in the memory of the plain one.
 
-    Where the plain iteration gives up, its plan is the first guess of the iteration with limits if a plan was remembered.
-    Otherwise that iteration begins from its own first guess.
+    Where a plan was remembered, that of the plain iteration is the first guess of the other one, which else has its own.
     """
-    arguments = [ca.MX.sym(plain.name_in(k), *plain.size_in(k)) for k in range(plain.n_in())]
-    results = [ca.MX.sym(f"r{k}", *plain.size_out(k)) for k in range(3)]
-    work = ca.Function("fpirhc_rescue", [*arguments, *results], _better(ocp, layout, limited, arguments, results))
-    rest = ca.Function("fpirhc_no_rescue", [*arguments, *results], results)
-    needed = ca.logic_and(results[1][4] != int(Status.OK), sane(*arguments[:4]))
-    choice = ca.Function.if_else("fpirhc_rescue_if_needed", work, rest)
-    return ca.Function("fpirhc_rescued", [*arguments, *results], list(choice(needed, *arguments, *results)))
-
-
-def _better(
-    ocp: OptimalControl, layout: Layout, limited: ca.Function, arguments: list[ca.MX], first: list[ca.MX]
-) -> list[ca.MX]:
-    """The results of both, the better one of them, in the plain iteration's memory."""
-    n, ns = ocp.stages, ocp.state.size
-    before, plan, plain_memory = layout.split(arguments[4]), limited_memory(ocp), layout.split(first[2])
-    evaluated = first[1][4] < int(Status.INFEASIBLE)
-    warm = ca.logic_and(before["plan_step"] > 0, evaluated)
-    begin = {name: ca.MX.zeros(plan[name].size) for name in plan.names}
-    begin["plan_inputs"] = ca.if_else(warm, plain_memory["plan_inputs"], before["plan_inputs"])
-    states = ca.vec(stage_later(ca.reshape(plain_memory["plan_states"], ns, n)))
-    begin |= {"plan_states": ca.if_else(warm, states, 0), "plan_gains": ca.if_else(warm, plain_memory["plan_gains"], 0)}
-    begin["plan_barrier"] = ca.if_else(warm, MU_WARM, 0)
-    second = limited(*arguments[:4], plan.join(begin))
-    inputs, diagnostics, after = second
-    interior_memory = plan.split(after)
-
-    nodes = ca.reshape(interior_memory["plan_states"], ns, n)
-    earlier = ca.horzcat(arguments[0], nodes[:, : n - 1])
-    memory: dict[str, ca.MX] = {
-        "plan_inputs": ca.vec(inputs),
-        "plan_states": ca.vec(earlier),
-        "plan_gains": interior_memory["plan_gains"],
-        "plan_gamma": ca.MX(0),
-        "plan_step": ca.MX(1),
-    }
-    usable = diagnostics[4] < int(Status.INFEASIBLE)
-    closer = ca.logic_or(
-        diagnostics[4] == int(Status.OK), ca.logic_or(ca.logic_not(evaluated), diagnostics[1] < first[1][1])
-    )
-    better = ca.logic_and(usable, closer)
-    count = ca.vertcat(ca.MX.zeros(3), first[1][3], 0)
-    results = [inputs, diagnostics + count, layout.join(memory)]
-    return [ca.if_else(better, new, old) for new, old in zip(results, first, strict=True)]
+    before, after, own, ns = call[4], first[2].ravel(), limited_memory(ocp), ocp.state.size
+    evaluated, begin = first[1][4, 0] < Status.INFEASIBLE, own.start()
+    warm = evaluated and before[layout.slice("plan_step")][0] > 0
+    begin[own.slice("plan_inputs")] = (after if warm else before)[layout.slice("plan_inputs")]
+    if warm:
+        states = after[layout.slice("plan_states")]
+        begin[own.slice("plan_states")] = np.append(states[ns:], states[-ns:])
+        begin[own.slice("plan_gains")] = after[layout.slice("plan_gains")]
+        begin[own.slice("plan_barrier")] = MU_WARM
+    inputs, numbers, remembered = (np.asarray(v.full()) for v in limited(*call[:4], begin))
+    closer = numbers[4, 0] == Status.OK or not evaluated or numbers[1, 0] < first[1][1, 0]
+    if numbers[4, 0] >= Status.INFEASIBLE or not closer:
+        return first
+    numbers[3, 0] += first[1][3, 0]
+    memory = layout.start()
+    memory[layout.slice("plan_inputs")] = inputs.ravel(order="F")
+    memory[layout.slice("plan_states")] = np.append(call[0], remembered[own.slice("plan_states"), 0][:-ns])
+    memory[layout.slice("plan_gains")] = remembered[own.slice("plan_gains"), 0]
+    memory[layout.slice("plan_step")] = 1
+    return inputs, numbers, memory
 
 
 def _of_two_starts(ocp: OptimalControl, one: ca.Function, memory: Layout) -> ca.Function:

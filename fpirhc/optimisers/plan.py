@@ -37,7 +37,6 @@ class Plan:
         status: of the plan.
         problem: the problem that was solved.
         data: its data, shape (ntheta, N + 1).
-        bounds: lower and upper limits of the inputs, shape (nu,) each.
     """
 
     inputs: np.ndarray
@@ -50,7 +49,6 @@ class Plan:
     status: Status
     problem: OptimalControl
     data: np.ndarray
-    bounds: tuple[np.ndarray, np.ndarray]
 
     def __repr__(self) -> str:
         return line(self, self.status.name, *(f"{name} {value}" for name, value in self._facts()))
@@ -59,6 +57,11 @@ class Plan:
         """The numbers of the plan and its faults as a table, for notebooks."""
         notes = [self.status.remedy, *self.violations(), self.overflow()]
         return table(f"Plan: {self.status.name}", ("", "value"), self._facts(), notes)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limits of the inputs, shape (nu,) each."""
+        return self.problem.input_lower, self.problem.input_upper
 
     def _facts(self) -> list[tuple[str, str]]:
         """The numbers that sum up the plan, by name."""
@@ -74,7 +77,7 @@ class Plan:
     @cached_property
     def state_multipliers(self) -> np.ndarray:
         """Multipliers of the state bounds, shape (ns, N), fitted to the plan alone, without its optimiser."""
-        return _fit_multipliers(self.problem, self.inputs, self.states[:, 0], self.data, self.bounds)
+        return _fit_multipliers(self.problem, self.inputs, self.states[:, 0], self.data)
 
     def violations(self) -> tuple[str, ...]:
         """Return the five worst violations of state bounds in words, the first state first; empty when there are none."""
@@ -188,7 +191,6 @@ def solve(
         status,
         ocp,
         np.asarray(ca.DM(data).full()),
-        (ocp.input_lower, ocp.input_upper),
     )
 
 
@@ -217,9 +219,7 @@ def _shown(value: float | None, text: Callable[[float], str]) -> str:
     return "none" if value is None else text(value)
 
 
-def _fit_multipliers(
-    ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray, data: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
+def _fit_multipliers(ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray, data: np.ndarray) -> np.ndarray:
     """The multipliers M (ns, N) of state bounds, each with the sign of its bound; zero where no state is at a bound.
 
     At a solution g + (dS/dU)' M = 0 in every input that is not at its own bound: a non-negative least-squares problem.
@@ -231,7 +231,7 @@ def _fit_multipliers(
     flat = states[:, 1:].ravel(order="F")
     upper = flat >= np.tile(ocp.state_upper - feasible_to(ocp), ocp.stages)
     lower = flat <= np.tile(ocp.state_lower + feasible_to(ocp), ocp.stages)
-    free = ~_at_bound(inputs, bounds).ravel(order="F")
+    free = ~_at_bound(inputs, (ocp.input_lower, ocp.input_upper)).ravel(order="F")
     if not (upper.any() or lower.any()) or not free.any() or not np.isfinite(sensitivity).all():
         return none
     # Rows in the units of the stationarity, so that the fit weighs what is judged.
