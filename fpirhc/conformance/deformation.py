@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fpirhc.conformance.laws import frozen_value, hold, keep
 from fpirhc.contraction.delayed import delayed, radius
-from fpirhc.deformation.base import Deformation, RequestChange, automatic, innermost, with_inner
+from fpirhc.deformation.base import Deformation, RequestChange, automatic, innermost, scaled_for, with_inner
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -56,7 +56,7 @@ def check_deformation(
     """
     laws = ANY if deformation.form.pairs else STEPS
     keep(deformation, _Map(deformation, deformation, tuple(elements), amplitude), laws, seed)
-    settled = deformation.with_scale_for(RequestChange(amplitude, sudden=True))
+    settled = scaled_for(deformation, RequestChange(amplitude, sudden=True))
     keep(deformation, _Map(deformation, settled, ("q",), amplitude), FACTS, seed)
 
 
@@ -301,14 +301,14 @@ def shown_is_remembered(trial: _Map, generator: np.random.Generator) -> None:  #
 
 
 def automatic_settings_are_chosen(trial: _Map, generator: np.random.Generator) -> None:
-    """`with_scale_for` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
+    """`scaled_for` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
     given = not automatic(trial.deformation)
     for sudden in (False, True):
         change = float(generator.uniform(2.0, 20.0))
-        ready = trial.deformation.with_scale_for(RequestChange(change, sudden))
-        hold(not automatic(ready), f"with_scale_for() leaves {automatic(ready)} open")
+        ready = scaled_for(trial.deformation, RequestChange(change, sudden))
+        hold(not automatic(ready), f"the scale for a change leaves {automatic(ready)} open")
         same, step = describe(ready) == describe(trial.deformation), ready.largest_step()
-        hold(same or not given, f"no setting is automatic, but with_scale_for() gives {ready}")
+        hold(same or not given, f"no setting is automatic, but the scale for a change gives {ready}")
         covers = given or step >= 0.99 * change
         hold(covers, f"with the scale for changes of {change:.3g} its largest step is {step:.3g}")
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar, cast
 import numpy as np
 
 from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
-from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
+from fpirhc.deformation.base import Deformation, Identity, automatic, scaled_for, with_inner
 from fpirhc.errors import refuse, require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
@@ -198,7 +198,7 @@ class Controller(Checked, ABC):
         if automatic(deformation):
             plans = self.planner is not None
             request = request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(self))
-            deformation = deformation.with_scale_for(request)
+            deformation = scaled_for(deformation, request)
         return self if deformation is own else self.with_deformation(deformation)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -126,10 +126,6 @@ class Deformation(Checked, ABC):
         """With what it compares a response; by default with the last request, around a map as that does."""
         return Form() if self.inner is None else self.inner.form
 
-    def with_scale_for(self, request: RequestChange) -> Self:
-        """Return the map with its automatic settings chosen for how much the desired response changes."""
-        return self if self.inner is None else with_inner(self, self.inner.with_scale_for(request))
-
     def memory(self, elements: tuple[str, ...]) -> Layout:
         """What the map remembers besides the pair (request, desired); by default nothing."""
         del elements
@@ -184,11 +180,27 @@ def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
 
 
 def automatic(deformation: Deformation) -> tuple[str, ...]:
-    """Names of settings that `with_scale_for` still has to choose: None, with the metadata {"automatic": True}."""
+    """Names of scales that are still to be chosen, by `scaled_for`: None, with the metadata {"automatic": True}."""
     own = innermost(deformation)
     if not is_dataclass(own):
         return ()
     return tuple(f.name for f in fields(own) if f.metadata.get("automatic") and getattr(own, f.name) is None)
+
+
+def scaled_for(deformation: Deformation, request: RequestChange) -> Deformation:
+    """Return the map whose open scale is at least 1 and fits how much the desired response changes; a given one stays.
+
+    The largest step covers a sudden change. For a change that goes on from cycle to cycle the scale is twice the change. In both
+    cases the largest step covers the recovery.
+    """
+    if deformation.inner is not None:
+        return with_inner(deformation, scaled_for(deformation.inner, request))
+    for name in automatic(deformation):
+        step = replace(cast("Any", deformation), **{name: 1.0}).largest_step()
+        scale = request.change / step if request.sudden else 2 * request.change
+        chosen = float(f"{max(1.0, scale, request.recovery / step):.3g}")
+        deformation = replace(cast("Any", deformation), **{name: chosen})
+    return deformation
 
 
 def innermost(deformation: Deformation) -> Deformation:
@@ -225,10 +237,6 @@ def smooth_norm(column: Expression, floor: float) -> Expression:
 def of_last_pair(deformation: Deformation) -> bool:
     """Whether a request follows from the last request and its response alone: no model, pairing or memory of its own."""
     return not (deformation.form.pairs or deformation.memory(("q",)).size)
-
-
-_FORGETTING = 0.1  # share of the newest sign
-_RETURNED = 0.3  # relative distance below which an error counts as equal to the error of two cycles before
 
 
 @dataclass(frozen=True)
@@ -300,33 +308,6 @@ def memory_of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int)
     """Return the part of a wrapper's memory that belongs to the map; `size` is the number of coordinates."""
     own = wrapper.map.memory(tuple(f"q{k}" for k in range(size)))
     return {name: memory[name] for name in own.names}
-
-
-def forget(before: Expression, sign: Expression) -> Expression:
-    """Return (1 - eta) before + eta sign, and zero where this is not a number."""
-    mean = (1 - _FORGETTING) * before + _FORGETTING * sign
-    return ca.if_else(ca.fabs(mean) <= 1, mean, 0)
-
-
-def growing_in_a_row(
-    count: Expression, error: Expression, before: Expression, slow: float = 1.0, fast: float | Expression = 1.0
-) -> Expression:
-    """Return how many errors in a row alternated in sign and grew; zero when the newest did not.
-
-    An error that grew by less than the factor `fast` counts `slow`.
-    """
-    size, earlier = ca.sumsqr(error), ca.sumsqr(before)
-    weight = ca.if_else(size > fast**2 * earlier, 1, slow)
-    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, size > earlier), count + weight, 0)
-
-
-def returning_in_a_row(count: Expression, error: Expression, before: Expression, earlier: Expression) -> Expression:
-    """Return how many errors in a row alternated in sign and were equal to the error of two cycles before: a two-cycle.
-
-    Saturated two-cycles neither grow nor die out. Errors of white noise are not equal in this way eight times in a row.
-    """
-    back = ca.sumsqr(error - earlier) < _RETURNED**2 * ca.sumsqr(error)
-    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, back), count + 1, 0)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
+from fpirhc.symbolic.layout import Expression
+from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
@@ -25,6 +27,11 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
         return pole
     error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
     return default_pole(ca.fmin(ca.fmax(abs(gain), 1.0), _LARGEST_PRODUCT), error)
+
+
+def leaked(pole: float, before: Expression, deformation: Expression) -> Expression:
+    """Return p delta_{k-1} + (1 - p) delta; delta itself without a leak."""
+    return deformation if stays(pole, 0.0) else pole * before + (1 - pole) * deformation
 
 
 def default_uncertainty(cycles: float) -> float:

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
-from fpirhc.deformation.leaky import check_cycles, check_uncertainty, check_whole, chosen_pole
+from fpirhc.deformation.leaky import check_cycles, check_uncertainty, check_whole, chosen_pole, leaked
 from fpirhc.errors import NotSupported
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import Cycles, Queue
 
 
@@ -59,11 +58,6 @@ class ModelReferenced(Wrapper):
         inner, late = self.map.form, self.measurement
         return replace(inner, compares="model", cycles=self._cycles, measurement=late, lag=self._lag)
 
-    @property
-    def _leak(self) -> float:
-        """The pole p in use."""
-        return chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
-
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         return Layout((Signal("own_deformation", past),)) + self.map.memory(elements)
@@ -72,12 +66,11 @@ class ModelReferenced(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         size, queue, past = request.numel(), self._queue, memory["own_deformation"]
-        before, pole = past[:size], self._leak
+        before = past[:size]
+        pole = chosen_pole(self.map.effective_gain(), self._delays, self.uncertainty, self.pole)
         undeformed = request - queue.delayed(past, size)
         next_request, next_memory = self.map.step(request, response, undeformed, memory_of_map(self, memory, size))
-        deformation = next_request - undeformed
-        if not stays(pole, 0.0):
-            deformation = pole * before + (1 - pole) * deformation
+        deformation = leaked(pole, before, next_request - undeformed)
         # A deformation that is not a number must not be remembered.
         remembered = ca.if_else(is_finite(deformation), deformation, before)
         return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **next_memory}

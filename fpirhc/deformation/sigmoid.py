@@ -16,7 +16,7 @@ from typing import Annotated, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, RequestChange, smooth_norm
+from fpirhc.deformation.base import Deformation, smooth_norm
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import NotZero, Positive, Range
 from fpirhc.symbolic.layout import Expression
@@ -55,18 +55,6 @@ class Sigmoid(Deformation):
     def with_scale(self, scale: float) -> Self:
         """Return the same map with scale S."""
         return replace(self, scale=scale)
-
-    def with_scale_for(self, request: RequestChange) -> Self:
-        """Return the map with a scale S of at least 1 for the change of the request; a scale that the user has set stays.
-
-        The largest step covers a sudden change. For a change that goes on from cycle to cycle S is twice the change. In both cases
-        the largest step covers the recovery.
-        """
-        if self.scale is not None:
-            return self
-        step = self.with_scale(1.0).largest_step()
-        scale = request.change / step if request.sudden else 2 * request.change
-        return self.with_scale(float(f"{max(1.0, scale, request.recovery / step):.3g}"))
 
     @cached_property
     def _tanh_fixed_point(self) -> float:

@@ -157,7 +157,6 @@ class Queue:
     """
 
     cycles: Cycles  # delay of all entries, or a tuple with one per entry
-    width: int = 0  # of the triangular mean around the delay, cycles to either side
 
     @property
     def length(self) -> int:
@@ -167,7 +166,7 @@ class Queue:
     def later(self, cycles: int) -> Queue:
         """Return the queue with every delay longer by whole cycles."""
         delays = tuple(c + cycles for c in self.cycles) if isinstance(self.cycles, tuple) else self.cycles + cycles
-        return Queue(delays, self.width)
+        return Queue(delays)
 
     def pushed(self, queue: Expression, newest: Expression) -> Expression:
         """Return the column one cycle later."""
@@ -225,21 +224,12 @@ class Queue:
         repeated = (ca.repmat(v, 1, longest) for v in held)
         return step.mapaccum("fpirhc_driven", longest)(state, columns, *repeated)[:, -1]
 
-    def _height(self, j: int) -> float:
-        """Of the triangle, `j` cycles from its middle."""
-        return (1 - abs(j) / (self.width + 1)) / (self.width + 1)
-
-    def _shares(self, cycles: float) -> dict[int, float]:
-        """Weights of what was pushed k cycles ago: a triangle over `width` cycles on both sides of `cycles`, interpolated."""
-        shares: dict[int, float] = {}
+    @staticmethod
+    def _shares(cycles: float) -> dict[int, float]:
+        """Weights of what was pushed k cycles ago."""
         whole = math.floor(cycles + WHOLE)
         part = max(cycles - whole, 0.0) if whole < math.ceil(cycles - WHOLE) else 0.0
-        for j in range(-self.width, self.width + 1):
-            height = self._height(j)
-            for place, share in ((whole + j, height * (1 - part)), (whole + j + 1, height * part)):
-                if share > 0:
-                    shares[place] = shares.get(place, 0.0) + share
-        return shares
+        return {place: share for place, share in ((whole, 1 - part), (whole + 1, part)) if share > 0}
 
 
 def whole(cycles: float) -> int:

@@ -75,7 +75,6 @@ MAP_MEMBERS = {
     "secant_gain": "secant is bounded",
     "shown": "shown is remembered",
     "step": "fixed point stays",
-    "with_scale_for": "automatic settings are chosen",
     "with_effective_gain": "gain can be set",
 }
 LOUD = "wrong start is corrected", "does not converge"  # a gain with which every correction is worse than the error

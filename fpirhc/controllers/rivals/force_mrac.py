@@ -14,7 +14,7 @@ from fpirhc.controllers.base import Controller, law_blocks, like
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
-from fpirhc.deformation.base import Deformation, automatic
+from fpirhc.deformation.base import Deformation, automatic, scaled_for
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import Finite
 from fpirhc.members import Example
@@ -45,7 +45,7 @@ class ForceMRAC(Controller):
         if not automatic(self.deformation):
             return self
         request = request_of_commands(problem, self.plant_model(problem).parameters(problem.plant))
-        return replace(self, deformation=self.deformation.with_scale_for(request))
+        return replace(self, deformation=scaled_for(self.deformation, request))
 
     def plant_model(self, problem: Problem) -> PlantModel:
         return PlantModel(problem.plant, problem.signals, given=self.model)

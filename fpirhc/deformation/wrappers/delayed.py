@@ -9,26 +9,16 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
-from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole
-from fpirhc.errors import InvalidValue
+from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole, leaked
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
-from fpirhc.symbolic.open import stays
-from fpirhc.task.dead_time import MOST, Cycles, Queue, every
+from fpirhc.task.dead_time import MOST, Cycles, Queue
 
 __all__ = ["MOST", "Increment", "Paired"]
-
-
-class _Past(NamedTuple):
-    """The queues of requests and of desired responses, newest first."""
-
-    requests: Expression
-    desired: Expression
 
 
 @dataclass(frozen=True)
@@ -45,14 +35,17 @@ class _Queued(Wrapper):
 
     cycles: Cycles = field(metadata={"structure": True})
 
+    def __post_init__(self) -> None:
+        check_cycles(type(self).__name__, self.cycles)
+
     @property
     def form(self) -> Form:
         return replace(self.map.form, cycles=self.cycles)
 
     @property
-    @abstractmethod
     def _queue(self) -> Queue:
         """The delays of the pairs."""
+        return Queue(self.cycles)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
@@ -63,28 +56,31 @@ class _Queued(Wrapper):
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
         inner, queue = memory_of_map(self, memory, request.numel()), self._queue
-        first = memory["queue_filled"] < 0.5
         # The first request of a run is the desired response itself.
-        desired_then = ca.if_else(first, request, memory["queue_now"])
-        past_requests = queue.pushed(memory["queue_requests"], request)
-        past_desired = queue.pushed(memory["queue_desired"], desired_then)
+        desired_then = ca.if_else(memory["queue_filled"] < 0.5, request, memory["queue_now"])
+        requests = queue.pushed(memory["queue_requests"], request)
+        undeformed = queue.pushed(memory["queue_desired"], desired_then)
         valid = memory["queue_filled"] >= queue.length - 1
-        next_request, next_memory = self._request(_Past(past_requests, past_desired), response, desired, inner)
+        next_request, next_memory = self._request(requests, undeformed, response, desired, inner)
         remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
-        filled = ca.fmin(memory["queue_filled"] + 1, queue.length)
         queues = {
-            "queue_requests": past_requests,
-            "queue_desired": past_desired,
+            "queue_requests": requests,
+            "queue_desired": undeformed,
             "queue_now": desired,
-            "queue_filled": filled,
+            "queue_filled": ca.fmin(memory["queue_filled"] + 1, queue.length),
         }
         return ca.if_else(valid, next_request, desired), {**queues, **remembered}
 
     @abstractmethod
     def _request(
-        self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+        self,
+        requests: Expression,
+        undeformed: Expression,
+        response: Expression,
+        desired: Expression,
+        memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        """The next request, from the queues and from the response and desired response of this cycle."""
+        """The next request, from the queues of requests and of desired responses, newest first, and from those of this cycle."""
 
 
 @dataclass(frozen=True)
@@ -94,31 +90,21 @@ class Paired(_Queued):
     Args:
         map: any deformation that iterates.
         cycles: dead time d, or one for every controlled coordinate.
-        uncertainty: half width of the triangular mean over the requests around the pair, whole cycles, at most d.
 
     Raises:
-        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
+        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles.
     """
 
-    uncertainty: int = 0
-
-    def __post_init__(self) -> None:
-        check_cycles("Paired", self.cycles)
-        check_uncertainty("Paired", self.uncertainty, self.cycles)
-        if self.uncertainty > min(every(self.cycles)):
-            raise InvalidValue(
-                f"Paired(uncertainty={self.uncertainty!r}): the mean would reach beyond the newest request; expected whole cycles "
-                f"from 0 to the dead time of {min(every(self.cycles)):g}"
-            )
-
-    @property
-    def _queue(self) -> Queue:
-        return Queue(self.cycles, self.uncertainty)
-
     def _request(
-        self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+        self,
+        requests: Expression,
+        undeformed: Expression,
+        response: Expression,
+        desired: Expression,
+        memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        return self.map.step(self._queue.delayed(past.requests, desired.numel()), response, desired, memory)
+        del undeformed
+        return self.map.step(self._queue.delayed(requests, desired.numel()), response, desired, memory)
 
 
 @dataclass(frozen=True)
@@ -141,7 +127,7 @@ class Increment(_Queued):
     pole: BelowOne | None = None
 
     def __post_init__(self) -> None:
-        check_cycles("Increment", self.cycles)
+        super().__post_init__()
         if self.uncertainty is not None:
             check_uncertainty("Increment", self.uncertainty, self.cycles)
 
@@ -163,25 +149,19 @@ class Increment(_Queued):
     def form(self) -> Form:
         return replace(super().form, compares="increment")
 
-    @property
-    def _leak(self) -> float:
-        """The pole p in use."""
-        return chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)
-
-    @property
-    def _queue(self) -> Queue:
-        return Queue(self.cycles)
-
     def _request(
-        self, past: _Past, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+        self,
+        requests: Expression,
+        undeformed: Expression,
+        response: Expression,
+        desired: Expression,
+        memory: Mapping[str, Expression],
     ) -> tuple[Expression, dict[str, Expression]]:
-        size, pole = desired.numel(), self._leak
-        undeformed, request = self._queue.delayed(past.desired, size), self._queue.delayed(past.requests, size)
-        next_request, next_memory = self.map.step(request, response, undeformed, memory)
-        deformation = next_request - undeformed
-        if not stays(pole, 0.0):
-            deformation = pole * (past.requests[:size] - past.desired[:size]) + (1 - pole) * deformation
-        return desired + deformation, next_memory
+        size = desired.numel()
+        then, request = self._queue.delayed(undeformed, size), self._queue.delayed(requests, size)
+        next_request, next_memory = self.map.step(request, response, then, memory)
+        pole = chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)
+        return desired + leaked(pole, requests[:size] - undeformed[:size], next_request - then), next_memory
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:

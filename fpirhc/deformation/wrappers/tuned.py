@@ -12,7 +12,7 @@ from typing import Annotated, Self
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Form, Wrapper, growing_in_a_row, memory_of_map, returning_in_a_row
+from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.expression import power
@@ -22,6 +22,7 @@ _RATE = 0.02  # gamma
 _GROWING, _RETURNING = 5, 8  # in a row
 _FAST, _SLOW = 1.5, 1 / 3  # an error that grew by less than the one counts the other
 _RECOVERY = 1.0  # target below the map's own gain: the product of a deadbeat iteration
+_RETURNED = 0.3  # relative distance below which an error counts as equal to the error of two cycles before
 _SMALLEST = 1e-3  # smallest factor that oscillation may lead to
 
 
@@ -74,8 +75,8 @@ class Tuned(Wrapper):
         next_request, of_inner = self.map.step(request, response, desired, inner)
         factor, error, before = memory["tuner_factor"], response - desired, memory["tuner_error"]
         fast = ca.if_else(factor < 1, 1, _FAST)
-        growing = growing_in_a_row(memory["tuner_growing"], error, before, _SLOW, fast)
-        returning = returning_in_a_row(memory["tuner_returning"], error, before, memory["tuner_earlier"])
+        growing = _growing_in_a_row(memory["tuner_growing"], error, before, _SLOW, fast)
+        returning = _returning_in_a_row(memory["tuner_returning"], error, before, memory["tuner_earlier"])
         oscillates = ca.logic_or(growing > _GROWING - _SLOW / 2, returning > _RETURNING - 0.5)
         own = {
             "tuner_factor": ca.if_else(
@@ -112,6 +113,27 @@ class Tuned(Wrapper):
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
     """Values for the laws, around any map."""
     return (Tuned(inner, largest_gain=1.2 * inner.effective_gain()),)
+
+
+def _growing_in_a_row(
+    count: Expression, error: Expression, before: Expression, slow: float = 1.0, fast: float | Expression = 1.0
+) -> Expression:
+    """How many errors in a row alternated in sign and grew; zero when the newest did not.
+
+    An error that grew by less than the factor `fast` counts `slow`.
+    """
+    size, earlier = ca.sumsqr(error), ca.sumsqr(before)
+    weight = ca.if_else(size > fast**2 * earlier, 1, slow)
+    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, size > earlier), count + weight, 0)
+
+
+def _returning_in_a_row(count: Expression, error: Expression, before: Expression, earlier: Expression) -> Expression:
+    """How many errors in a row alternated in sign and were equal to the error of two cycles before: a two-cycle.
+
+    Saturated two-cycles neither grow nor die out. Errors of white noise are not equal in this way eight times in a row.
+    """
+    back = ca.sumsqr(error - earlier) < _RETURNED**2 * ca.sumsqr(error)
+    return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, back), count + 1, 0)
 
 
 def _mean_sign(product: float, components: int) -> float:
