@@ -75,11 +75,11 @@ class Built:
         """Return the reference's own signals inside a step."""
         return [getattr(s, signal.name) for signal in self.own]
 
-    def inner(self, controller: Controller | None = None) -> Built:
-        """Return what the wrapped controller is built from; `controller`: in its place."""
-        wrapped = controller or self.controller.inner
+    def inner(self, wrapper: Controller, controller: Controller | None = None) -> Built:
+        """Return what the controller inside a wrapper is built from; `controller`: in its place."""
+        wrapped = controller or wrapper.inner
         assert wrapped is not None
-        return build(self.controller.inner_problem(self.problem), wrapped, opened=self.opened)
+        return build(wrapper.inner_problem(self.problem), wrapped, opened=self.opened)
 
     def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""

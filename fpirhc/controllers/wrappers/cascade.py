@@ -233,7 +233,7 @@ class Cascade(Controller):
             self.paired.queue(problem)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        inner = compose_controller(built.inner())
+        inner = compose_controller(built.inner(self))
         last = [Delay(like(built.plant.input, last), source) for last, source in _COMMANDS.items()]
         blocks = [reference_block(built), self._shift_block(built), under_names(embedded("inner", inner, {}), _RENAMED)]
         return blocks, [Delay(scalar("clipped_last"), "clipped"), *last]

@@ -107,7 +107,7 @@ class Estimating(ControllerWrapper):
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         follows = self.at_once and hasattr(innermost(self.controller), "follows_model")
         controller = with_field(self.controller, "follows_model", True) if follows else self.controller
-        within = built.inner(controller)
+        within = built.inner(self, controller)
         inner, modelled = compose_controller(within), within.problem
         require(
             "parameters" in dependencies_of_command(inner),

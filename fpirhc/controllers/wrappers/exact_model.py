@@ -36,7 +36,7 @@ class ExactModel(ControllerWrapper):
         return PlantModel(plant, really_known(problem.signals), exact=True)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        return self.controller.blocks(built.inner())
+        return self.controller.blocks(built.inner(self))
 
 
 _EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once

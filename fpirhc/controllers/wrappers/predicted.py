@@ -184,8 +184,8 @@ class Predicted(ControllerWrapper):
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant
         if not self._cycles(built.period):
-            return self.controller.blocks(built.inner())
-        inner = compose_controller(built.inner(), ahead=True)
+            return self.controller.blocks(built.inner(self))
+        inner = compose_controller(built.inner(self), ahead=True)
         ahead = {"time": like(time_signal(plant), "time_ahead"), "state": like(plant.state, "state_ahead")}
         ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
