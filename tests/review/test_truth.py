@@ -20,6 +20,7 @@ from helpers.reviewed import ball, biased, levitation, plans, turntable
 import fpirhc as fp
 
 UNWRAP = "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error."
+Pick = Callable[[], tuple[fp.Problem, dict[str, Any]]]
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
 
 
@@ -27,27 +28,23 @@ MORE = "Give the optimiser more iterations, or a smaller tolerance, before anyth
 class Case:
     """Who is asked, and what is said."""
 
-    task: Callable[[], tuple[fp.Problem, dict[str, Any]]]
+    task: Pick
     verdicts: dict[tuple[str, str], str] = field(default_factory=dict)  # by whom it is about, and the key
     numbers: dict[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)  # value, its tolerance
     never: tuple[str, ...] = ()  # about whom there is no no
     changes: dict[tuple[str, str], str] = field(default_factory=dict)
 
 
-def shipped(name: str, *controllers: str) -> Callable[[], tuple[fp.Problem, dict[str, Any]]]:
+def shipped(name: str, *controllers: str, of: Callable[[str], Any] = fp.load_problem) -> Pick:
     def made() -> tuple[fp.Problem, dict[str, Any]]:
-        task = fp.load_problem(name)
+        task = of(name)
         return task.problem, {n: task.controllers[n] for n in controllers}
 
     return made
 
 
-def foreign(name: str, *controllers: str, variant: str = "problem") -> Callable[[], tuple[fp.Problem, dict[str, Any]]]:
-    def made() -> tuple[fp.Problem, dict[str, Any]]:
-        task = load(name, variant)
-        return task.problem, {n: task.controllers[n] for n in controllers}
-
-    return made
+def foreign(name: str, *controllers: str, variant: str = "problem") -> Pick:
+    return shipped(name, *controllers, of=lambda n: load(n, variant))
 
 
 SERVO = -1.0, -1.97, -2.12
@@ -135,12 +132,8 @@ CASES: dict[str, Case] = {
         {(PAIRED, "gain"): "no", (PAIRED, "pays"): "no"},
         changes={(PAIRED, "follows"): "Set the gain to -1."},
     ),
-    "a sensor of the response with a bias": Case(
-        lambda: (biased(1.0), plans()), {("RHC+FPI", "bias"): "no", ("RHC+FPI", "pays"): "no"}
-    ),
-    "the same with a right sensor": Case(
-        lambda: (biased(0.0), plans()), {("RHC+FPI", "pays"): "yes"}, never=("RHC+FPI",)
-    ),
+    "a biased sensor": Case(lambda: (biased(1.0), plans()), {("RHC+FPI", "bias"): "no", ("RHC+FPI", "pays"): "no"}),
+    "the right sensor": Case(lambda: (biased(0.0), plans()), {("RHC+FPI", "pays"): "yes"}, never=("RHC+FPI",)),
     "upper tanks that move by themselves": Case(
         foreign("quadruple_tank", "RHC", "CTC+FPI"),
         {("CTC+FPI", "inner"): "yes"},
@@ -179,6 +172,9 @@ CASES: dict[str, Case] = {
         },
         {("RHC+FPI, increment", "latency", "cycles_borne"): (0, 0)},
     ),
+    "a person who eats within the model's step": Case(
+        shipped("problems/gallery/diabetes.py", "RHC+FPI on the target"), {("RHC+FPI on the target", "follows"): "yes"}
+    ),
     "slots": Case(
         shipped("crane_slots", "slots+FPI"),
         {("slots+FPI", "follows"): "yes", ("slots+FPI", "pays"): "yes"},
@@ -201,7 +197,7 @@ def said(name: str) -> dict[tuple[str, str], Any]:
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
-LONG = ("two pend", "a servo", "an own", "an inverse", "a limit of", "an unst", "a dead time")  # 4 s and more
+LONG = ("two pend", "a servo", "an own", "an inverse", "a limit of", "an unst", "a dead time", "a person")  # 4 s and more
 
 
 @pytest.mark.parametrize("name", slow_but(CASES, *(n for n in CASES if not n.startswith(LONG))))
@@ -250,7 +246,7 @@ def test_more_iterations_hold_the_ball():
 
 
 def test_the_harm_of_a_bias_is_that_of_runs():
-    found = said("a sensor of the response with a bias")["RHC+FPI", "pays"]
+    found = said("a biased sensor")["RHC+FPI", "pays"]
     pair = [rms(biased(1.0), one) for one in plans().values()]
     assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=0.02)
     assert pair[1] > 1.2 * pair[0]
