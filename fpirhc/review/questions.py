@@ -18,6 +18,7 @@ import numpy as np
 
 from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
+from fpirhc.deformation.wrappers.filtered import with_filter
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import zero_dynamics
 from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked, predictor
@@ -339,6 +340,7 @@ SAID = {TODAY: "error", TURNED: "error_turned", SMALLER[0]: "error_at_half", LAR
 def _tries(case: Case) -> dict[tuple[float, float], Try]:
     """Runs with other gains and filters: calm is what moves no command by more than is allowed or than today; good what helps."""
     own, tries, busy = case.bench, dict[tuple[float, float], Try](), _busy(case)
+    slow = lambda pole: own.controller.with_deformation(with_filter(own.controller.deformation, pole))  # noqa: E731
     alone = case.plain.share(case.plain.counted)
     useful, most, now = min(1.0, WORSE * alone + SLIGHT), _allowed(case), own.moved
     most = most if busy else np.maximum(most, now)
@@ -346,7 +348,7 @@ def _tries(case: Case) -> dict[tuple[float, float], Try]:
     def tried(way: tuple[float, float]) -> bool:
         tries[way] = Try(math.inf, np.full(most.shape, math.inf), False, False)
         with suppress(FpirhcError):  # refused by a schedule of slots
-            bench = own if way == TODAY else case.filtered(way[1]) if way[1] else own.at_gain(way[0])
+            bench = own if way == TODAY else case.other(slow(way[1]), short=True) if way[1] else own.at_gain(way[0])
             error, moves = bench.share(bench.counted), bench.moves(bench.start)
             if way == TODAY:
                 error, moves = max(map(own.share, own.draws)), now
