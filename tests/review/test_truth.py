@@ -197,7 +197,7 @@ def said(name: str) -> dict[tuple[str, str], Any]:
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
-LONG = ("two pend", "a servo", "an own", "an inverse", "a limit of", "an unst", "a dead time", "a person")  # 4 s and more
+LONG = "two pend", "a servo", "an own", "an inverse", "a limit of", "an unst", "a dead time", "a person"  # 4 s and more
 
 
 @pytest.mark.parametrize("name", slow_but(CASES, *(n for n in CASES if not n.startswith(LONG))))
