@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fpirhc.conformance.laws import frozen_value, hold, keep
 from fpirhc.contraction.delayed import delayed, radius
-from fpirhc.deformation.base import Deformation, RequestChange, automatic, innermost, scaled_for, with_inner
+from fpirhc.deformation.base import Deformation, RequestChange, automatic, own_gain, scaled_for, with_inner
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -258,16 +258,15 @@ def inner_can_be_exchanged(trial: _Map, generator: np.random.Generator) -> None:
 
 
 def gain_is_proportional_to_its_field(trial: _Map, generator: np.random.Generator) -> None:
-    """The field that `gain_name` names is proportional to the effective gain: advice in units of one is advice in the other."""
+    """The gain that a user sets is proportional to the effective gain: advice in units of one is advice in the other."""
     gain, factor = trial.deformation.effective_gain(), float(generator.uniform(1.2, 1.9))
     if gain == 0:
         return
-    before = innermost(trial.deformation)
-    after = innermost(trial.deformation.with_effective_gain(factor * gain))
-    one, other = (getattr(own, own.gain_name, None) for own in (before, after))
-    numbers = isinstance(one, int | float) and isinstance(other, int | float)
-    told = numbers and abs(other - factor * one) <= _SAME * abs(one)  # type: ignore[operator,arg-type]
-    hold(told, f"with {factor:.3g} times its effective gain its '{before.gain_name}' is {other}, and was {one}")
+    (name, one), (_, other) = (
+        own_gain(m) for m in (trial.deformation, trial.deformation.with_effective_gain(factor * gain))
+    )
+    told = abs(other - factor * one) <= _SAME * abs(one)
+    hold(told, f"with {factor:.3g} times its effective gain its '{name}' is {other:.4g}, and was {one:.4g}")
 
 
 def compares_as_it_says(trial: _Map, generator: np.random.Generator) -> None:

@@ -79,13 +79,6 @@ class Affine(Deformation):
         """The effective gain a = -A_c / 2."""
         return -0.5 * self.gain
 
-    def secant_gain(self) -> float:
-        """The same as the effective gain, because the map is linear."""
-        return self.effective_gain()
-
-    def largest_step(self) -> float:
-        return float("inf")
-
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -2 a."""
         return replace(self, gain=-2.0 * gain)

@@ -8,10 +8,11 @@ first order every map here is r+ = r - a (f - d) with one number a, its effectiv
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -99,8 +100,6 @@ class Deformation(Checked, ABC):
     `fpirhc.conformance.check_deformation` tests that a map keeps this contract.
     """
 
-    gain_name: ClassVar[str] = "gain"  # the field that the effective gain is proportional to
-
     if TYPE_CHECKING:
 
         @property
@@ -133,7 +132,7 @@ class Deformation(Checked, ABC):
 
     def shown(self) -> Mapping[str, str]:
         """Signals to log: name of the signal -> name of the scalar in the memory."""
-        return {}
+        return {} if self.inner is None else self.inner.shown()
 
     @abstractmethod
     def step(
@@ -154,13 +153,13 @@ class Deformation(Checked, ABC):
     def effective_gain(self) -> float:
         """First-order step per unit of response error: r+ = r - a (response - desired) + ..., dimensionless."""
 
-    @abstractmethod
     def secant_gain(self) -> float:
-        """Largest step per unit of response error at any size of the error, with the sign of the effective gain."""
+        """Largest step per unit of response error at any size, with the sign of the effective gain, which it is by default."""
+        return self.effective_gain() if self.inner is None else self.inner.secant_gain()
 
-    @abstractmethod
     def largest_step(self) -> float:
-        """Bound of |r+ - r| in one cycle, in units of the response; infinite where the step has no bound."""
+        """Bound of |r+ - r| in one cycle, in units of the response; infinite, the default, where the step has no bound."""
+        return math.inf if self.inner is None else self.inner.largest_step()
 
     @abstractmethod
     def with_effective_gain(self, gain: float) -> Self:
@@ -210,9 +209,11 @@ def innermost(deformation: Deformation) -> Deformation:
 
 
 def own_gain(deformation: Deformation) -> tuple[str, float]:
-    """Return the gain that the user sets, by name; the effective gain of a map that has none."""
-    own = getattr(deformation, deformation.gain_name, None)
-    return ("effective gain", deformation.effective_gain()) if own is None else (deformation.gain_name, float(own))
+    """Return the gain that the user sets, by name: the number that another effective gain changes; without one the latter."""
+    own, gain = innermost(deformation), deformation.effective_gain()
+    other = own.with_effective_gain(2 * own.effective_gain()) if gain else own
+    numbers = [(n, v) for n, v in vars(own).items() if isinstance(v, int | float) and v != getattr(other, n, v)]
+    return (numbers[0][0], float(numbers[0][1])) if numbers else ("effective gain", gain)
 
 
 def with_its_gain(deformation: Deformation) -> str:
@@ -254,22 +255,8 @@ class Wrapper(Deformation, ABC):
         """The wrapped map."""
         return self.map
 
-    @property
-    def gain(self) -> float:
-        """The map's own gain."""
-        return float(getattr(self.map, self.map.gain_name))
-
-    def shown(self) -> Mapping[str, str]:
-        return self.map.shown()
-
     def effective_gain(self) -> float:
         return self.map.effective_gain()
-
-    def secant_gain(self) -> float:
-        return self.map.secant_gain()
-
-    def largest_step(self) -> float:
-        return self.map.largest_step()
 
     def with_effective_gain(self, gain: float) -> Self:
         return replace(self, map=self.map.with_effective_gain(gain))
@@ -325,12 +312,6 @@ class Identity(Deformation):
 
     def effective_gain(self) -> float:
         return 0.0
-
-    def secant_gain(self) -> float:
-        return 0.0
-
-    def largest_step(self) -> float:
-        return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:
         """Raise, because there is no gain to change.

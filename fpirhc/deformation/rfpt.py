@@ -38,13 +38,6 @@ class _Transformation(Deformation):
         """The effective gain a = -K_c B_c A_c."""
         return -self.offset * self.sign * self.gain
 
-    def secant_gain(self) -> float:
-        """The same as the effective gain, because tanh is steepest at zero."""
-        return self.effective_gain()
-
-    def largest_step(self) -> float:
-        return float("inf")
-
     def with_effective_gain(self, gain: float) -> Self:
         """Return the map with A_c = -a / (K_c B_c)."""
         return replace(self, gain=-gain / (self.offset * self.sign))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import casadi as ca
 
@@ -35,8 +35,6 @@ class Rotation(Deformation):
         transformation in adaptive control, IEEE SMC 2018. The map here is in its spirit.
     """
 
-    gain_name: ClassVar[str] = "fraction"
-
     fraction: NotZero
     radius: Positive
 
@@ -65,9 +63,6 @@ class Rotation(Deformation):
 
     def secant_gain(self) -> float:
         return _SECANT * self.fraction
-
-    def largest_step(self) -> float:
-        return float("inf")
 
     def with_effective_gain(self, gain: float) -> Self:
         return replace(self, fraction=gain)

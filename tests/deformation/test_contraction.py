@@ -59,9 +59,9 @@ def test_a_gain_is_refused_exactly_beyond_its_limit(map):
     run(PAIR, map.with_effective_gain(0.99 * largest), duration=0.6)
     with pytest.raises(NotContractive, match=r"is too large; use 0 < \|"):
         run(PAIR, map.with_effective_gain(1.01 * largest), duration=0.6)
-    own = getattr(map, map.gain_name)
-    sign = "negative" if own < 0 else "positive"
-    with pytest.raises(NotContractive, match=rf"wrong sign.*use a {sign} {map.gain_name}, 0 < "):
+    name = "fraction" if isinstance(map, fp.Rotation) else "gain"
+    sign = "negative" if getattr(map, name) < 0 else "positive"
+    with pytest.raises(NotContractive, match=rf"wrong sign.*use a {sign} {name}, 0 < "):
         run(PAIR, map.with_effective_gain(-0.2), duration=0.6)
     with pytest.raises(NotContractive, match=r"wrong sign.*, without the response's delay of 2 cycles$"):
         run((-np.array(PAIR)).tolist(), map, duration=0.6, dead_time=fp.DeadTime(measurement=4e-3))

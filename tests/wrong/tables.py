@@ -67,7 +67,6 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
 MAP_MEMBERS = {
     "adapts": "adaptation is told",
     "effective_gain": "first step is effective gain",
-    "gain_name": "gain is proportional to its field",
     "inner": "inner can be exchanged",
     "form": "compares as it says",
     "largest_step": "step is bounded",
