@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -31,17 +31,11 @@ from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 OF_PROBLEM = ("cost", "limits", "reference")
-_ALWAYS_DATA = (
-    "Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes exact.NAME, "
-    "approximate.NAME and start.NAME"
-)
-_SMALLEST = 1e-3
 _OF_BUILD = (ArithmeticError, AttributeError, FpirhcError, NotImplementedError, RuntimeError, TypeError, ValueError)
 _PACKAGE = str(Path(__file__).parents[1])
-_OF_INPUTS = "limits.inputs."
 # Of the search for bounds, in the number's size.
 _REACHES = (1.0, 1e1, 1e2, 1e4, 1e8, 1e16, 1e32, 1e64, 1e128, 1e256)
-_CLOSE = 1e-6
+_SMALLEST, _CLOSE = 1e-3, 1e-6
 Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
 
 
@@ -58,16 +52,6 @@ class LiveSettings:
     def start(self) -> dict[str, float]:
         """The numbers of the build by path."""
         return {path: float(self._content(path)) for path in self.paths}
-
-    def _with(self, contents: Mapping[str, object], copy: Copy) -> tuple[Problem, Controller]:
-        """Problem and controller with other contents, by path."""
-        problem, controller = self.problem, self.controller
-        for path, content in contents.items():
-            if self._owner(path) is self.problem:
-                problem = changed_at(problem, path, content, copy)
-            else:
-                controller = changed_at(controller, path, content, copy)
-        return problem, controller
 
     def composed(self, compose: Callable[[Built], Composite]) -> Composite:
         """Return what `compose` makes of the controller that is built with open numbers.
@@ -96,16 +80,15 @@ class LiveSettings:
 
     def _refusal(self, error: Exception, compose: Callable[[Built], Composite]) -> Exception:
         """The error that names the setting and the place, for an error of the build."""
-        if isinstance(error, FpirhcError) and any(f"'{path}'" in str(error) for path in self.start):
+        if isinstance(error, FpirhcError) and any(f"'{path}'" in str(error) for path in self.paths):
             return error
         for path in self.paths if len(self.paths) > 1 else ():
             try:
                 replace(self, paths=(path,)).composed(compose)
             except NotSupported as alone:
                 return alone
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        for one in traceback.extract_tb(error.__traceback__):
-            place = one if one.filename.startswith(_PACKAGE) else place
+        every = traceback.extract_tb(error.__traceback__)
+        place = [one for one in every if one.filename.startswith(_PACKAGE)][-1]
         where = f"{Path(place.filename).stem}.{place.name}"
         return not_live(self.paths, f"{where} needs its number while the loop is built; {ANEW}", " here")
 
@@ -133,15 +116,25 @@ class LiveSettings:
             path: of the setting.
             reach: sizes of its number beyond which no end is sought; an end farther away is infinite.
         """
-        value = self._content(path)
-        size = max(abs(value), _SMALLEST)
-        reaches = [*(r for r in _REACHES if r < reach), *([reach] if math.isfinite(reach) else [])]
-        of_machine = path[-2:] if path.startswith(_OF_INPUTS) else ""
+        value, of_machine = self._content(path), path[-2:] if path.startswith("limits.inputs.") else ""
+        size, finite = max(abs(value), _SMALLEST), [reach] if math.isfinite(reach) else []
+        reaches = [*(r for r in _REACHES if r < reach), *finite]
         lower, upper = (
-            value if of_machine == end else _farthest(lambda n: self._accepts(path, n), value, side * size, reaches)
+            value if of_machine == end else self._farthest(path, value, [side * size * r for r in reaches])
             for end, side in ((".0", -1), (".1", 1))
         )
         return lower, upper
+
+    def _farthest(self, path: str, value: float, moves: Sequence[float]) -> float:
+        """The last accepted number, found by longer and longer moves from a value; infinite where none is refused."""
+        refused = next((k for k, move in enumerate(moves) if not self._accepts(path, value + move)), None)
+        if refused is None:
+            return math.copysign(math.inf, moves[0])
+        inside, outside = value + moves[refused - 1] if refused else value, value + moves[refused]
+        while abs(outside - inside) > _CLOSE * max(abs(inside), abs(moves[0])):
+            middle = (inside + outside) / 2
+            inside, outside = (middle, outside) if self._accepts(path, middle) else (inside, middle)
+        return inside
 
     def _accepts(self, path: str, value: float) -> bool:
         try:
@@ -155,33 +148,42 @@ class LiveSettings:
         """Return numbers by path, with the ends of intervals one by one."""
         values: dict[str, float] = {}
         for path, value in numbers.items():
-            ends = [p for p in self.paths if p in (path, f"{path}.0", f"{path}.1")]
-            if not ends:
-                raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
-            parts = [(path, value)] if ends == [path] else self._parts(path, value, ends)
-            for name, part in parts:
+            for name, part in self._parts(path, value):
                 number = real_number(part)
                 if number is None or math.isnan(number):
                     raise InvalidValue(f"setting '{name}': expected a number, got {described(part)}")
-                values[name] = number
+                if name in self.paths:
+                    values[name] = number
+                elif number != self._content(name):
+                    raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
         return values
 
-    def _parts(self, path: str, value: object, ends: list[str]) -> list[tuple[str, object]]:
-        if not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
+    def _parts(self, path: str, value: object) -> Iterator[tuple[str, object]]:
+        """A number, or the ends of an interval of which some are live."""
+        ends = f"{path}.0", f"{path}.1"
+        if path in self.paths:
+            yield path, value
+        elif not {*ends} & {*self.paths}:
+            raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
+        elif not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
             raise InvalidValue(
                 f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}"
             )
-        both = {f"{path}.{k}": value[k] for k in (0, 1)}
-        for name in both.keys() - set(ends):
-            if both[name] != self._content(name):
-                raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
-        return [(name, both[name]) for name in ends]
+        else:
+            yield from zip(ends, value, strict=True)
 
-    def _owner(self, path: str) -> Problem | Controller:
-        return _owner(self.problem, self.controller, path)
+    def _with(self, contents: Mapping[str, object], copy: Copy) -> tuple[Problem, Controller]:
+        """Problem and controller with other contents, by path."""
+        problem, controller = self.problem, self.controller
+        for path, content in contents.items():
+            if _owner(self.problem, self.controller, path) is self.problem:
+                problem = changed_at(problem, path, content, copy)
+            else:
+                controller = changed_at(controller, path, content, copy)
+        return problem, controller
 
     def _content(self, path: str) -> float:
-        return cast(float, content_at(self._owner(path), path))
+        return cast(float, content_at(_owner(self.problem, self.controller, path), path))
 
 
 def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:
@@ -194,47 +196,28 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
     """The path of a number, or the paths of the finite ends of an interval."""
     owner = _owner(problem, controller, path)
     content = content_at(owner, path, "the problem" if owner is problem else "the controller")
-    if isinstance(content, tuple) and len(content) == 2 and owner is problem:
-        ends = [f"{path}.{k}" for k in (0, 1) if math.isfinite(content[k])]
-        if not ends:
-            raise InvalidValue(f"setting '{path}' is {content!r}: there is no limit that could change")
-        return ends
+    interval = isinstance(content, tuple) and len(content) == 2 and owner is problem
+    ends = [f"{path}.{k}" for k in (0, 1) if math.isfinite(content[k])] if interval else [path]  # type: ignore[index]
     if isinstance(content, bool) or (isinstance(content, int | float) and _is_structure(owner, path)):
         what = f"{content!r} decides what the loop is made of, as whole numbers, switches and lengths of queues do"
         raise not_live([path], f"{what}; {ANEW}")
-    if not isinstance(content, int | float | np.number):
+    if not interval and not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
         hint = "give it a number first" if content is None else f"go on with one of: {ways}"
         raise InvalidValue(f"setting '{path}' is {content!r}, not a number; {hint}")
-    if not math.isfinite(content):
+    if not ends or (not interval and not math.isfinite(cast(float, content))):
         raise InvalidValue(
-            f"setting '{path}' is {content}: there is no limit that could change; give it a finite number"
+            f"setting '{path}' is {content!r}: there is no limit that could change; give it a finite number"
         )
-    return [path]
-
-
-def _farthest(accepts: Callable[[float], bool], value: float, size: float, reaches: Sequence[float]) -> float:
-    """The last accepted number on the side of `size`, whose sign and magnitude the steps have; infinite where none is refused."""
-    inside = value
-    for reach in reaches:
-        outside = value + reach * size
-        if not accepts(outside):
-            break
-        inside = outside
-    else:
-        return math.copysign(math.inf, size)
-    while abs(outside - inside) > _CLOSE * max(abs(inside), abs(size)):
-        middle = (inside + outside) / 2
-        inside, outside = (middle, outside) if accepts(middle) else (inside, middle)
-    return inside
+    return ends
 
 
 def _is_structure(owner: object, path: str) -> bool:
     value = owner
     for name in path.split("."):
         value = mapped(value, name)
-        declared = {f.name: f.metadata.get("structure") for f in fields(value)} if is_dataclass(value) else {}
-        if declared and (declared.get(name) or expects_whole_number(type(value), name)):
+        own = [f for f in fields(value) if f.name == name] if is_dataclass(value) else []
+        if own and (own[0].metadata.get("structure") or expects_whole_number(type(value), name)):
             return True
         value = entry(value, name)
     return False
@@ -243,16 +226,17 @@ def _is_structure(owner: object, path: str) -> bool:
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:
     """The controller, or the problem for a cost, limits or a reference that the controller does not have."""
     first = path.partition(".")[0]
-    if first in names_in(controller) and getattr(controller, first) is not None:
-        return controller
-    if first in OF_PROBLEM and getattr(problem, first) is not None:
-        return problem
-    valid = [n for n in names_in(controller) if getattr(controller, n) is not None]
-    valid += [n for n in OF_PROBLEM if getattr(problem, n) is not None]
+    own = [n for n in names_in(controller) if getattr(controller, n) is not None]
+    shared = [n for n in OF_PROBLEM if getattr(problem, n) is not None]
+    if first in (*own, *shared):
+        return controller if first in own else problem
     below = " or ".join(f"'{one}'" for one in paths_to(first, controller))
-    hint = f" Did you mean {below}?" if below else nearest(first, valid)
+    hint = f" Did you mean {below}?" if below else nearest(first, [*own, *shared])
     if first in ("start", "plant", "parameters", *problem.plant.parameters):
-        hint = f" {_ALWAYS_DATA}"
+        hint = (
+            " Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes "
+            "exact.NAME, approximate.NAME and start.NAME"
+        )
     raise InvalidName(
         f"setting '{path}': neither the controller nor the problem's {', '.join(OF_PROBLEM)} have '{first}'.{hint}"
     )
