@@ -25,8 +25,8 @@ from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
-from fpirhc.symbolic.open import ANEW, Opened, copied, not_live
-from fpirhc.symbolic.paths import Copy, changed_at, content_at, entry, mapped, names_in, paths_to, validated
+from fpirhc.symbolic.open import ANEW, Opened, not_live
+from fpirhc.symbolic.paths import Copy, changed_at, content_at, copied, entry, mapped, names_in, paths_to, validated
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 

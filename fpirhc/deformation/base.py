@@ -20,8 +20,8 @@ import numpy as np
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
+from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
-from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import Cycles, every, several
 
 Wrapping = TypeVar("Wrapping")

@@ -22,9 +22,8 @@ from fpirhc.fields.user_code import called
 from fpirhc.plant.motion import outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.expression import Value, total
+from fpirhc.symbolic.expression import Value, stays, total
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.open import stays
 
 
 @dataclass(frozen=True, eq=False)

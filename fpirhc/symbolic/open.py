@@ -21,6 +21,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.paths import copied
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 SETTINGS = "settings"  # the signal of all open numbers of a loop
@@ -121,14 +122,6 @@ def expressed(value: float | ca.SX, beside: Value) -> Value:
     return graph[0] if value.is_symbolic() else ca.Function("fpirhc_open", symbols, [value])(*graph)
 
 
-def copied(value: T, changes: Mapping[str, object]) -> T:
-    """Return a frozen dataclass with other contents of some fields, without validation and without cached facts."""
-    copy = object.__new__(type(value))
-    for one in fields(value):  # type: ignore[arg-type]  # mypy does not narrow type variables
-        object.__setattr__(copy, one.name, changes.get(one.name, getattr(value, one.name)))
-    return copy
-
-
 def _mapped(value: object, change: Callable[[ca.SX], object]) -> object:
     """The value with `change` applied to its open numbers; the same object where it has none."""
     return _changed(value, change) if type(value) not in _LEAVES and _has_open(value) else value
@@ -167,8 +160,3 @@ def _has_open(value: object) -> bool:
 def numbers(values: Sequence[float | ca.SX], beside: Expression) -> Expression:
     """Return a column of numbers, of the kind of another one where some are open."""
     return ca.vertcat(*(expressed(value, beside) for value in values))
-
-
-def stays(x: float, value: float) -> bool:
-    """Return whether a number is a certain one in every run of the loop; an open one may become another."""
-    return not isinstance(x, ca.SX) and x == value

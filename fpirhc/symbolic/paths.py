@@ -79,6 +79,14 @@ def validated(value: object, changes: Mapping[str, object]) -> object:
     return replace(value, **changes)  # type: ignore[type-var]  # only dataclasses have fields
 
 
+def copied(value: T, changes: Mapping[str, object]) -> T:
+    """Return a frozen dataclass with other contents of some fields, without validation and without cached facts."""
+    copy = object.__new__(type(value))
+    for one in fields(value):  # type: ignore[arg-type]  # mypy does not narrow type variables
+        object.__setattr__(copy, one.name, changes.get(one.name, getattr(value, one.name)))
+    return copy
+
+
 def changed_at(value: T, path: str, content: object, copy: Copy = validated) -> T:
     """Return the value with another content at a path.
 
