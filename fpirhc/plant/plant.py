@@ -249,7 +249,7 @@ class Plant(Checked):
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
-        return vector(name, self.controlled_names, self._controlled_units)
+        return Signal(name, self.controlled_names, self._controlled_units)
 
     @cached_property
     def _controlled_units(self) -> tuple[str, ...]:
@@ -291,9 +291,8 @@ class Plant(Checked):
 
     def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return new symbols of the state, the input and the parameters, with the sizes of this plant."""
-        sizes = {"x": self.state.size, "u": len(self.inputs), "p": len(self.parameters)}
-        x, u, p = (ca.SX.sym(name, size) for name, size in sizes.items())
-        return x, u, p
+        inputs, parameters = len(self.inputs), len(self.parameters)
+        return ca.SX.sym("x", self.state.size), ca.SX.sym("u", inputs), ca.SX.sym("p", parameters)
 
 
 def plant_facts(plant: Plant) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
 from operator import attrgetter
-from typing import cast
+from typing import NoReturn, cast
 
 import casadi as ca
 
@@ -65,11 +65,12 @@ class Block:
     @cached_property
     def _built(self) -> tuple[ca.Function, Layout]:
         matrix = kind(self.opaque)
-        symbols = {n: matrix.sym(n, size) for n, size in (self.reads.sizes | self.memory.sizes).items()}
+        sizes = self.reads.sizes | self.memory.sizes
+        symbols = dict(zip(sizes, map(matrix.sym, sizes, sizes.values()), strict=True))
         values = self.step(Signals(symbols))
         results = []
-        sizes = (*self.writes.sizes.values(), *self.memory.sizes.values())
-        for key, size in zip(self._results, sizes, strict=True):
+        of_results = (*self.writes.sizes.values(), *self.memory.sizes.values())
+        for key, size in zip(self._results, of_results, strict=True):
             if key not in values:
                 raise InvalidName(f"block '{self.name}' does not give '{key}'.{nearest(key, values)}")
             written = values[key]
@@ -92,7 +93,7 @@ class Block:
     @cached_property
     def _results(self) -> dict[str, Signal]:
         """The signals that the step returns, by their keys."""
-        keys = (*self.writes.names, *[f"{name}_next" for name in self.memory.names])
+        keys = (*self.writes.names, *map("{}_next".format, self.memory.names))
         return dict(zip(keys, (*self.writes.signals, *self.memory.signals), strict=True))
 
 
@@ -169,7 +170,7 @@ def compose(
         InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
         InvalidShape: a reader and a writer disagree on a size.
     """
-    memory = Layout((*(d.now for d in delays), *[s for b in blocks for s in b.memory.signals]))
+    memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
     reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
     _require_wired(reads, memory, blocks, delays)
@@ -184,13 +185,14 @@ def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delay
         inputs = block.inputs
         for name, size in inputs.sizes.items():
             if sizes.get(name) != size:
-                _require_size(f"block '{block.name}'", inputs[name], name, sizes)
+                _refuse_size(f"block '{block.name}'", inputs[name], name, sizes)
         for name, size in block.writes.sizes.items():
             if name in sizes:
                 raise InvalidName(f"block '{block.name}' writes '{name}', which is already written")
             sizes[name] = size
     for delay in delays:
-        _require_size(f"delay '{delay.now.name}'", delay.now, delay.source, sizes)
+        if sizes.get(delay.source) != memory.sizes[delay.now.name]:
+            _refuse_size(f"delay '{delay.now.name}'", delay.now, delay.source, sizes)
 
 
 def scalar_code(function: ca.Function) -> ca.Function:
@@ -203,7 +205,7 @@ def scalar_code(function: ca.Function) -> ca.Function:
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
     """Evaluate a block: what it writes is added to the known signals, what it remembers to the next memory."""
     # Of graphs they are MX, which the stub does not mix with SX.
-    arguments = cast(list[ca.SX], [known[name] for name in (*block.inputs.names, *block.memory.names)])
+    arguments = cast(list[ca.SX], list(map(known.__getitem__, (*block.inputs.names, *block.memory.names))))
     values = block.function.call(arguments)
     results = cast(dict[str, Matrix], dict(zip(block._results, values, strict=True)))
     for name in block.writes.names:
@@ -267,8 +269,7 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
     return run, hold
 
 
-def _require_size(reader: str, signal: Signal, source: str, sizes: Mapping[str, int]) -> None:
+def _refuse_size(reader: str, signal: Signal, source: str, sizes: Mapping[str, int]) -> NoReturn:
     if source not in sizes:
         raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, sizes)}")
-    if sizes[source] != signal.size:
-        raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {sizes[source]}")
+    raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {sizes[source]}")
