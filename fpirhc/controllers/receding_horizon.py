@@ -39,7 +39,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
-from fpirhc.symbolic.open import expressed, numbers, open_numbers, require_closed
+from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem
 
@@ -125,7 +125,9 @@ _PLANS: Latest[Block] = Latest(8)  # controllers that differ in their deformatio
 
 def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
     """The horizon; open numbers of cost and limits are among its settings."""
-    require_closed("the code of the optimiser", optimiser)
+    live = open_numbers(optimiser)
+    if live:
+        raise not_live(live, f"the code of the optimiser is computed from it while the loop is built; {ANEW}", " here")
     assert problem.horizon is not None
     assert problem.cost is not None
     ahead, limits, start = previewed_values(problem.plant, problem.signals), problem.limits, problem.start_state

@@ -13,8 +13,8 @@ import casadi as ca
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import finite_number
+from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped

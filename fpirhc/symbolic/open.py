@@ -81,13 +81,6 @@ def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
     return NotSupported(f"setting{'s' if len(names) > 1 else ''} {', '.join(names)} cannot be live{where}: {why}")
 
 
-def require_closed(what: str, *values: object) -> None:
-    """Raise where an open number stands in one of the values, from which Python computes something at `what`."""
-    paths = list(open_numbers(*values))
-    if paths:
-        raise not_live(paths, f"{what} is computed from it while the loop is built; {ANEW}", " here")
-
-
 def open_numbers(*values: object) -> dict[str, ca.SX]:
     """Return the symbols in some values, by path."""
     found: dict[str, ca.SX] = {}
