@@ -150,11 +150,10 @@ class Layout:
     signals: tuple[Signal, ...] = ()
     names: tuple[str, ...] = field(init=False, repr=False)
     size: int = field(init=False, repr=False)
-    sizes: dict[str, int] = field(init=False, repr=False)  # of the signals, by name
     _slices: dict[str, slice] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        slices, sizes, at = dict[str, slice](), dict[str, int](), 0
+        slices, at = dict[str, slice](), 0
         for s in self.signals:
             if s.name in slices:
                 raise InvalidName(f"signal '{s.name}' appears twice in one layout")
@@ -163,10 +162,15 @@ class Layout:
                 raise InvalidShape(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
             if not all(map(math.isfinite, s.start)):
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
-            slices[s.name], sizes[s.name] = slice(at, at + size), size
+            slices[s.name] = slice(at, at + size)
             at += size
         # Layouts are built and asked many times while a loop is composed; their names and places are plain attributes.
-        vars(self).update(names=tuple(slices), size=at, sizes=sizes, _slices=slices)
+        vars(self).update(names=tuple(slices), size=at, _slices=slices)
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """Sizes of the signals, by name."""
+        return {name: place.stop - place.start for name, place in self._slices.items()}
 
     @cached_property
     def columns(self) -> tuple[str, ...]:

@@ -105,5 +105,5 @@ def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
 
 def test_what_is_not_covered_says_so() -> None:
     desired = fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE, by=fp.ByDesired())
-    with pytest.raises(NotSupported, match=r"does not predict C, which no desired response moves; use ByModel\(\)"):
+    with pytest.raises(NotSupported, match=r"does not predict C, E, which no desired response moves; use ByModel\(\)"):
         simulated(late(planned()), desired)
