@@ -1,8 +1,7 @@
 """Named signals laid out in one flat vector.
 
-A `Signal` is a short vector with a name, a unit, named elements and a start value. A `Layout` is an
-ordered set of signals: it turns names into places of a flat vector and back, for numbers and for
-CasADi expressions alike. `Named` gives a vector's elements by attribute: `q.q1`.
+A `Signal` is a short vector with a name, a unit, named elements and a start value. A `Layout`, an ordered set of signals, turns names
+into places of a flat vector and back, for numbers and CasADi expressions. `Named` gives a vector's elements by attribute: `q.q1`.
 """
 
 from __future__ import annotations
@@ -162,9 +161,8 @@ class Layout:
                 raise InvalidShape(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
             if not all(map(math.isfinite, s.start)):
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
-            slices[s.name] = slice(at, at + size)
-            at += size
-        # Layouts are built and asked many times while a loop is composed; their names and places are plain attributes.
+            slices[s.name] = slice(at, at := at + size)
+        # They are asked many times while a loop is composed, so they are plain attributes.
         vars(self).update(names=tuple(slices), size=at, _slices=slices)
 
     @cached_property
