@@ -1,6 +1,6 @@
 """Named signals laid out in one flat vector.
 
-A `Signal` is a short vector with a name, a unit, named elements and a start value. A `Layout`, an ordered set of signals, turns names
+A `Signal` is a short vector with a name, a unit, named elements and a start value. A `Layout`, an ordered set of them, turns names
 into places of a flat vector and back, for numbers and CasADi expressions. `Named` gives a vector's elements by attribute: `q.q1`.
 """
 
