@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import ClassVar, Literal, TypeAlias, cast
 
 import casadi as ca
@@ -41,16 +41,10 @@ class Optimiser(Checked, ABC):
         """Why a call may take any time, with a remedy; empty where its work is bounded."""
         return ""
 
-    @property
-    def most_work(self) -> dict[str, int]:
-        """Settings that bound the iterations of a call, by name."""
-        return (
-            {f.name: getattr(self, f.name) for f in fields(self) if f.name in _ITERATIONS} if is_dataclass(self) else {}
-        )
-
     def longer(self, times: int) -> Optimiser | None:
         """The same optimiser with so many times the iterations per call; None where it has no such setting."""
-        more = {name: times * count for name, count in self.most_work.items()}
+        counts = {name: getattr(self, name, None) for name in _ITERATIONS}
+        more = {name: times * count for name, count in counts.items() if count is not None}
         return replace(self, **more) if more else None  # type: ignore[type-var]
 
     def check(self, ocp: OptimalControl) -> None:

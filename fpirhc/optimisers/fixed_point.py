@@ -61,10 +61,6 @@ class FixedPoint(Optimiser):
     most_iterations: Count = 100
     second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
-    @property
-    def most_work(self) -> dict[str, int]:
-        return {name: count for name, count in super().most_work.items() if count is not None}
-
     def check(self, ocp: OptimalControl) -> None:
         """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.
 

@@ -98,7 +98,7 @@ class Simulator:
         was measured with those of the build, which a plan that is solved forgets, and one of so many iterations does not.
         """
         planner = self.controller.planner
-        counted = planner is not None and "iterations" in planner.optimiser.most_work
+        counted = planner is not None and getattr(planner.optimiser, "iterations", None) is not None
         return counted and plans_exactly(self.loop, problem, self.controller)
 
     @property
