@@ -20,12 +20,12 @@ _SOLVERS = {
     "fatrop": "the optimiser Fatrop",
     "sqpmethod": "the optimiser SequentialQuadratic",
 }
-_GCC = "sudo apt install gcc (Debian, Ubuntu), xcode-select --install (macOS), or name a compiler by FPIRHC_CC"
+_GCC = "sudo apt install gcc (Debian, Ubuntu), xcode-select --install (macOS), pip install ziglang, or name one by FPIRHC_CC"
 _EXTRAS = {
     "tune": ("fpirhc tune", ("optuna",)),
     "cluster": ("fpirhc study --cluster", ("distributed",)),
     "fmu": ("fpirhc export --to fmu2, and plants that are units of FMI", ("fmpy",)),
-    "compiler": ("fpirhc export --to wasm and --to lab", ("ziglang",)),
+    "compiler": ("fpirhc export --to wasm and --to lab, and C without a compiler of the system", ("ziglang",)),
     "outside": ("plants in simulators of others", ("mujoco", "rotorpy", "tclab", "vehiclemodels")),
 }
 
@@ -40,7 +40,7 @@ def _compiler() -> tuple[str, str, str]:
     x = ca.SX.sym("x")
     built = native(ca.Function("step", [x], [3 * x + 1]))  # a name of libc: it must have a prefix
     if not built.compiled:
-        need = "needed for loops as compiled C, which are several times as quick, and for --to library"
+        need = "needed for loops as compiled C, which are quicker, for limits of states in plans, and for --to library"
         return "warn", f"{built.reason}; {need}", _GCC
     value = float(built.function(2))
     return "ok" if value == 7 else "fail", f"{find_compiler()}: 3 * 2 + 1 = {value:g}", _GCC
