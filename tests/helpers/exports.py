@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ class Exported:
         """Names, units and starts of what a step is given, and bounds of its settings."""
         return json.loads((self.folder / "layout.json").read_text())
 
-    @property
+    @cached_property
     def bounds(self) -> dict[str, tuple[float, float]]:
         return dict(self.stepper.bounds())
 

@@ -114,13 +114,7 @@ def test_what_a_frozen_value_holds_stays():
     body: Any = problem.plant.parameters
     with pytest.raises(NotSupported, match=r"Problem\.start cannot be changed in place.*\{\*\*start, name: value\}"):
         start["q1"] = 1.0
-    for change in (
-        body.clear,
-        body.popitem,
-        lambda: body.pop("m1"),
-        lambda: body.update({}),
-        lambda: body.setdefault("a"),
-    ):
+    for change in (body.clear, body.popitem, lambda: body.pop("m1"), lambda: body.update({})):
         with pytest.raises(NotSupported, match=r"Plant\.parameters cannot be changed"):
             change()
     assert replace(problem, start={**problem.start, "q1": 1.0}).start_state[0] == 1.0

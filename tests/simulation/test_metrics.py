@@ -71,6 +71,8 @@ def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
     pump = problem(limits=fp.Limits(inputs={"u": (0.0, float("inf"))}))
     assert share(0.0, pump) == share(0.9e-9, pump) == pytest.approx(0.6)
     assert share(1.5e-9, pump) == 0.0  # a billionth of 1 N where a limit is open
+    moved = replace(run(0.0), settings={"live": [[0.0, {}], [7.0, {"limits.inputs.u.0": 0.0}]]})
+    assert fp.measure(limited, moved).at_limit == pytest.approx(0.6)  # a live limit from when it is in force
 
 
 def test_total_variation_is_movement_per_second():
@@ -143,6 +145,7 @@ def test_contraction_is_the_factor_of_the_plant_and_the_gain():
     assert 0.1 < factor < 0.9
     assert adaptive["contraction.predicted"][""] == pytest.approx(factor)
     assert adaptive["contraction.measured"][""] == pytest.approx(factor, rel=0.1)
+    assert adaptive["contraction.growing"][""] == 0.0
     assert plain["contraction.predicted"] == {}
 
 
