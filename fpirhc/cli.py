@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -474,7 +475,8 @@ def new(
 
     problem, test = create_problem(name, folder)
     print(f"wrote {problem}, which runs as it is: put your equations into it\nwrote {test}")
-    print(f"next: fpirhc review {problem}; fpirhc compare {problem}; python -m pytest {test}")
+    install = "" if find_spec("pytest") else "pip install pytest; "
+    print(f"next: fpirhc review {problem}; fpirhc compare {problem}; {install}python -m pytest {test}")
 
 
 @_command("list", name="list")

@@ -23,6 +23,7 @@ _SOLVERS = {
 _GCC = "sudo apt install gcc (Debian, Ubuntu), xcode-select --install (macOS), pip install ziglang, or name one by FPIRHC_CC"
 _EXTRAS = {
     "tune": ("fpirhc tune", ("optuna",)),
+    "test": ("the test that fpirhc new writes", ("pytest",)),
     "cluster": ("fpirhc study --cluster", ("distributed",)),
     "fmu": ("fpirhc export --to fmu2, and plants that are units of FMI", ("fmpy",)),
     "compiler": ("fpirhc export --to wasm and --to lab, and C without a compiler of the system", ("ziglang",)),

@@ -313,10 +313,10 @@ def test_names_that_an_output_cannot_write_are_escaped(command, encoding, tmp_pa
 # --- new and doctor ---------------------------------------------------------------------------------------------------
 
 
-def test_new_files_work_at_once(pytester, capsys):
+def test_new_files_work_at_once(pytester, capsys, monkeypatch):
     """Adaptation helps, and the written test passes, with a baseline and without one."""
     assert main(["new", "my_arm", "--dir", "arms/left"]) == 0
-    assert "fpirhc compare arms/left/my_arm.py" in capsys.readouterr().out
+    assert "fpirhc compare arms/left/my_arm.py; python -m pytest" in capsys.readouterr().out
     task = fp.load_problem(str(pytester.path / "arms/left/my_arm.py"))
     errors = {
         n: fp.measure(task.problem, fp.simulate(task.problem, c, seed=0)).rms_error["y"]
@@ -324,8 +324,13 @@ def test_new_files_work_at_once(pytester, capsys):
     }
     assert errors["RHC+FPI"] < 0.2 * errors["RHC"]
     (pytester.path / "arms/left/baselines").mkdir()  # of another problem
+    monkeypatch.setattr("fpirhc.cli.find_spec", lambda name: None)
+    assert main(["new", "other"]) == 0
+    assert "pip install pytest; python -m pytest test_other.py" in capsys.readouterr().out
+    path = pytester.path / "other.py"
+    path.write_text(re.sub(r"([\"'.])y\b", r"\1angle", path.read_text()))  # a coordinate of another name
     done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "-W", "error", "-k", "not test_controller")
-    done.assert_outcomes(passed=2, skipped=1, deselected=3)
+    done.assert_outcomes(passed=4, skipped=2, deselected=6)
 
 
 @pytest.mark.parametrize("taken", ["arm.py", "test_arm.py"])
@@ -368,11 +373,12 @@ def test_doctor_finds_this_installation_and_a_faulty_one(capsys, tmp_path, monke
     assert str(tmp_path / "cache") in checks["cache"]["evidence"]
     assert "fail" not in {one["outcome"] for one in checks.values()}
     monkeypatch.setenv("FPIRHC_CC", "none")
-    monkeypatch.setattr("fpirhc.doctor.find_spec", lambda name: None if name == "optuna" else name)
+    monkeypatch.setattr("fpirhc.doctor.find_spec", lambda name: None if name in ("optuna", "pytest") else name)
     assert main(["doctor"]) == 0
     said = capsys.readouterr().out
     assert re.search(r"warn  compiler: .*FPIRHC_CC=none.*needed for .*to do: sudo apt install gcc", said)
     assert "none  extra tune: optuna not installed, needed for fpirhc tune; to do: pip install 'fpirhc[tune]'" in said
+    assert "none  extra test: pytest not installed, needed for the test that fpirhc new writes; to do: pip" in said
     monkeypatch.setattr("casadi.has_nlpsol", lambda name: 1 / 0)
     assert main(["doctor"]) == 7
     assert re.search(r"fail  solvers: ZeroDivisionError", capsys.readouterr().out)
