@@ -13,7 +13,7 @@ from contextvars import ContextVar
 import numpy as np
 
 from fpirhc.contraction.delayed import converges, delayed, largest_gain
-from fpirhc.contraction.spectrum import Spectrum, check_gain, jacobians_along, linear_limit
+from fpirhc.contraction.spectrum import Spectrum, assess_gain, jacobians_along, linear_limit
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.controllers.seeing import check_believed
 from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
@@ -46,7 +46,10 @@ def check_gain_sign(problem: Problem, deformation: Deformation) -> None:
         return
     spectrum = _at_start(problem, deformation)
     if spectrum is not None and sum(linear_limit(spectrum.eigenvalues)) * gain <= 0:
-        check_gain(deformation, spectrum, problem.response_delay)  # which raises, with the sign that would do
+        report = assess_gain(deformation, spectrum, problem.response_delay)
+        turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
+        why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
+        raise NotContractive(f"{report.fault}{why}", report.remedy)
 
 
 def check_gain_size(problem: Problem, deformation: Deformation) -> None:
@@ -59,10 +62,8 @@ def check_gain_size(problem: Problem, deformation: Deformation) -> None:
     if gain == 0 or not deformation.form.steady or not _REFUSES.get():
         return
     spectrum, jacobian = _at_start(problem, deformation), _jacobian_at_start(problem)
-    if spectrum is None:
-        return
     seen = _delayed_weights(problem)
-    if seen is None and abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues))):
+    if spectrum is None or (seen is None and abs(gain) < max(map(abs, linear_limit(spectrum.eigenvalues)))):
         return
     weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)
     if converges(deformation, jacobian, weights):
@@ -94,8 +95,7 @@ def _delayed_weights(problem: Problem) -> list[np.ndarray] | None:
 def _too_large(deformation: Deformation, spectrum: Spectrum, limit: float) -> NotContractive:
     """What is wrong with a gain that is beyond the limit of the plant itself."""
     name = own_gain(deformation)[0]
-    values = spectrum.eigenvalues.ravel()
-    largest = values[np.argmax(np.abs(values))]
+    largest = max(spectrum.eigenvalues.ravel(), key=abs)
     value_text = f"{largest.real if largest.imag == 0 else largest:.3g}"
     return NotContractive(
         f"{with_its_gain(deformation)} is too large",
