@@ -44,6 +44,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "two mistakes": (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "dropout: expected a number from 0 to below 1"),
     "range": (lambda: fp.Sensor(range=(1.0, 0.0)), "lower < upper"),
     "even window": (lambda: FIT(window=10, degree=2), "use 9 or 11"),
+    "even and short window": (lambda: FIT(window=4, degree=9), "whose centre is a sample; use 11"),
     "short window": (lambda: FIT(window=3, degree=3), "at least 5"),
     "window of a float": (lambda: FIT(window=5.0, degree=2), "expected a whole number from 1 to 1001, got 5.0; write 5"),  # type: ignore[arg-type]
     "low degree": (lambda: task(estimator=FIT(5, 1)), "use a degree of at least 2"),
