@@ -123,7 +123,7 @@ def excited(
 def read_recording(path: Path, problem: Problem) -> Record:
     """Return the record in a CSV file; a response without a column is the difference of its lower derivative over a cycle."""
     table = _table(path)
-    plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path.name}")
+    plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path}")
     missing = [n for n in ("time", *input_columns(plant), *plant.state.elements) if n not in table]
     if missing:
         mistakes.add(f"it lacks columns for {', '.join(missing)}; its columns are {', '.join(map(str, table))}")
@@ -138,12 +138,12 @@ def read_recording(path: Path, problem: Problem) -> Record:
     if uneven.any():
         k = int(np.argmax(uneven))
         raise InvalidValue(
-            f"recording {path.name}: its times are not {period:g} {problem.time_unit} apart, the period of the problem: "
+            f"recording {path}: its times are not {period:g} {problem.time_unit} apart, the period of the problem: "
             f"{times[k]:g} is followed by {times[k + 1]:g}"
         )
     commands, states = (table[list(names)].to_numpy() for names in (input_columns(plant), plant.state.elements))
     responses = [table[n] if n in table else table[n[:-1]].diff() / period for n in response_names(plant)]
-    return _record(problem, f"recording {path.name}", times, states, commands, np.column_stack(responses))
+    return _record(problem, f"recording {path}", times, states, commands, np.column_stack(responses))
 
 
 def _table(path: Path) -> pd.DataFrame:
@@ -154,11 +154,11 @@ def _table(path: Path) -> pd.DataFrame:
         raise InvalidValue(f"recording '{path}' cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise InvalidValue(
-            f"recording {path.name}: expected a line of names, such as time, and rows of as many numbers; {error}"
+            f"recording {path}: expected a line of names, such as time, and rows of as many numbers; {error}"
         ) from None
     numbers = table.apply(pd.to_numeric, errors="coerce").astype(float)
     for row, column in np.argwhere((numbers.isna() & table.notna()).to_numpy())[:1]:
         raise InvalidValue(
-            f"recording {path.name}: row {row + 1} of numbers has {table.iat[row, column]!r} for {table.columns[column]}"
+            f"recording {path}: row {row + 1} of numbers has {table.iat[row, column]!r} for {table.columns[column]}"
         )
     return numbers

@@ -337,6 +337,7 @@ run mine.py RHC --duration 0 => '--duration' is unknown
 run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number other than zero ... got nan
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
 run mine.py RHC --set optimiser.iterations=0 => FixedPoint.iterations: expected a whole number from 1
+compare mine.py --set exact.mass=-1 => enlarges the error: mass of the plant and of the model differ in sign; use a
 compare mine.py --set deformation.map.gain=2.6 => has the wrong sign ... ; write ModelReferenced(
 run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file
 compare mine.py --plans --optimisers => '--optimisers' requires an argument
@@ -355,6 +356,7 @@ export two_mass CTC --live gain =>
 probe mine.py --chatter 0 => expected a number above 0, in the unit of the signal
 probe two_mass --cycles 3 => probe: 3 cycles are too few to tell a gain from noise; expected at least 40, 300 are usual
 probe mine.py --recording words.csv => recording words.csv ... abc
+probe mine.py --recording /dev/null => recording /dev/null: expected a line of names
 study two_mass --cases heavy => problem 'two_mass' has no cases; add to its file cases = fpirhc.Cases(
 new 2mass => Try 'plant_2mass'; a folder is given by --dir
 run two_mass RHC --set deformation.gain=-1 =>
