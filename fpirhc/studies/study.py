@@ -83,7 +83,7 @@ class VariantStudy(Study):
             numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between]
             moved = [written_out(float(summary[name][row.controller])) for name in moves]
             shown.add([row.controller, *numbers, *moved, better])
-        return shown
+        return shown.filled
 
 
 @checked_call

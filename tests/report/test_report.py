@@ -28,6 +28,7 @@ def comparison() -> Any:
     """A pair of controllers with and without adaptation, and one whose run ends early."""
     track, form = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=5.0)
     controllers = {"plain": fp.ComputedTorque(track), "adaptive": fp.ComputedTorque(track, form)}
+    controllers["exact"] = fp.ExactModel(controllers["plain"])
     return fp.compare(tasks.made(problem(), controllers, description="Its task."), seed=0, compiled=False)
 
 
@@ -56,12 +57,20 @@ def test_report_is_self_contained_and_small(written):
     assert places == sorted(places)
 
 
+def test_the_best_number_is_of_those_with_the_wrong_model_and_no_factor_is_best(comparison):
+    [shown] = comparison.view.tables
+    marked = {row.cells[0]: {shown.columns[k].head for k in row.best} for row in shown.rows}
+    assert "rms error y [m]" in marked["adaptive"]
+    assert not marked["exact"]
+    assert not any("factor" in head or "contraction" in head for heads in marked.values() for head in heads)
+
+
 def test_data_of_the_charts_is_complete(comparison, written):
     """Every controller and no peak lost; no two rows share a colour."""
     text = written.read_text(encoding="utf-8")
     begin = text.index("DATA", text.index('{"controllers"') - 20)
     data, _ = json.JSONDecoder().raw_decode(text[text.index("{", begin) :])
-    assert [c["name"] for c in data["controllers"]] == ["plain", "adaptive"]
+    assert [c["name"] for c in data["controllers"]] == ["plain", "adaptive", "exact"]
     error, run = next(c for c in data["charts"] if c["title"] == "error of y"), comparison["plain"].run
     drawn = error["series"][0]["values"]
     assert len(drawn) == len(data["time"])

@@ -260,6 +260,9 @@ def test_a_summary_is_that_of_the_rows(task):
     """Medians and paired differences of its own table; a clear difference is told, an unclear one is not claimed."""
     found = fp.study(task, fp.Draws(12, 20.0, 5), compiled=False)
     own = found.table.pivot(index="variant", columns="controller", values="error")
+    alone = fp.study(task, fp.Draws(1, 20.0, 5), controllers=[found.summary.index[0]], compiled=False)
+    heads = [[one.head for one in shown.view.tables[0].columns if "against" in one.head] for shown in (found, alone)]
+    assert list(map(len, heads)) == [1, 0]
     apart = own["CTC+FPI"] - own["CTC"]
     assert found.summary.difference["CTC+FPI"] == pytest.approx(apart.median())
     assert found.summary["median"].to_dict() == pytest.approx(own.median().to_dict())

@@ -140,17 +140,18 @@ class Comparison(Study):
     @property
     def view(self) -> View:
         shown = columns([e.metrics for e in self.entries], in_report)
-        done = [e.metrics for e in self.entries if e.run.stop is None]
+        done = [e.metrics for e in self.entries if e.run.stop is None and not e.exact]
         best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.headline}
+        best = {c: number for c, number in best.items() if number is not None}
         heads = [Column(c.heading, c.short if c.metric.headline else None) for c in shown]
         heads = [Column("controller"), *heads, Column("cycle [us]", "cycle us"), Column("status", left=True)]
         table = Table(self.title, heads)
         for e in self.entries:
-            marked = [k for k, c in enumerate(shown, 1) if best.get(c) is not None and c.number(e.metrics) == best[c]]
+            marked = [k for k, c in enumerate(shown, 1) if not e.exact and c in best and c.number(e.metrics) == best[c]]
             texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
             status = f"ended early: {e.run.stop}" if e.run.stop else status_shares(e.metrics.statuses)
             status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
-            cycle = f"{e.cycle[0]:.3g}" if e.cycle else ""
+            cycle = f"{round(e.cycle[0], 1):g}" if e.cycle else ""
             table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
         about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
         notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
