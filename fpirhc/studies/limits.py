@@ -209,7 +209,8 @@ def limits(
 ) -> Limits:
     """Return for every controller how much it bears, to 5 %, and what fails there.
 
-        mismatch    f: exact = approximate (exact / approximate)^f of all parameters; 1 is the problem's own
+        mismatch    f: exact = approximate (exact / approximate)^f of all parameters; 1 is the problem's own.
+                    Where one is 0 or the signs differ: approximate + f (exact - approximate)
         plants      percent within which exact parameters are drawn; none of 100 plants may fail
         latency     commands arrive later, by whole cycles
         noise       deviation of white noise on every measured quantity, as a share of its range along the reference
