@@ -40,11 +40,7 @@ def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[Const
 
 
 def check_feedforward(limits: Limits, plant: Plant, cost: Cost) -> None:
-    """Raise where a path reads the feedforward, which plans have only where the cost reads it.
-
-    Raises:
-        InvalidProblem: all such paths.
-    """
+    """Raise where a path reads the feedforward, which plans have only where the cost reads it."""
     mistakes, known = Mistakes("limits"), read_by_cost(plant, cost)
     for name, one in limits.paths.items():
         if "feedforward" in _read_by(name, one, plant) - known:
@@ -63,11 +59,7 @@ def _read_by(name: str, one: Limit, plant: Plant) -> frozenset[str]:
 
 
 def check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
-    """Raise where the end or a margin is that of no state, or a margin leaves nothing between two limits.
-
-    Raises:
-        InvalidProblem: all such names.
-    """
+    """Raise where the end or a margin is that of no state, or a margin leaves nothing between two limits."""
     mistakes = Mistakes("horizon")
     mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
     if plant.output.elements != plant.state.elements and horizon.terminal:
@@ -94,10 +86,7 @@ def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:
 
 
 def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> list[ConstraintState]:
-    """Hard limits of states and paths after so many steps inside a stage of a map: the nodes do not see what is between them.
-
-    `limits`: of the problem; soft and priced ones, and those of a change of inputs, hold at the nodes alone.
-    """
+    """Hard limits of states and paths after so many steps inside a stage of a map; no other limits hold between the nodes."""
     nodes_alone, measured_view = limits.soft.keys() | limits.prices.keys(), replace(view, state=seen)
     states = [_entry_of(name, one, measured_view) for name, one in limits.boxes(plant).items()]
     paths = [
@@ -111,13 +100,7 @@ def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> 
 def ends(
     names: tuple[str, ...], plant: Plant, next_state: Expression, target: Expression, last: Expression
 ) -> list[ConstraintState]:
-    """State minus reference at the end of the horizon, and zero in all earlier stages.
-
-    The bounds, here of a state of size one, leave a small gap: an interior-point solver counts a fixed variable as an equation.
-
-    Args:
-        last: 1 in the last stage, 0 before.
-    """
+    """State minus reference where `last` is 1, else zero; with a small gap: a solver counts a fixed variable as an equation."""
     places = {e: k for k, e in enumerate(plant.state.elements)}
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     return [

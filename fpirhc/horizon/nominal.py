@@ -41,10 +41,7 @@ def filled(plant: Plant, outputs: np.ndarray) -> np.ndarray:
 
 
 def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
-    """Return the state on the reference.
-
-    `outputs`: the nominal outputs and their derivatives; of a plant without outputs its nominal state.
-    """
+    """Return the state on the reference, from the nominal outputs and their derivatives, or the nominal state without outputs."""
     hidden = [e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0]
     require_reference_of_states(
         plant,
@@ -82,15 +79,7 @@ def nominal_motion(
     times: np.ndarray,
     rate: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (nx, m) and inputs (nu, m) of the approximate model on its outputs' reference, from the start.
-
-    Args:
-        advance: Function (state, input, parameters) -> state at the next time.
-        start: first state, shape (nx,).
-        bounds: lower and upper bounds of the inputs, shape (nu,) each.
-        times: shape (m,).
-        rate: with which errors of the outputs decay, (d/dt + rate)^r e = 0; zero is the feedforward alone.
-    """
+    """Return states (nx, m) and inputs (nu, m) of the model on its outputs' reference; errors decay as (d/dt + rate)^r e = 0."""
     x, outputs, r = (ca.MX.sym(n, size) for n, size in _sizes(plant).items())
     known = [(k, place) for k, place in enumerate(plant.equations.known_by_outputs) if place >= 0]
     entries = ca.vertsplit(x)
@@ -177,10 +166,7 @@ def nominal_run(
     bounds: Bounds,
     times: tuple[float, int],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (nx, m) and inputs (nu, m) of the model while its outputs follow their reference, in the first 20 000 cycles.
-
-    `plant`: the model, with outputs and as many inputs as controlled ones. `start`: first state, shape (nx,).
-    """
+    """Return states (nx, m) and inputs (nu, m) of the model that follows the reference of its outputs for 20 000 cycles."""
     period, cycles = times[0], min(times[1], _CYCLES)
     x, u, p = plant.symbols()
     advance, w = integrator.step(plant, period), np.zeros(len(plant.names))
@@ -192,10 +178,7 @@ def nominal_run(
 
 
 def singular_gain(plant: Plant, states: np.ndarray, inputs: np.ndarray, period: float) -> str:
-    """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not.
-
-    `states`: of its nominal run, cycle by cycle, shape (nx, m). `inputs`: of the same run, shape (nu, m).
-    """
+    """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not."""
     x, u, p = plant.symbols()
     response, count = plant.equations.controlled_response(x, u, p), states.shape[1]
     gain = ca.Function("fpirhc_output_gain", [x, u, p], [ca.densify(ca.det(ca.jacobian(response, u)))])

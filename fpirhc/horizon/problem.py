@@ -96,9 +96,7 @@ class OptimalControl:
 
     @property
     def measured_at_rest(self) -> OptimalControl:
-        """The problem whose D is that of later inputs at rest, for plans with states of their own: a model that runs away enlarges
-        what their inputs are rounded by, and D with answers would call them not solved.
-        """
+        """The problem whose D is that of later inputs at rest: one that runs away enlarges what inputs of plans are rounded by."""
         return replace(self, curvature=curvature_at_rest(self.along, self.step))
 
     @cached_property
@@ -218,15 +216,7 @@ def expand_along(
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
     functions: dict[object, ca.Function] | None = None,
 ) -> _ReferenceExpansion:
-    """Return the quadratic model along a trajectory.
-
-    Args:
-        dynamics: (s, u, theta) -> s_next.
-        stage_cost: (s, u, theta) -> (l, terms).
-        terminal_cost: (s, theta) -> T.
-        nodes: states (ns, N + 1), inputs (nu, N) and data (ntheta, N + 1).
-        functions: keeps the Functions of derivatives for the next call; None: they are built.
-    """
+    """Return the quadratic model along nodes (states, inputs, data); `functions` keeps its Functions for the next call."""
     functions = {} if functions is None else functions
     if "linearised" not in functions:
         functions |= {"linearised": _linearised(dynamics, stage_cost), "final": _final(terminal_cost)}

@@ -21,12 +21,7 @@ from fpirhc.task.reference import Reference
 
 
 def data_layout(plant: Plant, horizon: Horizon) -> Layout:
-    """Layout of one stage's data.
-
-    A terminal equality adds whether the stage is the last, and the reference after it; blocks add whether the inputs are free.
-    Limits that hold for the measured state add its distance from the plan's start. Plans that follow sooner than a stage add the
-    haste of the change of inputs: first stages per time since the change before. Stages of several lengths add theirs.
-    """
+    """Layout of one stage's data; haste: first stages per time since the last change of inputs, offset: of the measured state."""
     free = (scalar("free"),) if horizon.blocks else ()
     units = dict(zip(plant.state.elements, plant.state.units, strict=True))
     shown = horizon.measured
@@ -143,10 +138,7 @@ def shifted_reference(plant: Plant, layout: Layout, nodes: int, *, corrected: bo
 
 
 def offset_limits(plant: Plant, horizon: Horizon, layout: Layout) -> ca.Function:
-    """Function (data, state from which the plan starts, measured state) -> data with the distance of the measured state.
-
-    `horizon`: of the plan, with states whose limits hold for the measured one. `layout`: of one stage's data.
-    """
+    """Function (data, state from which the plan starts, measured state) -> data with the distance of the measured state."""
     nodes, rows = horizon.stages + 1, layout.slice("offset")
     places = [plant.state.elements.index(name) for name in horizon.measured]
     data = ca.MX.sym("data", layout.size, nodes)

@@ -53,12 +53,7 @@ def transcribe(
     signals: ca.Function | None = None,
     start: np.ndarray | None = None,
 ) -> OptimalControl:
-    """Return the standard form of one horizon; it is the same one for the same objects, and for plants with other exact parameters.
-
-    Args:
-        start: first state, shape (nx,), from which states without a reference are simulated to expand the cost along the reference;
-            None: zero.
-    """
+    """Return the standard form of one horizon, one for the same objects; from `start` states without a reference are simulated."""
     same = plant.equations, reference, cost, limits, signals  # the approximate parameters are those of the equations
     first = None if start is None else np.asarray(start, dtype=float).tobytes()
     arguments = plant, reference, horizon, cost, limits, signals, start
@@ -139,10 +134,7 @@ def _transcribed(
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """Symbols x, before, u, theta of one stage, and its expressions; `before` is empty unless the input is part of the state.
-
-    theta ends with the symbols of open `settings` (see `setting_rows`).
-    """
+    """Symbols of one stage, and its expressions; `before` is empty unless the input is part of the state, settings end theta."""
 
     x: Expression
     before: Expression
@@ -224,10 +216,7 @@ def _stage_functions(stage: _Stage) -> tuple[ca.Function, ...]:
 
 
 def _sizes_of_entries(plant: Plant, horizon: Horizon, limits: Limits, states: np.ndarray, written: int) -> np.ndarray:
-    """What the bounds of the written entries are multiplied by: the size of the state that the end must meet, ones for others.
-
-    `states`: along the reference, from which a size follows where limits do not give it.
-    """
+    """What the bounds of the written entries are multiplied by: the size of the state that the end must meet, ones for others."""
     half = 0.5 * np.subtract(*reversed(limits.state_bounds(plant)))
     places = [plant.state.elements.index(e) for e in dict.fromkeys(horizon.terminal)]
     sizes = np.where(np.isfinite(half) & (half > 0), half, sizes_along(states[: plant.state.size]))[places]
@@ -296,10 +285,7 @@ def _written(
 def _steps_inside(
     plant: Plant, horizon: Horizon, limits: Limits, view: View, data: Mapping[str, Expression]
 ) -> list[View]:
-    """The stage as it is after each step of a map but the last, whose state is the next node's; empty without limits on them.
-
-    Where stages have several lengths, a shorter one stays at its end.
-    """
+    """The stage after each step of a map but the last, whose state is the next node's, so that a shorter stage stays at its end."""
     if not (limits.states or limits.paths):
         return []
     one, per_stage = by_single_steps(plant), steps_in(plant, horizon.step)
@@ -399,10 +385,7 @@ def _nodes(
     limits: Limits,
     start: np.ndarray | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (the plant's, `extra` input and written entries), inputs and data along the reference from t = 0.
-
-    States without a reference are simulated, with the inputs that the model needs for the nominal outputs.
-    """
+    """States (the plant's, `extra` input and written ones), inputs and data along the reference; what has none is simulated."""
     layout = data_layout(plant, horizon)
     along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
     states, inputs = along["reference"], along["feedforward"]

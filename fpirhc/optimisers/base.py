@@ -284,15 +284,7 @@ def improved(
     *,
     calls: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Improve a plan until its status is OK; with a violated limit of a state, as long as the violation shrinks.
-
-    Args:
-        state: the first state, shape (ns,).
-        data: shape (ntheta, N + 1).
-
-    Returns:
-        Plan (nu, N), diagnostics with the iterations of all calls, memory, and the number of calls.
-    """
+    """Improve a plan until it is OK or its violation stays; return the plan, diagnostics of all calls, memory, number of calls."""
     step, fixed = (
         built(optimiser, ocp, "converging"),
         (np.asarray(ca.DM(data).full()), ocp.input_lower, ocp.input_upper),
@@ -338,11 +330,7 @@ LAST = "(arg[5] ? *arg[5] : 0)"
 
 
 def require_compiler() -> None:
-    """Raise where there is no C compiler.
-
-    Raises:
-        NotInstalled: with how to get one.
-    """
+    """Raise NotInstalled, with how to get one, where there is no C compiler."""
     if find_compiler() is None:
         raise NotInstalled(
             f"plans with limits of states need a C compiler (the system's, or pip install ziglang): {why_no_compiler()}"
@@ -350,14 +338,7 @@ def require_compiler() -> None:
 
 
 def compiled_plan(ocp: OptimalControl, name: str, driver: Driver, memory: int) -> ca.Function:
-    """Return the Function (s0, data, lower, upper, memory, last) -> (U, diagnostics, memory) of a driver, as a compiled library.
-
-    It has one argument more than a step, a number that its text reads as `LAST`. In generated C it is the driver itself.
-
-    Raises:
-        NotInstalled: there is no C compiler.
-        CompileError: it failed.
-    """
+    """Return a driver as the library (s0, data, lower, upper, memory, `LAST`) -> (U, diagnostics, memory), or raise."""
     results = [ca.MX.zeros(*size) for size in ((ocp.input.size, ocp.stages), (5, 1), (memory, 1))]
     arguments = [*call_arguments(ocp, memory), ca.MX.sym("last")]
     unique = registered(name, driver)

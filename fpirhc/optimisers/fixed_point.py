@@ -176,13 +176,7 @@ def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Col
 
 
 def _of_two_starts(ocp: OptimalControl, one: ca.Function, memory: Layout) -> ca.Function:
-    """Function like a step of an optimiser: the result of `one`, or of `one` from the start of its memory where that is cheaper.
-
-    A plan that is not solved is taken only if neither is. The iterations are those of both.
-
-    Args:
-        one: Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
-    """
+    """Function like the step `one`: its result, or that from the start of its memory where that is solved and cheaper."""
     arguments = [ca.MX.sym(one.name_in(k), *one.size_in(k)) for k in range(one.n_in())]
     warm = one(*arguments)
     cold = one(*arguments[:4], ca.MX(ca.DM(memory.start())))

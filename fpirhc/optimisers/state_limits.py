@@ -119,10 +119,7 @@ class LimitedSettings:
 
 
 def limited_memory(ocp: OptimalControl) -> Layout:
-    """Return the layout of the plan, its states and costates s_1 ... s_N, its feedback, its multipliers, mu and the damping.
-
-    `plan_barrier` is zero where no plan is remembered.
-    """
+    """Return the layout of plan, states, costates, feedback, multipliers, mu (zero: no plan is remembered) and damping."""
     n, states, inputs = range(ocp.stages), ocp.state.elements, ocp.input.elements
     rows = (*inputs, *(states[k] for k in scales(ocp).bounded))
     later = tuple(f"{e}@{k + 1}" for k in n for e in states)
@@ -141,12 +138,7 @@ def limited_memory(ocp: OptimalControl) -> Layout:
 
 
 def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
-    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory).
-
-    Raises:
-        NotInstalled: there is no C compiler.
-        CompileError: it failed, as where the model calls what cannot be written as C.
-    """
+    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory); it raises as `compiled_plan` does."""
     # The number of iterations is an argument of the loops: one library serves a loop and plans in open loop.
     alike = replace(settings, iterations=0)
     plan = _PLANS.of((ocp, settings.map), (alike,), lambda: _compiled(ocp, alike))
@@ -243,10 +235,7 @@ def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]
 
 
 def _guess(ocp: OptimalControl) -> ca.Function:
-    """Function theta -> (reference as a stage's state (ns), feedforward (nu)).
-
-    States without a reference are those of the nodes.
-    """
+    """Function theta -> (reference as a stage's state (ns), that of the nodes where there is none, feedforward (nu))."""
     theta = ca.SX.sym("theta", ocp.data.size)
     reference, forward = (theta[ocp.data.slice(name)] for name in ("reference", "feedforward"))
     if ocp.inner:
