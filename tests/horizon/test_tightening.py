@@ -20,17 +20,11 @@ def carriage(mass: float = 1.0, believed: float = 1.3) -> fp.Problem:
         response=lambda q, v, u, p: {"q": (u.F - 2.0 * q.q - 0.4 * v.q) / p.m},
         parameters={"m": fp.Parameter(believed, mass, "kg")},
     )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"q": ca.sin(2 * t)}),
-        start={"q": 0.0, "q'": 2.0},
-        period=0.01,
-        duration=3.5,
-        measure_from=1.0,
-        limits=fp.Limits(inputs={"F": (-20.0, 20.0)}, states={"q": (-LIMIT, LIMIT), "q'": (-2.5, 2.5)}),
-        horizon=fp.Horizon(stages=20, step=0.05),
-        cost=fp.Quadratic(states={"q": 100.0, "q'": 1.0}, effort={"F": 1e-3}),
-    )
+    limits = fp.Limits(inputs={"F": (-20.0, 20.0)}, states={"q": (-LIMIT, LIMIT), "q'": (-2.5, 2.5)})
+    cost = fp.Quadratic(states={"q": 100.0, "q'": 1.0}, effort={"F": 1e-3})
+    more = {"limits": limits, "horizon": fp.Horizon(stages=20, step=0.05), "cost": cost, "measure_from": 1.0}
+    moved = fp.Trajectory(lambda t: {"q": ca.sin(2 * t)})
+    return fp.Problem(plant, moved, {"q": 0.0, "q'": 2.0}, period=0.01, duration=3.5, **more)
 
 
 def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
@@ -58,17 +52,9 @@ def test_the_rate_of_a_plan_counts_from_the_command_without_its_shift(weights):
         response=lambda q, u, p: {"q": u.F - q.q + p.d},
         parameters={"d": fp.Parameter(0.0, 2.0, "N")},
     )
-    problem = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"q": 0 * t}),
-        start={"q": 0.0},
-        period=0.01,
-        duration=6.0,
-        limits=fp.Limits(),
-        horizon=fp.Horizon(stages=20, step=0.05),
-        cost=fp.Quadratic(states={"q": 10.0}, **weights),
-    )
-    run = fp.simulate(
-        problem, fp.RecedingHorizon(fp.FixedPoint(iterations=50, tolerance=1e-9), fp.Affine(-1.0)), seed=0
-    )
+    still, horizon = fp.Trajectory(lambda t: {"q": 0 * t}), fp.Horizon(stages=20, step=0.05)
+    more = {"horizon": horizon, "cost": fp.Quadratic(states={"q": 10.0}, **weights), "duration": 6.0}
+    problem = fp.Problem(plant, still, {"q": 0.0}, period=0.01, **more)
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=50, tolerance=1e-9), fp.Affine(-1.0))
+    run = fp.simulate(problem, plan, seed=0)
     assert np.abs(run["state"][-50:, 0]).max() < 1e-6

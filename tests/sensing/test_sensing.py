@@ -300,18 +300,11 @@ def sensed_slowly(gain: float) -> fp.Problem:
         response=lambda q, v, u, p: {"y": u.u / p.m, "s": (p.g * q.y - q.s) / 0.02},
         controlled=("y",),
     )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"y": 0.1 + 0.05 * ca.sin(t)}),
-        start={"y": 0.1},
-        period=5e-3,
-        duration=0.1,
-        limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
-        horizon=fp.Horizon(stages=5, step=0.01),
-        cost=fp.Quadratic(states={"y": 1e2}, deviation={"u": 0.1}),
-        sensing=fp.Sensing(estimator=fp.PositionDifference()),
-        reality=fp.Reality(real, start={"s": 0.1 * gain}, seen={"y": "s"}),
-    )
+    more = {"sensing": fp.Sensing(estimator=fp.PositionDifference()), "limits": fp.Limits(inputs={"u": (-50.0, 50.0)})}
+    more |= {"horizon": fp.Horizon(stages=5, step=0.01), "cost": fp.Quadratic({"y": 1e2}, deviation={"u": 0.1})}
+    more |= {"reality": fp.Reality(real, start={"s": 0.1 * gain}, seen={"y": "s"})}
+    moved = fp.Trajectory(lambda t: {"y": 0.1 + 0.05 * ca.sin(t)})
+    return fp.Problem(plant, moved, {"y": 0.1}, period=5e-3, duration=0.1, **more)
 
 
 def test_another_reality_begins_with_its_own_estimates():
