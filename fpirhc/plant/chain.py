@@ -21,6 +21,7 @@ from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import (
     arguments_of,
+    believed_in,
     by_name,
     controlled_places,
     derivative_unit,
@@ -43,7 +44,7 @@ def output_expression(plant: Plant, name: str, x: Expression, u: Expression, p: 
     """Return a coordinate, or h(x, u, p) of an output."""
     if name in plant.coordinates:
         return x[plant.state.elements.index(name)]
-    return stated_expression(plant, name, x, u, p)
+    return stated_expression(plant, name, x, u, p) + believed_in(plant, name, p)
 
 
 def stated_expression(plant: Plant, name: str, x: Expression, u: Expression, p: Expression) -> Expression:
@@ -102,17 +103,10 @@ def _reached(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX
     return bool((seen @ on_input).any())
 
 
-def believed_disturbance(plant: Plant, name: str, p: Expression) -> Expression:
-    """Return what a model believes to add to the response of a quantity: zero, or a parameter of an estimator."""
-    parameter = plant.outputs[name].response_disturbance if name in plant.outputs else ""
-    return p[plant.parameter.elements.index(parameter)] if parameter else ca.SX(0)
-
-
 def without_disturbances(plant: Plant) -> Plant:
     """Return the plant without believed disturbances of its outputs' responses; itself where there are none."""
-    if not any(one.response_disturbance for one in plant.outputs.values()):
-        return plant
-    return replace(plant, outputs={n: replace(one, response_disturbance="") for n, one in plant.outputs.items()})
+    kept = {name: parameter for name, parameter in plant.believed.items() if "'" not in name}
+    return plant if len(kept) == len(plant.believed) else replace(plant, believed=kept)
 
 
 def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:

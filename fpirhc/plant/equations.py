@@ -10,8 +10,8 @@ import casadi as ca
 
 from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.chain import Symbols, believed_disturbance, derivatives, output_order
-from fpirhc.plant.motion import arguments_of, by_name, sampling, words
+from fpirhc.plant.chain import Symbols, derivatives, output_order
+from fpirhc.plant.motion import arguments_of, believed_in, by_name, sampling, words
 from fpirhc.symbolic.expression import FINITE, Expression, expression, graph, nan_where
 from fpirhc.symbolic.layout import Named
 
@@ -35,7 +35,7 @@ class Equations:
         if self.plant.next is not None:
             responses = self.forced_rate(x, u, p, ca.SX.zeros(len(self.plant.names)))
         else:
-            responses = self._of_user(self.plant.response, x, u, p)
+            responses = self._of_user(self.plant.response, 1.0, x, u, p)
         return ca.Function("fpirhc_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property
@@ -71,7 +71,7 @@ class Equations:
         if self.plant.next is None:
             after = x + sampling(self.plant) * self.forced_rate(*symbols)
         else:
-            one = ca.Function("fpirhc_step", [x, u, p], [self._of_user(self.plant.next, x, u, p)])
+            one = ca.Function("fpirhc_step", [x, u, p], [self._of_user(self.plant.next, self.plant.step, x, u, p)])
             for _ in range(self.plant.steps):
                 after = one(after, u, p) + self.plant.step * w
         return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
@@ -114,7 +114,8 @@ class Equations:
         """Function (state, input, parameters) -> highest derivatives of the controlled quantities; of order 0 these themselves."""
         x, u, p = self.plant.symbols()
         chains = derivatives(self.plant, self.plant.response_orders, (x, u, p, ca.SX.zeros(len(self.plant.names))))
-        entries = (chain[-1] + believed_disturbance(self.plant, name, p) for name, chain in chains.items())
+        added = (believed_in(self.plant, n + "'" * k, p) if k else 0 for n, k in self.plant.response_orders.items())
+        entries = (chain[-1] + more for chain, more in zip(chains.values(), added, strict=True))
         column = ca.densify(ca.vertcat(*entries))
         return ca.Function("fpirhc_controlled_response", [x, u, p], [column], ["x", "u", "p"], ["r"])
 
@@ -160,16 +161,26 @@ class Equations:
     def _forced(self) -> Symbols:
         return *self.plant.symbols(), ca.SX.sym("w", len(self.plant.names))
 
-    def _of_user(self, function: Callable[..., Mapping[str, Expression]], x: ca.SX, u: ca.SX, p: ca.SX) -> Expression:
+    def _of_user(
+        self, function: Callable[..., Mapping[str, Expression]], share: float, x: ca.SX, u: ca.SX, p: ca.SX
+    ) -> Expression:
+        """What a user's function gives for every coordinate, with so large a share of what is believed to add to it."""
         values = called(words(self.plant)[1], function, *arguments_of(self.plant, x, u, p))
-        return ca.densify(ca.vertcat(*(ca.SX(values[name]) for name in self.plant.names)))
+        entries = (ca.SX(values[name]) + share * believed_in(self.plant, name, p) for name in self.plant.names)
+        return ca.densify(ca.vertcat(*entries))
 
 
 def inverse_by_user(plant: Plant, inverse: Callable[..., Mapping[str, Expression]]) -> ca.Function:
     """Function (state, response, parameters) -> input, made of the user's `inverse`."""
     x, _, p = plant.symbols()
     r = ca.SX.sym("r", len(plant.controlled_names))
-    wanted = Named(plant.controlled_names, r, "coordinate")
+    entries = []
+    for k, (name, order) in enumerate(plant.response_orders.items()):
+        of = name + "'" * order
+        entries.append(
+            r[k] - believed_in(plant, of if of in plant.believed or name not in plant.coordinates else name, p)
+        )
+    wanted = Named(plant.controlled_names, ca.vertcat(*entries), "coordinate")
     *lower, parameters = by_name(plant, x, p)
     commands = named_results("inverse", called("inverse", inverse, *lower, wanted, parameters))
     mistakes = Mistakes("inverse")

@@ -120,6 +120,11 @@ def arguments_of(plant: Plant, x: Expression, u: Expression, p: Expression) -> t
     return (*derivatives, Named(plant.input.elements, u, "input"), parameters)
 
 
+def believed_in(plant: Plant, name: str, p: Expression) -> Expression:
+    """Return what a model believes to add to a coordinate's response, an output, or an output's response: zero, or a parameter."""
+    return p[plant.parameter.elements.index(plant.believed[name])] if name in plant.believed else ca.SX(0)
+
+
 def by_name(plant: Plant, x: Expression, p: Expression) -> tuple[Named, ...]:
     """Return the arguments of a user's function without the inputs, each with its entries by name: q, q', ..., p."""
     derivatives = [
@@ -128,4 +133,6 @@ def by_name(plant: Plant, x: Expression, p: Expression) -> tuple[Named, ...]:
         )
         for k in range(max(plant.orders, default=0))
     ]
-    return (*derivatives, Named(tuple(plant.parameters), p, "parameter"))
+    own = [n for n in plant.parameters if n not in plant.believed.values()]
+    column = p[[plant.parameter.elements.index(n) for n in own]] if plant.believed else p
+    return (*derivatives, Named(own, column, "parameter"))

@@ -32,14 +32,10 @@ class Output(Checked):
     Args:
         unit: of the output.
         expression: function of the arguments of the response, with or without the inputs; it returns one scalar.
-        response_disturbance: name of a parameter that a model believes to add to the response y^(r) and to nothing else, as
-            estimators of disturbances do; empty: none. The inverse has it in every cycle. A plan is made without it, as if the
-            response were the model's, which is how a plan is made behind a deformation.
     """
 
     unit: str
     expression: Callable[..., Expression]
-    response_disturbance: str = field(default="", kw_only=True, metadata={"setting": False})
 
 
 WHERE_GIVEN = {"setting": "where given"}
@@ -68,6 +64,9 @@ class Plant(Checked):
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
         step: of a map, the time from one state to the next; None: differential equations. See `Plant.discrete`.
         steps: of a map, how many a control cycle has, with the command held; `Problem` counts them.
+        believed: coordinate, output, or response of an output (y'') -> the parameter that a model believes to add to it, as
+            estimators of disturbances do; the user's functions do not have it. That of an output's response is in the inverse,
+            and no state sees it: a plan is made without it, as one is made behind a deformation.
 
     Raises:
         InvalidProblem: all mistakes together.
@@ -85,6 +84,7 @@ class Plant(Checked):
     time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
     step: float | None = field(default=None, kw_only=True, metadata=WHERE_GIVEN)
     steps: Few = field(default=1, kw_only=True, metadata={"setting": False})
+    believed: Mapping[str, str] = field(default_factory=dict, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("plant")

@@ -175,13 +175,9 @@ def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
 
 def _check_output(plant: Plant, name: str, mistakes: Mistakes) -> None:
     x, u, p = plant.symbols()
-    value, parameter = ca.SX(stated_expression(plant, name, x, u, p)), plant.outputs[name].response_disturbance
+    value = ca.SX(stated_expression(plant, name, x, u, p))
     if name in plant.coordinates and not ca.is_equal(value, x[plant.state.elements.index(name)], 1):
         mistakes.add(f"outputs: '{name}' has the name of a coordinate, but is another expression; rename the output")
         return
-    if parameter and parameter not in plant.parameters:
-        mistakes.add(
-            f"outputs: '{name}': response_disturbance={parameter!r} is no parameter of the plant; add it there"
-        )
     if (plant.controlled is None or name in plant.controlled) and output_order(plant, name) is None:
         mistakes.add(f"outputs: no input reaches '{name}', however often it is differentiated; control another output")
