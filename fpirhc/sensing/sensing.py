@@ -62,55 +62,6 @@ class Sensor(Checked):
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
 
 
-def uncovered(
-    plant: Plant,
-    estimator: DerivativeEstimator,
-    named: Sequence[str] | None,
-    measured: tuple[str, ...],
-    observer: StateObserver | None,
-) -> Iterator[str]:
-    """Yield a sentence for everything that is needed and neither measured nor believed, and for an observer without need.
-
-    The outputs that controllers follow are measured or estimated, never believed: an output that the wrong model computes would be
-    followed in place of the true one.
-
-    Args:
-        named: names of the measured quantities where a user names them.
-    """
-    missing = [n for n in estimator.measures(plant) if n not in measured]
-    if named is not None and not measured:
-        yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-    elif observer is not None and named is None and not (estimator.of_steps or plant.outputs):
-        yield (
-            f"observer: everything that {type(estimator).__name__} needs is measured; name what sensors show: "
-            f"Sensing(measured={list(measured)!r}, ...)"
-        )
-    elif observer is None and missing:
-        yield (
-            f"measured: {type(estimator).__name__} also needs {', '.join(missing)}; measure it, or estimate it by "
-            "an observer: Sensing(measured=..., observer=KalmanFilter(...))"
-        )
-    if plant.outputs:
-        yield from _of_outputs(plant, estimator, missing, measured, believes=observer is not None)
-
-
-def _of_outputs(
-    plant: Plant, estimator: DerivativeEstimator, missing: list[str], measured: tuple[str, ...], *, believes: bool
-) -> Iterator[str]:
-    followed = [n for n in missing if n.rstrip("'") in plant.controlled_names]
-    if believes and followed:
-        yield (
-            f"measured: {type(estimator).__name__} needs {', '.join(followed)}, and outputs that are controlled are measured or "
-            "differentiated, never observed; measure it, or choose an estimator of what is measured, such as PositionDifference()"
-        )
-    states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
-    if not believes and states:
-        yield (
-            f"measured: {', '.join(states)} is given as it is to controllers of a plant with outputs, unless an "
-            "observer is stated: leave it out, or add Sensing(..., observer=KalmanFilter(...))"
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Sensing(Checked):
     """Sensors and estimator between plant and controller; ideal by default.
@@ -175,7 +126,7 @@ class Sensing(Checked):
                 what = f"'{name}' is estimated by {type(by).__name__}, not measured"
                 mistakes.add(f"sensors: {what}; sensors are those of {', '.join(measures)}")
         mistakes.unknown("measured: quantity", self.measured or (), every)
-        for mistake in uncovered(plant, self.estimator, self.measured, measures, self.observer):
+        for mistake in self._uncovered(plant):
             mistakes.add(mistake)
         with mistakes.caught():
             self.estimator.check(plant)
@@ -183,6 +134,39 @@ class Sensing(Checked):
             with mistakes.caught():
                 self.observer.check(plant, measures)
         mistakes.raise_if_any()
+
+    def _uncovered(self, plant: Plant) -> Iterator[str]:
+        """Sentences about what is needed and neither measured nor believed, and about an observer without need.
+
+        The outputs that controllers follow are measured or estimated, never believed: an output that the wrong model computes would
+        be followed in place of the true one.
+        """
+        own, believes, measured = type(self.estimator).__name__, self.observer is not None, self.measures(plant)
+        missing = [n for n in self.estimator.measures(plant) if n not in measured]
+        followed = [n for n in missing if n.rstrip("'") in plant.controlled_names]
+        states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
+        if self.measured is not None and not measured:
+            yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
+        elif believes and self.measured is None and not (self.estimator.of_steps or plant.outputs):
+            yield (
+                f"observer: everything that {own} needs is measured; name what sensors show: "
+                f"Sensing(measured={list(measured)!r}, ...)"
+            )
+        elif missing and not believes:
+            yield (
+                f"measured: {own} also needs {', '.join(missing)}; measure it, or estimate it by "
+                "an observer: Sensing(measured=..., observer=KalmanFilter(...))"
+            )
+        if plant.outputs and believes and followed:
+            yield (
+                f"measured: {own} needs {', '.join(followed)}, and outputs that are controlled are measured or differentiated, "
+                "never observed; measure it, or choose an estimator of what is measured, such as PositionDifference()"
+            )
+        if plant.outputs and states and not believes:
+            yield (
+                f"measured: {', '.join(states)} is given as it is to controllers of a plant with outputs, unless an "
+                "observer is stated: leave it out, or add Sensing(..., observer=KalmanFilter(...))"
+            )
 
     def delay(self, plant: Plant, period: float) -> float:
         """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""

@@ -31,9 +31,6 @@ class InverseTangent(Deformation):
     def effective_gain(self):
         return self.gain
 
-    def secant_gain(self):
-        return self.gain
-
     def largest_step(self):
         return abs(self.gain) * self.width * math.pi / 2
 

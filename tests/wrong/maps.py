@@ -23,10 +23,6 @@ class Softsign(Deformation):
     def effective_gain(self):
         return self.gain
 
-    def secant_gain(self):
-        """The slope at zero error is the largest one."""
-        return self.gain
-
     def largest_step(self):
         return abs(self.gain) * self.size
 
