@@ -45,11 +45,9 @@ REFUSED = [
     ({GAIN: HUGE}, "expected a number, got 1000"),
     ({GAIN: [-0.4]}, r"expected a number, got \[-0.4\]"),
     ({GAIN: np.timedelta64(1, "s")}, "timedelta64"),
-    ({GAIN: np.bool_(True)}, "expected a number"),
     ({GAIN: float("nan")}, "expected a number, got nan"),
     ({ENDS: (1, HUGE)}, "Q1.1': expected a number"),
     ({ENDS: 5}, r"pair \(lower, upper\), got 5"),
-    ({ENDS: "ab"}, "pair"),
 ]
 
 
@@ -130,7 +128,6 @@ RUNS = [
     ({"setpoints": {"q9": 1.0}}, InvalidName, "'q9' is unknown"),
     ({"setpoints": {"q1": lambda t: 1 / (t - t)}}, InvalidProblem, "'q1': the function of time .*ZeroDivisionError"),
     ({"setpoints": {"q1": lambda t: HUGE}}, InvalidValue, "does not return a number, but 1000"),
-    ({"setpoints": {"q1": lambda t: "a"}}, InvalidValue, "does not return a number, but the text 'a'"),
 ]
 
 
@@ -155,7 +152,6 @@ LIVE = [
     ("RHC+FPI", "optimiser.iterations", NotSupported, "what the loop is made of"),
     ("RHC+FPI", "deformation", InvalidValue, "go on with one of"),
     ("CTC", "cost.states.q1", NotSupported, "does not use it"),
-    ("CTC", "referense.rate", InvalidName, "reference"),
     ("CTC", "reference.rate", NotSupported, "what the loop is made of"),
 ]
 

@@ -23,7 +23,7 @@ ADAPTS = fp.ModelReferenced(fp.Affine(gain=-0.5))
 SHAPES = {
     "constant": lambda e, t: e,
     "growing": lambda e, t: e * ca.exp(2 * t) / 900,  # rms e from .5 s on
-    "steady": lambda e, t: e * (0.3 + 0.25 * t),
+    "late": lambda e, t: e * ca.fmax(1 - 0.1 * t, 0.009 * ca.exp(2 * t)),  # not in the second quarter
 }
 SENT = {
     "ramp": lambda size, t: size * t / (PERIOD * CYCLES),
@@ -135,7 +135,7 @@ def test_outcomes_and_ratios():
 # What raises a flag and what nearly does, words of its sentence, and the outcome.
 FLAGS: dict[str, tuple[Facts, Facts, Facts, str]] = {
     "left alone": (Facts(1.6, 1.9), Facts(1.3, 1.6), Facts(0.6, 1.6), "times that of the plant whose inputs are held"),
-    "growth": (Facts(), Facts(0.3, shape="growing"), Facts(0.3, shape="steady"), "as in an unstable loop"),
+    "growth": (Facts(), Facts(0.3, shape="growing"), Facts(0.04, 0.04, "late"), "as in an unstable loop"),
     "limit": (Facts(), Facts(0.1, sends="full", size=0.4), Facts(0.1), "stands at a limit"),
     "chatter": (Facts(), Facts(0.1, sends="zigzag"), Facts(0.1), "chatters"),
 }
@@ -161,7 +161,8 @@ def test_what_counts_and_what_comes_first():
     found = compared(cases, headline=("B", "B+FPI"), metrics=own, headline_metric="mine").findings
     assert [f.pair[1] for f in found if f.pair] == ["B+FPI", "A+FPI"] * 2
     assert [str(f.outcome) for f in found[:2]] == ["no difference", "better"]
-    assert any(f.text.startswith("The smallest rms error is that of B+FPI: ") for f in found)
+    [share] = [s for f in found for s in re.findall(r"^The smallest rms error is that of B\+FPI: (\S+) % of", f.text)]
+    assert float(share) == pytest.approx(100 * math.sqrt(((0.2 / 1.757) ** 2 + (0.2 / 2) ** 2) / 2), rel=0.01)
     broken = fp.Metric("mine", lambda problem, run: 1 / 0)
     [told] = compared({"A": cases["A"]}, metrics=[*tasks.two_mass.metrics, broken])["A"].metrics.broken.values()
     assert told.startswith("metric 'mine' could not be computed (ZeroDivisionError: division by zero)")
