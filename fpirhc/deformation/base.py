@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.errors import InvalidName, NotSupported, require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import stays
@@ -171,11 +171,11 @@ def with_inner(wrapper: Wrapping, inner: object) -> Wrapping:
     current = getattr(wrapper, "inner", None)
     names = [name for name, value in vars(wrapper).items() if value is current]
     changed = replaced(wrapper, names[0], inner) if names and current is not None else None
-    if changed is None:
-        raise NotSupported(
-            f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; hold it in a field"
-        )
-    return changed
+    require(
+        changed is not None,
+        f"{type(wrapper).__name__} has no field that holds its `inner`, so the inner one cannot be replaced; hold it in a field",
+    )
+    return cast("Wrapping", changed)
 
 
 def automatic(deformation: Deformation) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_uncertainty, check_whole, chosen_pole, leaked
-from fpirhc.errors import NotSupported
+from fpirhc.errors import require
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -95,11 +95,11 @@ class ModelReferenced(Wrapper):
 
 def require_map_of_plan(owner: str, deformation: Deformation) -> None:
     """Check that a map may be given its own last request, as a plan has nothing else."""
-    if deformation.form.modelled:
-        raise NotSupported(
-            f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a "
-            "plan's gradient has no model beside it; use the map inside"
-        )
+    require(
+        not deformation.form.modelled,
+        f"{owner}(map={type(deformation).__name__}(...)): a model-referenced form compares a plant with its model, and a plan's "
+        "gradient has no model beside it; use the map inside",
+    )
 
 
 def settled(deformation: Deformation, request: Expression, response: Expression) -> dict[str, Expression]:
