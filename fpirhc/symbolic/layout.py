@@ -149,10 +149,11 @@ class Layout:
     signals: tuple[Signal, ...] = ()
     names: tuple[str, ...] = field(init=False, repr=False)
     size: int = field(init=False, repr=False)
+    sizes: dict[str, int] = field(init=False, repr=False)  # of the signals, by name
     _slices: dict[str, slice] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        slices, at = dict[str, slice](), 0
+        slices, sizes, at = dict[str, slice](), dict[str, int](), 0
         for s in self.signals:
             if s.name in slices:
                 raise InvalidName(f"signal '{s.name}' appears twice in one layout")
@@ -161,14 +162,10 @@ class Layout:
                 raise InvalidShape(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
             if not all(map(math.isfinite, s.start)):
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
-            slices[s.name] = slice(at, at := at + size)
+            slices[s.name], sizes[s.name] = slice(at, at + size), size
+            at += size
         # They are asked many times while a loop is composed, so they are plain attributes.
-        vars(self).update(names=tuple(slices), size=at, _slices=slices)
-
-    @cached_property
-    def sizes(self) -> dict[str, int]:
-        """Sizes of the signals, by name."""
-        return {name: place.stop - place.start for name, place in self._slices.items()}
+        vars(self).update(names=tuple(slices), size=at, sizes=sizes, _slices=slices)
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
