@@ -19,7 +19,7 @@ from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import quantities, require_named, response_names
+from fpirhc.sensing.base import quantities, require_named, response_names, values_of
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal
@@ -229,18 +229,10 @@ class DisturbanceKalman(ParameterEstimator):
 
     def _shown_function(self, model: Plant) -> ca.Function:
         """Function (state, command that acted, parameters) -> the measured quantities."""
-        x, u, p = model.symbols()
-        states = dict(zip(model.state.elements, ca.vertsplit(x), strict=True))
-        if self.reads_outputs(model):
-            calm = ca.DM.zeros(len(model.names))
-            states = (
-                dict(zip(model.output.elements, ca.vertsplit(model.equations.output(x, u, p, calm)), strict=True))
-                | states
-            )
-        if self._responses(model):
-            responses = ca.vertsplit(model.equations.controlled_response(x, u, p))
-            states |= dict(zip(response_names(model), responses, strict=True))
-        return ca.Function("fpirhc_shown", [x, u, p], [ca.densify(ca.vertcat(*(states[n] for n in self.measured)))])
+        at = model.symbols()
+        values = values_of(model, *at)
+        shown = ca.vertcat(*(values[n] for n in self.measured))
+        return ca.Function("fpirhc_shown", list(at), [ca.densify(shown)])
 
     def _matrices(self, problem: Problem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A of state and disturbances over one period, the effect of response noise on the state, and C."""
