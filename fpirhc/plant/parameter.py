@@ -130,7 +130,13 @@ def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, f
     p_exact is the value in the problem file: a parameter keeps its sign, and zero stays zero. One with a `spread` lies in P/100 of
     that spread; where all parameters have one, P may be 100 and more.
     """
-    check_mismatch(plant, mismatch)
+    all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
+    if not 0 <= mismatch < (math.inf if all_spread else 100):
+        more = " (100 is the whole spread, more is possible here)"
+        raise InvalidValue(
+            f"mismatch {mismatch:g}: expected percent of at least 0 and below 100, where a parameter keeps its sign"
+            f"{more if all_spread else '; where all have a spread, 100 is all of it'}"
+        )
     ranges = {name: _range(parameter, mismatch) for name, parameter in plant.parameters.items()}
     mistakes = Mistakes("mismatch")
     for name, parameter in plant.parameters.items():
@@ -142,20 +148,6 @@ def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, f
             )
     mistakes.raise_if_any()
     return ranges
-
-
-def check_mismatch(plant: Parametric, mismatch: float) -> None:
-    """Raise if no range belongs to this mismatch."""
-    all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
-    if not 0 <= mismatch < (math.inf if all_spread else 100):
-        raise InvalidValue(
-            f"mismatch {mismatch:g}: expected percent of at least 0 and below 100, where a parameter keeps its sign"
-            + (
-                " (100 is the whole spread, more is possible here)"
-                if all_spread
-                else "; where all have a spread, 100 is all of it"
-            )
-        )
 
 
 def drawn(parameter: Parameter, mismatch: float, share: float) -> float:
@@ -292,9 +284,8 @@ class LogNormal(Spread):
         return float(exact * self.factor ** (share * z))
 
     def mistake(self, exact: float) -> str:
-        return (
-            "" if exact else "has the value 0, which a factor does not change; use Uniform or Normal with absolute=..."
-        )
+        zero = "has the value 0, which a factor does not change; use Uniform or Normal with absolute=..."
+        return "" if exact else zero
 
 
 def _standard(probability: float) -> float:
