@@ -6,7 +6,6 @@ Theory: docs/theory.md.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -47,6 +46,11 @@ class _Queued(Wrapper):
         """The delays of the pairs."""
         return Queue(self.cycles)
 
+    @property
+    def _pole(self) -> float:
+        """The pole of the leak of an increment."""
+        return 0.0
+
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
@@ -61,7 +65,13 @@ class _Queued(Wrapper):
         requests = queue.pushed(memory["queue_requests"], request)
         undeformed = queue.pushed(memory["queue_desired"], desired_then)
         valid = memory["queue_filled"] >= queue.length - 1
-        next_request, next_memory = self._request(requests, undeformed, response, desired, inner)
+        size = desired.numel()
+        request, then = (queue.delayed(past, size) for past in (requests, undeformed))
+        increments = self.form.compares == "increment"
+        next_request, next_memory = self.map.step(request, response, then if increments else desired, inner)
+        if increments:
+            before = requests[:size] - undeformed[:size]
+            next_request = desired + leaked(self._pole, before, next_request - then)
         remembered = {name: ca.if_else(valid, value, inner[name]) for name, value in next_memory.items()}
         queues = {
             "queue_requests": requests,
@@ -70,17 +80,6 @@ class _Queued(Wrapper):
             "queue_filled": ca.fmin(memory["queue_filled"] + 1, queue.length),
         }
         return ca.if_else(valid, next_request, desired), {**queues, **remembered}
-
-    @abstractmethod
-    def _request(
-        self,
-        requests: Expression,
-        undeformed: Expression,
-        response: Expression,
-        desired: Expression,
-        memory: Mapping[str, Expression],
-    ) -> tuple[Expression, dict[str, Expression]]:
-        """The next request, from the queues of requests and of desired responses, newest first, and from those of this cycle."""
 
 
 @dataclass(frozen=True)
@@ -94,17 +93,6 @@ class Paired(_Queued):
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles.
     """
-
-    def _request(
-        self,
-        requests: Expression,
-        undeformed: Expression,
-        response: Expression,
-        desired: Expression,
-        memory: Mapping[str, Expression],
-    ) -> tuple[Expression, dict[str, Expression]]:
-        del undeformed
-        return self.map.step(self._queue.delayed(requests, desired.numel()), response, desired, memory)
 
 
 @dataclass(frozen=True)
@@ -149,19 +137,9 @@ class Increment(_Queued):
     def form(self) -> Form:
         return replace(super().form, compares="increment")
 
-    def _request(
-        self,
-        requests: Expression,
-        undeformed: Expression,
-        response: Expression,
-        desired: Expression,
-        memory: Mapping[str, Expression],
-    ) -> tuple[Expression, dict[str, Expression]]:
-        size = desired.numel()
-        then, request = self._queue.delayed(undeformed, size), self._queue.delayed(requests, size)
-        next_request, next_memory = self.map.step(request, response, then, memory)
-        pole = chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)
-        return desired + leaked(pole, requests[:size] - undeformed[:size], next_request - then), next_memory
+    @property
+    def _pole(self) -> float:
+        return chosen_pole(self.map.effective_gain(), self.cycles, self.uncertainty, self.pole)
 
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
