@@ -228,8 +228,7 @@ def _latency(case: Case) -> Fact | None:
     most, calm = max(2 * bench.share(bench.start), 0.1), bench.steps(bench.start)
     for cycles in range(1, LATENCY + 1):
         base = bench.run(latency=cycles)
-        share, step = bench.share(base), bench.steps(base)
-        left = without = math.inf
+        share, step, left, without = bench.share(base), bench.steps(base), math.inf, math.inf
         if share <= most and step <= BUSY * max(CALM, calm):
             left = bench.pushed(PLACES[0], base=base, latency=cycles)[0].left
         if left <= 1 and bench.built.controller.deformation.adapts:
@@ -419,7 +418,6 @@ def _model(case: Case) -> Fact:
         raise NotAsked("The command stands at a limit: run it where commands are free.")
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
     name, numbers, harms = _added(case, without, adapted, SLIGHT)
-    # more than it may cure
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
     no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
     verdict = Verdict.NO if no else Verdict.CAUTION if spoils and harms > WORSE else Verdict.YES
@@ -481,7 +479,7 @@ QUESTIONS = (
     Question("latency", "Does it bear a cycle of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
              "| with {cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
              "| commands change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency"
-             "| {left:%} of a push left after {pushed}", "{late}."),
+             "| {left:%} of a push left after {pushed}", "Slow the loop, or {dead}."),
     Question("limits", "Do states, rates and paths keep their limits?", _left,
              "beyond a limit in {share_of_cycles:%} of the cycles of {whole}"
              "| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}",
