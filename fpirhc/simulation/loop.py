@@ -19,16 +19,10 @@ from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.motion import time_signal
-from fpirhc.simulation.path import (
-    Mover,
-    acting_blocks,
-    disturbance_signals,
-    lost_blocks,
-    moving,
-    outside_blocks,
-    sensing_blocks,
-)
+from fpirhc.simulation.path import Mover, acting_blocks, moving, outside_blocks
 from fpirhc.simulation.replay import known_samples
+from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
+from fpirhc.simulation.tables import disturbance_signals
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete

@@ -9,8 +9,8 @@ from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, derivative_of, nearest
 from fpirhc.plant.motion import followed_units, with_space
+from fpirhc.simulation.judging import JUDGING
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric
-from fpirhc.simulation.simulate import JUDGING
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
 

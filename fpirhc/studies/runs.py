@@ -24,9 +24,10 @@ from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
+from fpirhc.simulation.judging import with_judgements
 from fpirhc.simulation.metrics.base import Metric, measure
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator, with_judgements
+from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator
 from fpirhc.studies.comparison.compare import select
 from fpirhc.studies.comparison.verdict import left_alone, ranges
 from fpirhc.studies.variants import Variant, Variants

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.adapters.real_time import RealTime
-from fpirhc.adapters.tclab import tclab_body
+from fpirhc.adapters.tclab import RealTime, tclab_body
 from fpirhc.errors import InvalidProblem
 
 tclab: Any = pytest.importorskip("tclab", reason="it needs the extra fpirhc[outside]")

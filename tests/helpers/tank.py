@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import fpirhc as fp
-from fpirhc.adapters.real_time import RealTime
+from fpirhc.adapters.tclab import RealTime
 
 PERIOD = 0.1
 TANK = fp.Plant(

@@ -14,6 +14,7 @@ from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.check import checked
 from fpirhc.controllers.contract import resolved
+from fpirhc.controllers.live_settings import Changes
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -22,7 +23,6 @@ from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.changes import Changes
 from fpirhc.simulation.hard_limits import Followed, limits_left
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum

@@ -1,0 +1,199 @@
+"""The second half of the path of a run: from what moves, by sensors and their dead time, to what the controller is given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import casadi as ca
+import numpy as np
+
+from fpirhc.controllers.base import like, rename
+from fpirhc.controllers.gate import LOST
+from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
+from fpirhc.controllers.seeing import sensor_ranges
+from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.motion import followed_units, time_signal
+from fpirhc.sensing.base import backward_difference, combine, response_names
+from fpirhc.simulation.path import HELD, Mover, moving, real_signals
+from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.expression import Signals, Value, expression
+from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
+from fpirhc.task.problem import Problem
+
+Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
+_LOST_QUEUE = "lost_samples_queue"
+_PAST, _FULL = "_outputs_past", "_outputs_known"
+
+
+def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
+    """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
+    problem, plant = mover.problem, mover.problem.plant
+    response = plant.response_signal("realised")
+    if problem.sees_plant:
+        sense = [mover.sense(measured_signals(plant), response)]
+        return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
+    true, shown = _true_blocks(mover, response)
+    if predicts and not mover.shows_truth and all(map(problem.moves.shows, problem.judged_names)):
+        true = [*true, _truth_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
+    if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
+        return true  # with coordinates measured in place of others
+    return [*true, *_late_blocks(problem, shown)]
+
+
+def _true_blocks(mover: Mover, response: Signal) -> tuple[list[Block], Shown]:
+    """Blocks of the true motion, response and error; and the signals that sensors see."""
+    problem, motion = mover.problem, mover.motion
+    hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response, "_seen")
+    if not mover.shows_truth:
+        return [mover.sense(*hidden)], hidden
+    true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response, "plant_realised")
+    sense = mover.sense(*true)
+    if problem.sensing.estimator.of_steps:
+        sense = with_true_response(problem, sense, true[0][-1], true[1])
+    blocks = [sense, _truth_block(problem, true[0][-1])]
+    if not problem.truth.seen:
+        return blocks, true
+    direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    shown = (motion, response) if direct else hidden
+    return [*blocks, _seen_block(problem, shown)], shown
+
+
+def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
+    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given.
+
+    Sensors are those of the outputs where the plant has some; its state then comes with the dead time alone.
+    """
+    plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
+    first = problem.first_output
+    starts = (problem.start_state, first)[-len(measured_signals(plant)) :]
+    states_pass = sensing.observer is None  # a believed state is the controller's own
+    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
+    if not sensing.ideal:
+        others = states[:-1]
+        sensors = [
+            *_late_states(others, late),
+            *sensing.blocks(plant, problem.first_shown, late, (*shown[0], shown[1])),
+        ]
+        if sensing.estimates:
+            return sensors
+        raw = sensing.raw(plant, problem.first_shown, late)
+        return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
+    assert late is not None
+    resting = tuple(problem.first_shown[name] for name in response_names(plant))
+    realised = replace(shown[1], name="realised", start=resting)
+    return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
+
+
+def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
+    """Return how many cycles one call of the loop runs: one where samples may be lost, and the caller replays them."""
+    mover = moving(problem)
+    many = mover.cycles_of_call if compiled else mover.cycles_interpreted
+    return 1 if loses(mover) else many
+
+
+def loses(mover: Mover) -> bool:
+    """Return whether samples may be lost, or lie outside the range of their sensor."""
+    return bool(lost_blocks(mover) or sensor_ranges(mover.problem))
+
+
+def lost_blocks(mover: Mover) -> list[Block]:
+    """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
+    problem = mover.problem
+    drawn, held = problem.sensing.drawn, [one for one in mover.reads if one.name == HELD]
+    if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
+        return []
+    late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        lost = problem.sensing.lost(ca.vertcat(*(getattr(s, one.name) for one in drawn)))
+        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) for one in held)))
+        arrived, remembered = late.arrived(s, _LOST_QUEUE, now)
+        return {LOST.name: arrived, **remembered}
+
+    memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
+    return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
+
+
+def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Queue | None) -> list[Block]:
+    """Blocks of the dead time from true signals to measured ones, with the values before the run."""
+    if late is None:
+        return [rename(f"see_{to.name}", true, to) for true, to, _ in states]
+    return [
+        delay_block(f"see_{to.name}", true, replace(to, start=tuple(map(float, start))), [late] * to.size)
+        for true, to, start in states
+    ]
+
+
+def _truth_block(problem: Problem, motion: Signal) -> Block:
+    """Block (time, true state or outputs) -> true error of the judged ones."""
+    plant = problem.plant
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
+    own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
+    writes = Layout(
+        (vector("true_error", problem.judged_names, [followed_units(plant)[c] for c in problem.judged_names]),)
+    )
+    if given_signals(problem):
+        reads = Layout((like(plant.output, "reference"), motion))
+        return Block(
+            "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
+        )
+    function, reads = motion_of(problem), Layout((time_signal(plant), motion, *own_signals(problem)))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        along = function(s.time, *own_values(problem, s))[0]
+        return {"true_error": along[places] - getattr(s, motion.name)[own]}
+
+    return Block("truth", reads, writes, step, opaque=problem.reference.opaque)
+
+
+def _seen_block(problem: Problem, shown: Shown) -> Block:
+    """Block -> the state, the outputs and the response that are measured in place of the true ones."""
+    motion, response = shown
+    functions = {one.name: problem.truth.function(one.elements, seen=True) for one in motion}
+    functions[response.name] = problem.truth.function(response_names(problem.plant), seen=True)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {name: function(*now) for name, function in functions.items()}
+
+    return Block("seen", Layout(real_signals(problem)), Layout((*motion, response)), step)
+
+
+def with_true_response(problem: Problem, sense: Block, motion: Signal, response: Signal) -> Block:
+    """Return the block of the true motion, with the true response of a map in place of the one that it writes.
+
+    `motion`: signal of the state, or of the outputs where the plant has some.
+    """
+    period = problem.period
+    orders = problem.plant.response_orders
+    if not any(orders.values()):
+        return sense  # a response of order 0 is the output, and no difference
+    places = {c: problem.plant.output.elements.index(c) for c in orders}
+    entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]
+    past = Signal(_PAST, tuple(f"{c}@{j}" for c, j in entries))
+    known = Signal(_FULL)
+
+    def step(s: Signals) -> dict[str, Value]:
+        values = dict(sense.step(s))
+        before = dict(zip(entries, ca.vertsplit(getattr(s, _PAST)), strict=True))
+        now = expression(values[motion.name])
+        samples = {c: [now[k], *(before[c, j] for j in range(1, orders[c] + 1))] for c, k in places.items()}
+        enough = getattr(s, _FULL)
+        values[response.name] = ca.vertcat(
+            *(
+                ca.if_else(enough > order - 0.5, _difference(samples[c], order) / period**order, 0)
+                for c, order in orders.items()
+            )
+        )
+        values[f"{_PAST}_next"] = ca.vertcat(*(samples[c][j - 1] for c, j in entries))
+        values[f"{_FULL}_next"] = ca.fmin(enough + 1, max(orders.values()))
+        return values
+
+    return replace(sense, step=step, memory=sense.memory + Layout((past, known)))
+
+
+def _difference(samples: Sequence[Expression], order: int) -> Expression:
+    return combine(backward_difference(order), samples)
