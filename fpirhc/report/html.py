@@ -1,6 +1,6 @@
 """HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view.
 
-The verdict is first, then come the main columns, charts, pictures, notes, and settings.
+The verdict is first, then come charts, the main columns, pictures, notes, and settings.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ class Comparison(Study):
         best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.headline}
         best = {c: number for c, number in best.items() if number is not None}
         heads = [Column(c.heading, c.short if c.metric.headline else None) for c in shown]
-        heads = [Column("controller"), *heads, Column("cycle [us]", "cycle us"), Column("status", left=True)]
+        heads = [Column("controller"), *heads, Column("cycle [us]"), Column("status", left=True)]
         table = Table(self.title, heads)
         for e in self.entries:
             marked = [k for k, c in enumerate(shown, 1) if not e.exact and c in best and c.number(e.metrics) == best[c]]
