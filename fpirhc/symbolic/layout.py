@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 from unicodedata import normalize
 
 import casadi as ca
@@ -149,8 +149,8 @@ class Layout:
     signals: tuple[Signal, ...] = ()
     names: tuple[str, ...] = field(init=False, repr=False)
     size: int = field(init=False, repr=False)
-    sizes: dict[str, int] = field(init=False, repr=False)  # of the signals, by name
     _slices: dict[str, slice] = field(init=False, repr=False)
+    sizes: ClassVar[dict[str, int]]  # of the signals, by name; every layout has its own, which is no field to be shown
 
     def __post_init__(self) -> None:
         slices, sizes, at = dict[str, slice](), dict[str, int](), 0
