@@ -229,8 +229,8 @@ def _twin(path: Path) -> Block:
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
         told = ca.if_else(is_finite(measured), measured, at)
         # The next cycle begins at the state that is given. One that outputs show is estimated, so it is late and noisy: there the
-        # model keeps its own, moved as the outputs are, and an exact model answers as the plant does, to rounding.
-        begins = ca.vertcat(*(told[k] if place < 0 else at[k] + move[place] for k, place in shown_by))
+        # model keeps its own, put where the sensors show it, and an exact model answers as the plant does, to rounding.
+        begins = ca.vertcat(*(told[k] if place < 0 else at[k] + offset[place] + move[place] for k, place in shown_by))
         turn = outputs(at, end, parameters) - outputs(begins, end, parameters)
         later |= {"mirror_state_next": begins, "mirror_offset_next": offset + move + turn}
         moved = zip(own, memories, moves, strict=True)

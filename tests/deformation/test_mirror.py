@@ -159,3 +159,30 @@ def test_paired_through_the_lag_the_command_is_quiet(lag):
         assert error < none
     assert through(problem, fp.Increment(map, cycles=0))[1] > 8 * quiet
     assert through(problem, map)[1] > 50 * quiet
+
+
+@pytest.mark.parametrize("wrong", ["", "mass", "friction"])
+def test_the_model_is_where_the_sensors_show_a_plant_of_states(wrong):
+    """A lift whose acceleration is no state: an exact model is left alone, a wrong one does not drift away from the measured height."""
+
+    def rates(x, u, p):
+        force = 200 * x.pressure - p.friction * x.speed
+        return {"height": x.speed, "speed": force / p.mass - 9.81, "pressure": 20 * (u.flow - 120 * x.speed)}
+
+    exact = {"mass": 400.0, "friction": 500.0, **({wrong: {"mass": 650.0, "friction": 1500.0}[wrong]} if wrong else {})}
+    lift = fp.Plant.of_states(
+        states={"height": "m", "speed": "m/s", "pressure": "bar"},
+        inputs={"flow": "l/min"},
+        rates=rates,
+        outputs={"position": fp.Output("m", lambda x, p: x.height)},
+        parameters={n: fp.Parameter({"mass": 400.0, "friction": 500.0}[n], value, "1") for n, value in exact.items()},
+    )
+    start, path = {"height": 0.1, "speed": 0.0, "pressure": 19.62}, lambda t: {"position": 0.5 - 0.4 * ca.cos(0.8 * t)}
+    times = {"period": 2e-3, "duration": 4.0, "measure_from": 2.0}
+    sensing = fp.Sensing({"position": fp.Sensor()}, fp.SavitzkyGolay(window=11, degree=3))
+    problem = fp.Problem(lift, fp.Trajectory(path), start, **times, sensing=sensing)
+    plain, adaptive = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.ModelReferenced(fp.Affine(gain=-1.0)))
+    if not wrong:
+        assert change(problem, plain, adaptive) <= 1e-9
+    error = fp.measure(problem, fp.simulate(problem, adaptive, seed=0, compiled=False)).rms_error["position"]
+    assert error < 2e-3  # .6 m and more where the model keeps a height of its own
