@@ -17,7 +17,14 @@ from fpirhc.plant.equations import Equations
 from fpirhc.plant.maps import Differences
 from fpirhc.plant.motion import derivative_unit, derivatives_signal, followed_units
 from fpirhc.plant.parameter import Parameter, check_parameters
-from fpirhc.plant.plant_check import check_map, check_names, check_outputs, check_ranges, check_response
+from fpirhc.plant.plant_check import (
+    check_expressions,
+    check_map,
+    check_names,
+    check_outputs,
+    check_ranges,
+    check_response,
+)
 from fpirhc.summary import line, number, table
 from fpirhc.symbolic.expression import Expression
 from fpirhc.symbolic.layout import Signal, vector
@@ -93,6 +100,8 @@ class Plant(Checked):
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
         check_ranges(self, mistakes)
+        check_expressions(self, mistakes)
+        mistakes.raise_if_any()
         check_response(self, mistakes)
         mistakes.raise_if_any()
         check_outputs(self, mistakes)

@@ -158,19 +158,23 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
             )
 
 
+def check_expressions(plant: Plant, mistakes: Mistakes) -> None:
+    """Add every output whose function takes other arguments to `mistakes`."""
+    lower = max(plant.orders, default=0)
+    names = ", ".join((["x"] if words(plant)[0] == "state" else _LOWER)[:lower])
+    for name, one in plant.outputs.items():
+        if not (takes(one.expression, lower + 1) or takes(one.expression, lower + 2)):
+            mistakes.add(
+                f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
+                f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
+            )
+
+
 def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the outputs to `mistakes`."""
-    for name, one in plant.outputs.items():
-        lower = max(plant.orders, default=0)
-        if takes(one.expression, lower + 1) or takes(one.expression, lower + 2):
-            with mistakes.caught():
-                _check_output(plant, name, mistakes)
-            continue
-        names = ", ".join((["x"] if words(plant)[0] == "state" else _LOWER)[:lower])
-        mistakes.add(
-            f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
-            f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
-        )
+    for name in plant.outputs:
+        with mistakes.caught():
+            _check_output(plant, name, mistakes)
 
 
 def _check_output(plant: Plant, name: str, mistakes: Mistakes) -> None:
