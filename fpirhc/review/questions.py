@@ -30,10 +30,9 @@ WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size
 ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
 MOSTLY, BUSY = 0.5, 2.0  # share of the cycles at a limit that shows no loop; times the movement without adaptation
-OFFSET = 0.8  # share of the rms error from which on its mean is most of it
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
 CALM, CHATTER = 0.1, 0.01  # step of a command a cycle, as a share of what it covers: mean, and rms from noise
-SATURATED, UNUSED = 0.2, 0.01  # share of the cycles at a limit; largest command as a share of its limit
+SATURATED, UNUSED, OFFSET = 0.2, 0.01, 0.8  # share of cycles at a limit; command as one of it; mean as one of rms
 
 Numbers = Mapping[str, float]
 
@@ -392,8 +391,9 @@ def gain_by_run(case: Case) -> Fact:
         numbers |= {"error_recommended": tries[best].error, "movement_recommended": tries[best].moves[worst]}
         told = f"Set the {name} to {times * value:.4g}."
         change = f"Filter the error of the map: Filtered(map, pole={pole:g})." if pole else told
-    reserve, costs = largest >= 2 and tries[SMALLER[0]].good, tries[best].error > WORSE * tries[TODAY].error
-    verdict = Verdict.NO if not good else Verdict.YES if (reserve or costs) and not busy else Verdict.CAUTION
+    reserve = largest >= 2 and (best == TODAY or tries[SMALLER[0]].good)
+    enough = reserve or tries[best].error > WORSE * tries[TODAY].error  # or it costs too much
+    verdict = Verdict.NO if not good else Verdict.YES if enough and not busy else Verdict.CAUTION
     return Fact(verdict, numbers, of, change)
 
 
