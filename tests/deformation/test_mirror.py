@@ -163,7 +163,7 @@ def test_paired_through_the_lag_the_command_is_quiet(lag):
 
 @pytest.mark.parametrize("wrong", ["", "mass", "friction"])
 def test_the_model_is_where_the_sensors_show_a_plant_of_states(wrong):
-    """A lift whose acceleration is no state: an exact model is left alone, a wrong one does not drift away from the measured height."""
+    """A lift whose acceleration is no state: an exact model is left alone, a wrong one does not drift from the measured height."""
 
     def rates(x, u, p):
         force = 200 * x.pressure - p.friction * x.speed
