@@ -46,8 +46,7 @@ NEAR = 2e-3  # m; the motion has 0.4 m
 def stays_away(law: Tracking, deformation: Deformation, spikes=SPIKES) -> dict[str, float]:
     """Distance to the undisturbed motion after the stated time, of every spike where it is too large."""
     own = Lossy(PROBLEM, fp.ComputedTorque(law, deformation))
-    assert law.speed is not None
-    back, after = round(RETURNS / law.speed / PROBLEM.period), 20
+    back, after = round(RETURNS / law.rate / PROBLEM.period), 20
 
     def motion(what: str = "", size: float = 0.0, at: int = -1, cycles: int = 220 + back) -> np.ndarray:
         """Positions of the two masses; one sample of the states or of the responses has this size."""
