@@ -21,12 +21,12 @@ from fpirhc.deformation.base import own_gain
 from fpirhc.deformation.wrappers.filtered import with_filter
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.chain import zero_dynamics
-from fpirhc.review.experiments import LATENCY, PLACES, PROBE, Bench, Case, NotAsked, predictor
+from fpirhc.review.experiments import FAILS, LATENCY, PLACES, PROBE, WORSE, Bench, Case, NotAsked, predictor
 from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
 
-WORSE, SLIGHT = 1.2, 1e-3  # ratio of errors; added error as a share of the size of the task
+SLIGHT, LITTLE = 1e-3, 0.9  # added error as a share of the size of the task; ratio of errors that is worth another gain
 ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
 GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
 MOSTLY, BUSY = 0.5, 2.0  # share of the cycles at a limit that shows no loop; times the movement without adaptation
@@ -92,11 +92,10 @@ def _inverse(case: Case) -> Fact:
 def _ranges(case: Case) -> Fact | None:
     if not case.outside:
         return None
-    sensing = case.problem.sensing
-    shown = sensing.measures(case.problem.plant)
-    free = [n for n in shown if n not in sensing.sensors or sensing.sensors[n].range is None]
-    numbers = {"without": len(free), "measured": len(shown)}
-    return Fact(Verdict.CAUTION if free else Verdict.YES, numbers, ", ".join(free))
+    shown, sensors = case.problem.sensing.measures(case.problem.plant), case.problem.sensing.sensors
+    free = [n for n in shown if n not in sensors or sensors[n].range is None]
+    verdict = Verdict.CAUTION if free else Verdict.YES
+    return Fact(verdict, {"without": len(free), "measured": len(shown)}, ", ".join(free))
 
 
 def _follows(case: Case) -> Fact:
@@ -165,7 +164,7 @@ def _plans(case: Case) -> Fact | None:
     share = float(np.mean(bench.nominal["status"] == Status.NOT_CONVERGED))
     numbers = {"not_converged": share}
     if more is None or (share == 0 and bench.sound):  # nothing that more of them could mend
-        return Fact(graded(share, 0.05, math.inf), numbers)
+        return Fact(graded(share, FAILS, math.inf), numbers)
     own, long = bench.share(bench.start), bench.share(more.start)
     better = long < own / WORSE and own - long > SLIGHT
     verdict = Verdict.NO if case.lacks_iterations else Verdict.CAUTION if better else Verdict.YES

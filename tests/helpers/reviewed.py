@@ -271,3 +271,23 @@ def servo() -> fp.Problem:
         horizon=fp.Horizon(stages=20, step=0.1),
         cost=fp.Quadratic(outputs={"angle": 1e3, "angle'": 1.0}, rate={"V": 1e-4}),
     )
+
+
+def lift() -> fp.Problem:
+    """A hydraulic lift of 400 kg, whose map swings at gain -1 with plans every ten cycles: movement 827 where 20 are needed."""
+    rates = lambda x, u, p: {  # noqa: E731
+        "y": x.v,
+        "v": (200 * x.bar - p.friction * x.v) / p.mass - 9.81,
+        "bar": p.stiff * (u.flow - p.leak * x.bar - 120 * x.v),
+    }
+    off = {"mass": (400, 650), "friction": (500, 1500), "stiff": (20, 14), "leak": (0, 0.08)}
+    parameters = {name: fp.Parameter(*both, "1") for name, both in off.items()}
+    given = {"states": {"y": "m", "v": "m/s", "bar": "bar"}, "inputs": {"flow": "l/min"}, "parameters": parameters}
+    return fp.Problem(
+        fp.Plant.of_states(**given, rates=rates, outputs={"y": fp.Output("m", lambda x, p: x.y)}),
+        fp.Trajectory(lambda t: {"y": 0.5 - 0.4 * ca.cos(0.8 * t)}),
+        {"y": 0.1, "v": 0.0, "bar": 19.62},
+        **{"period": 2e-3, "duration": 8.0, "measure_from": 2.0, "limits": fp.Limits(inputs={"flow": (-60.0, 60.0)})},
+        horizon=fp.Horizon(stages=20, step=0.02),
+        cost=fp.Quadratic(outputs={"y": 1e4}, rate={"flow": 1e-4}),
+    )

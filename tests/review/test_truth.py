@@ -116,6 +116,14 @@ CASES: dict[str, Case] = {
         never=("problem", "-1.97", "-2.12"),
         changes={("-1.0", "returns"): "Set the gain to -2."},
     ),
+    "a map that swings while plans converge": Case(
+        lambda: (
+            reviewed.lift(),
+            {"it": fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(gain=-1.0)))},
+        ),
+        {("it", "plans"): "yes", ("it", "gain"): "caution", ("it", "horizon"): "yes"},
+        changes={("it", "gain"): "Set the gain to -2."},
+    ),
     "an inverse with two branches": Case(
         foreign("cstr", "RHC", "RHC+FPI"),
         {("RHC", "follows"): "yes", ("RHC", "returns"): "yes", ("RHC+FPI", "model"): "no", ("RHC+FPI", "pays"): "no"},
@@ -197,7 +205,7 @@ def said(name: str) -> dict[tuple[str, str], Any]:
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
-LONG = "two pend", "a servo", "an own", "an inverse", "a limit of", "an unst", "a dead time", "a person"  # 4 s and more
+LONG = "two pend", "a map", "a servo", "an own", "an inv", "a limit of", "an unst", "a dead", "a person"  # 4 s and more
 
 
 @pytest.mark.parametrize("name", slow_but(CASES, *(n for n in CASES if not n.startswith(LONG))))
