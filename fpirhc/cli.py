@@ -345,7 +345,9 @@ def study(
     "probe my_arm.py --recording run.csv         from a record of a run",
 )
 def probe(
-    problem: Problem, controller: Annotated[str | None, _given("NAME", "that runs the plant [default: first that can]")] = None,
+    problem: Problem, controller: Annotated[
+        str | None, typer.Option("--controller", "-c", metavar="NAME", help="that runs the plant [default: first that can]")
+    ] = None,
     cycles: Annotated[int | None, _given("N", "length of the excitation [default: 300]")] = None,
     amplitude: Annotated[float | None, _given("NUMBER", "size of the excitation, in the unit of the response")] = None,
     recording: Annotated[Path | None, _given("CSV", "estimate from a recorded run: time, inputs, measurements")] = None,
