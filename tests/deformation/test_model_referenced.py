@@ -81,7 +81,11 @@ def test_exact_model_is_left_alone(name):
     adaptive = task.controllers[task.headline[1]]
     if not adaptive.deformation.adapts or adaptive.deforms != "response":
         pytest.skip("its headline deforms no response")
-    problem = with_exact_model(task.problem)
+    if name == "diabetes_announced":
+        pytest.skip("its meals end within a step of the model, which only its reality can have")
+    late = task.problem.dead_time  # whole cycles, by which a model can be late
+    late = replace(late, measurement=np.ceil(late.measurement / task.problem.period) * task.problem.period)
+    problem = with_exact_model(replace(task.problem, dead_time=late))
     problem = short(problem, min(100, problem.cycles))
     sign = -1.0 if adaptive.deformation.effective_gain() < 0 else 1.0
     map = fp.Sigmoid(gain=-0.5 * sign, shift=0.3 * sign, scale=50.0)
