@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fpirhc.controllers.contract import tracking_law
 from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.deformation.wrappers.filtered import with_filter
@@ -26,9 +27,8 @@ from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
 
-SLIGHT, LITTLE = 1e-3, 0.9  # added error as a share of the size of the task; ratio of errors that is worth another gain
-ROUNDING, MINOR = 1e-6, 1e-3  # error that shows nothing, as such a share; added one, as a share of the largest error
-GOOD, BAD = 0.5, 1.0  # error as a share of the task; what is left of a push
+SLIGHT, MINOR, LITTLE = 1e-3, 1e-3, 0.9  # added error, as a share of the task and of the largest; ratio worth a change
+ROUNDING, GOOD, BAD = 1e-6, 0.5, 1.0  # error as a share of the task; the last two also for what is left of a push
 MOSTLY, BUSY = 0.5, 2.0  # share of the cycles at a limit that shows no loop; times the movement without adaptation
 GAINS = (1.4, 2.0), (0.7, 0.5)  # of the inputs, which are tried until one is not borne
 CALM, CHATTER = 0.1, 0.01  # step of a command a cycle, as a share of what it covers: mean, and rms from noise
@@ -94,14 +94,15 @@ def _ranges(case: Case) -> Fact | None:
         return None
     shown, sensors = case.problem.sensing.measures(case.problem.plant), case.problem.sensing.sensors
     free = [n for n in shown if n not in sensors or sensors[n].range is None]
-    verdict = Verdict.CAUTION if free else Verdict.YES
-    return Fact(verdict, {"without": len(free), "measured": len(shown)}, ", ".join(free))
+    return Fact(Verdict("caution" if free else "yes"), {"without": len(free), "measured": len(shown)}, ", ".join(free))
 
 
 def _follows(case: Case) -> Fact:
     bench, (name, share) = case.bench, case.bench.worst(case.bench.nominal)
     rms, errors, verdict = bench.errors(bench.nominal)[name], bench.nominal["true_error"], graded(share, GOOD, BAD)
     numbers = {"rms_error": rms, "error": share, "size": bench.sizes[name]}
+    if verdict != Verdict.YES and bench.controller.deformation.adapts and case.plain.share(case.plain.nominal) <= GOOD:
+        return Fact(verdict, numbers, name, "Adaptation spoils it: {by_gain}.")
     column, by = errors[bench.first(len(errors)) :, case.problem.judged_names.index(name)], predictor(bench.controller)
     if by is None or by.residual_time or abs(column.mean()) <= OFFSET * rms or not 0.01 < share < math.inf:
         return Fact(verdict, numbers, name)
@@ -162,13 +163,12 @@ def _plans(case: Case) -> Fact | None:
     if bench.controller.planner is None or not bench.nominal.cycles:
         return None
     share = float(np.mean(bench.nominal["status"] == Status.NOT_CONVERGED))
-    numbers = {"not_converged": share}
     if more is None or (share == 0 and bench.sound):  # nothing that more of them could mend
-        return Fact(graded(share, FAILS, math.inf), numbers)
+        return Fact(graded(share, FAILS, math.inf), {"not_converged": share})
     own, long = bench.share(bench.start), bench.share(more.start)
     better = long < own / WORSE and own - long > SLIGHT
     verdict = Verdict.NO if case.lacks_iterations else Verdict.CAUTION if better else Verdict.YES
-    return Fact(verdict, {**numbers, "error": own, "error_with_more_iterations": long})
+    return Fact(verdict, {"not_converged": share, "error": own, "error_with_more_iterations": long})
 
 
 def _horizon(case: Case) -> Fact | None:
@@ -334,6 +334,7 @@ SAID = {TODAY: "error", TURNED: "error_turned", SMALLER[0]: "error_at_half", LAR
         LARGER[1]: "error_at_four_times"}  # fmt: skip
 
 
+@lru_cache(maxsize=1)
 def _tries(case: Case) -> dict[tuple[float, float], Try]:
     """Runs with other gains and filters: calm is what moves no command by more than is allowed or than today; good what helps."""
     own, tries, busy = case.bench, dict[tuple[float, float], Try](), _busy(case)
@@ -363,14 +364,16 @@ def _tries(case: Case) -> dict[tuple[float, float], Try]:
 
 @lru_cache(maxsize=1)  # noise asks it, too
 def gain_by_run(case: Case) -> Fact:
-    """Return errors at other gains and the recommended one: half of the largest that is good, or else the best; always a calm one.
-
-    Where noise moves a command too much with today's gain, it is the best of smaller ones and of filters.
-    """
+    """Return errors at other gains and a calm one with reserve, or the best; in much noise a smaller one or a filter."""
     case.asks_more()
-    busy, tries, before = _busy(case), _tries(case), case.plain.moves(case.plain.start)
-    good, now, fine = tries[TODAY].good, tries[TODAY].moves, [way for way, one in tries.items() if one.good]
-    largest, calm = max(fine, default=TODAY)[0], [way for way in fine if tries[way].calm]
+    busy, tries, plain = _busy(case), _tries(case), case.plain
+    before, alone, now, error = plain.moves(plain.start), plain.share(plain.counted), *tries[TODAY][1::-1]
+    good, fine = tries[TODAY].good, [way for way, one in tries.items() if one.good]
+    most = error * (LITTLE if good or plain.lost else 1.0)
+    spare = lambda way: good and way[0] < 1  # noqa: E731  its reserve is worth it, unless it costs too much
+    pays = lambda way: tries[way].error < alone and (spare(way) or busy or tries[way].error <= most)  # noqa: E731
+    largest, tame = max(fine, default=TODAY)[0], [way for way in fine if tries[way].calm]
+    calm = [way for way in tame if way == TODAY or pays(way) or (spare(way) and tries[way].error > WORSE * error)]
     best = min(calm, key=lambda way: tries[way].error, default=TODAY)
     if not good and TURNED in calm and tries[TURNED].error <= WORSE * tries[best].error:
         best = TURNED
@@ -378,10 +381,10 @@ def gain_by_run(case: Case) -> Fact:
         best = max((way for way in calm if 0 < 2 * way[0] <= largest), default=best)
     worst = int((now / np.maximum(before, 1e-300)).argmax())
     of, numbers = list(case.problem.plant.inputs)[worst], {"movement": now[worst], "movement_without": before[worst]}
-    numbers |= {SAID[way]: one.error for way, one in tries.items() if way in SAID}
+    numbers |= {"error_without": alone} | {SAID[way]: one.error for way, one in tries.items() if way in SAID}
     if not good and not calm:
-        change = "No gain that was tried helps: use another form, or leave the deformation out."
-        return Fact(Verdict.UNKNOWN, numbers, of, change)
+        change = f"No gain that was tried helps: {{other}}{', or leave the deformation out' if alone <= error else ''}."
+        return Fact(Verdict.NO if tame else Verdict.UNKNOWN, numbers, of, change)
     (times, pole), (name, value) = best, own_gain(case.bench.controller.deformation)
     if best != TODAY or (largest >= 2 and not busy):  # else it is not calm, or has no reserve
         numbers |= {"recommended_times": times, "recommended_gain": times * value}
@@ -391,9 +394,39 @@ def gain_by_run(case: Case) -> Fact:
         told = f"Set the {name} to {times * value:.4g}."
         change = f"Filter the error of the map: Filtered(map, pole={pole:g})." if pole else told
     reserve = largest >= 2 and (best == TODAY or tries[SMALLER[0]].good)
-    enough = reserve or tries[best].error > WORSE * tries[TODAY].error  # or it costs too much
+    enough = reserve or tries[best].error > WORSE * error  # or it costs too much
     verdict = Verdict.NO if not good else Verdict.YES if enough and not busy else Verdict.CAUTION
     return Fact(verdict, numbers, of, change)
+
+
+def cures(case: Case) -> dict[str, str]:
+    """What this loop has, for sentences: its gain is changed as the gain's row says, and lowered where a run bears that."""
+    own, problem = case.bench.controller, case.problem
+    law, window = tracking_law(own) is not None, hasattr(problem.sensing.estimator, "window")
+    plain = "lower the rate of the tracking law" if law else "choose slower settings of this controller"
+    plain = "weigh the changes of the inputs more in the cost" if own.planner else plain
+    sensor = "widen the window of the estimator" if window else "measure the response with less noise"
+    settings = "horizon, weights" if own.planner else "rate of the tracking law" if law else "its settings"
+    late = "predict the dead time: Predicted(controller, inputs=...)"
+    late = late if problem.dead_time.queued else "measure the latency and state it: Problem(dead_time=...)"
+    late = "have the stated dead time right to one cycle" if predictor(own) else late
+    other = [late] * bool(problem.dead_time.queued) + ["shorten the window of the estimator"] * window
+    starts = own.planner and own.planner.restarts and own.planner.starts_consistent(problem.plant)
+    ways = (
+        "RecedingHorizon(replanning=FromMeasurement(consistent=False)), " * bool(starts) + "a shorter window, " * window
+    )
+    ways = f"the start of the plan or the estimator's window is the cause: {ways}or leave" if ways else "leave"
+    known = f"Its map is model-referenced already: {ways}", "Use ModelReferenced(map), or leave"
+    told = {"referenced": known[own.deformation.form.compares != "model"], "sensor": sensor, "settings": settings, "dead": late,
+            "quieter": f"{plain}, or {sensor}", "other": ", or ".join(other) or "use another form", "slower": plain,
+            "by_gain": "leave it out"}  # fmt: skip
+    with suppress(FpirhcError, ValueError, ArithmeticError):
+        if own.deformation.adapts:
+            said = gain_by_run(case).change.removesuffix(".").format(**told) or told["by_gain"]
+            told["by_gain"] = said = said[:1].lower() + said[1:]
+            lowers = any(one.good and 0 < times < 1 for (times, _), one in _tries(case).items())
+            told["slower"] = said if said.startswith(("set", "filter")) else "lower the gain" if lowers else plain
+    return told
 
 
 def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) -> tuple[str, dict[str, float], float]:
@@ -436,71 +469,62 @@ def _pays(case: Case) -> Fact:
 
 
 QUESTIONS = (
-    Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns,
-             "jumps of {of} in {whole}: {jumps}", "The angle jumps by a whole turn: unwrap it (an angle that goes on), or "
-             "weigh 1 - cos of its error.", "problem"),
+    Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns, "jumps of {of} in {whole}: "
+             "{jumps}", "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error.",
+             "problem"),
     Question("posed", "Has the reference finite commands?", _posed, "finite in {share_finite:%} of the cycles of {whole}",
              "Give it the derivatives that the plant's order needs, away from singular states.", "problem"),
-    Question("inverse", "Can the response be inverted where it goes?", _inverse,
-             "largest condition number of the scaled input matrix in {whole}: {condition}",
-             "Keep the plant away from states where inputs lose their effect.", "problem"),
+    Question("inverse", "Can the response be inverted where it goes?", _inverse, "largest condition number of the scaled input "
+             "matrix in {whole}: {condition}", "Keep the plant away from states where inputs lose their effect.", "problem"),
     Question("ranges", "Is it stated what working sensors show?", _ranges, "{without} of {measured} quantities are without| {of}",
              "State it, so that a failed sensor is not believed: Sensor(range=(lower, upper)).", "problem"),
-    Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of the plans of {whole} did not converge"
-             "| relative rms error {error:%} ({start})| {error_with_more_iterations:%} with 8 times the iterations",
-             "Give the optimiser more iterations, or a smaller tolerance, before anything else."),
-    Question("gain", "Is the gain admissible?", gain_by_run, "relative rms error {error:%} ({tried})"
-             "| {error_recommended:%} as recommended| {error_at_half:%} at half of the gain| {error_at_twice:%} at twice"
-             "| {error_at_four_times:%} at four times| {error_turned:%} with the other sign| recommended gain {recommended_gain:4}"
-             "| total variation of {of} {movement:r} ({start})| {movement_recommended:r} as recommended"
-             "| {movement_without:r} without adaptation",
-             "There is no reserve: with twice this gain it is lost or chatters, or with half of it adaptation harms.", "adaptive"),
-    Question("follows", "Does it follow the reference?", _follows,
-             "rms error of {of} {rms_error:u} ({counted}), {error:%} of its motion of {size:u}| mean {mean_error:u}",
-             "Mend the loop without adaptation first: {settings}, limits, period."),
-    Question("input_limits", "Do the input limits fit the task?", _saturates,
-             "a command or its change at a limit in {at_a_limit:%} of the cycles ({counted})"
-             "| largest {of} {largest:u}, {share_of_the_limit:%} of its limit"
-             "| by the model or the plant the reference needs {needed:%}",
-             "Slow the reference, widen the limits, or mend the model."),
-    Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges "
-             "{left:%} is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle"
-             "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}"
-             "| commands change by {mean_step:%} of what they cover a cycle", "{slower}, shorten the period, or {dead}."),
-    Question("horizon", "Is the horizon long enough?", _horizon,
-             "relative rms error {error:%} ({half})| {error_with_twice_the_horizon:%} with twice the stages",
-             "Lengthen it, or weigh its end (LQRTerminal)."),
-    Question("box", "Does it come back for every plant in the range of the parameters?", _box,
-             "{share_that_come_back:%} of {plants} plants| in the worst case {left:%} of a push left after {pushed}"
-             "| relative rms error {error:%} ({start})", "Narrow the range of the parameters, or {slower}."),
-    Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains,
-             "it comes back at {least} to {most} times their gain", "{slower}: with more gain of the inputs it is lost."),
-    Question("latency", "Does it bear a cycle of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})"
-             "| with {cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation"
-             "| commands change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency"
-             "| {left:%} of a push left after {pushed}", "Slow the loop, or {dead}."),
-    Question("limits", "Do states, rates and paths keep their limits?", _left,
-             "beyond a limit in {share_of_cycles:%} of the cycles of {whole}"
-             "| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}",
-             "Commands keep intervals of inputs and rates: slow the reference, or leave room."),
-    Question("inner", "Are the zero dynamics stable?", _inner, "largest real part {rate_with_outputs_held} 1/{time}"
-             "| time constant {time_constant} {time}| doubles in {doubles_in} {time}| {left:%} of a push left after {pushed}",
-             "States without a task go off: weigh them in the cost, or control another output."),
-    Question("noise", "Is the chatter from noise small?", _noise,
-             "noise changes {of} by {rms_change:u} rms per cycle, {rms_step:%} of what it covers ({start})"
-             "| total variation {movement:r}| {movement_without_noise:r} without noise"
+    Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of the plans of {whole} did not converge| relative "
+             "rms error {error:%} ({start})| {error_with_more_iterations:%} with 8 times the iterations", "Give the optimiser more "
+             "iterations, or a smaller tolerance, before anything else."),
+    Question("gain", "Is the gain admissible?", gain_by_run, "relative rms error {error:%} ({tried})| {error_without:%} without "
+             "adaptation| {error_recommended:%} as recommended| {error_at_half:%} at half of the gain| {error_at_twice:%} at "
+             "twice| {error_at_four_times:%} at four times| {error_turned:%} with the other sign| recommended gain "
+             "{recommended_gain:4}| total variation of {of} {movement:r} ({start})| {movement_recommended:r} as recommended| "
+             "{movement_without:r} without adaptation", "There is no reserve: with twice this gain it is lost or chatters, or with "
+             "half of it adaptation harms.", "adaptive"),
+    Question("follows", "Does it follow the reference?", _follows, "rms error of {of} {rms_error:u} ({counted}), {error:%} of its "
+             "motion of {size:u}| mean {mean_error:u}", "Mend the loop without adaptation first: {settings}, limits, period."),
+    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change at a limit in "
+             "{at_a_limit:%} of the cycles ({counted})| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the "
+             "model or the plant the reference needs {needed:%}", "Slow the reference, widen the limits, or mend the model."),
+    Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges {left:%} "
+             "is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle| time constant "
+             "{time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}| commands change by "
+             "{mean_step:%} of what they cover a cycle", "{slower}, shorten the period, or {dead}."),
+    Question("horizon", "Is the horizon long enough?", _horizon, "relative rms error {error:%} ({half})| "
+             "{error_with_twice_the_horizon:%} with twice the stages", "Lengthen it, or weigh its end (LQRTerminal)."),
+    Question("box", "Does it come back for every plant in the range of the parameters?", _box, "{share_that_come_back:%} of "
+             "{plants} plants| in the worst case {left:%} of a push left after {pushed}| relative rms error {error:%} ({start})",
+             "Narrow the range of the parameters, or {slower}."),
+    Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it comes back at {least} to {most} "
+             "times their gain", "{slower}: with more gain of the inputs it is lost."),
+    Question("latency", "Does it bear a cycle of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})| with "
+             "{cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation| commands "
+             "change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency| {left:%} of a push left "
+             "after {pushed}", "Slow the loop, or {dead}."),
+    Question("limits", "Do states, rates and paths keep their limits?", _left, "beyond a limit in {share_of_cycles:%} of the "
+             "cycles of {whole}| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}", "Commands keep "
+             "intervals of inputs and rates: slow the reference, or leave room."),
+    Question("inner", "Are the zero dynamics stable?", _inner, "largest real part {rate_with_outputs_held} 1/{time}| time constant "
+             "{time_constant} {time}| doubles in {doubles_in} {time}| {left:%} of a push left after {pushed}", "States without a "
+             "task go off: weigh them in the cost, or control another output."),
+    Question("noise", "Is the chatter from noise small?", _noise, "noise changes {of} by {rms_change:u} rms per cycle, "
+             "{rms_step:%} of what it covers ({start})| total variation {movement:r}| {movement_without_noise:r} without noise"
              "| relative rms error {error:%}| {error_without_noise:%} without noise", "{quieter}."),
-    Question("bias", "Does it bear a bias of the measured response?", _bias,
-             "a bias of 1 % of the response's range adds {added_by_a_bias:u} to the error of {of} ({late})"
-             "| one of {share_of_the_response:%} costs what adaptation gains| relative rms error {error:%} ({start})"
-             "| {error_with_right_sensors:%} with right sensors", "Calibrate the sensor: a bias moves the plant.", "adaptive"),
-    Question("model", "Does it spoil a right model less than it cures yours?", _model,
-             "model as the plant, without noise and disturbances: rms error of {of} {error_without:u} without adaptation"
-             "| {error_with:u} with it ({counted})",
-             "Use ModelReferenced(map), or leave the deformation out.", "adaptive"),
+    Question("bias", "Does it bear a bias of the measured response?", _bias, "a bias of 1 % of the response's range adds "
+             "{added_by_a_bias:u} to the error of {of} ({late})| one of {share_of_the_response:%} costs what adaptation gains| "
+             "relative rms error {error:%} ({start})| {error_with_right_sensors:%} with right sensors", "Calibrate the sensor: a "
+             "bias moves the plant.", "adaptive"),
+    Question("model", "Does it spoil a right model less than it cures yours?", _model, "model as the plant, without noise and "
+             "disturbances: rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
+             "{referenced} the deformation out.", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "rms error of {of} {error_without:u} without "
              "adaptation| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "
-             "({counted})| divided by {divided_by}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...",
-             "adaptive"),
+             "({counted})| {ratio}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...", "adaptive"),
 )  # fmt: skip
 ROOTS = ("turns", "posed", "plans", "gain")  # whose no is the cause of the others: their sentence stands there too

@@ -291,3 +291,18 @@ def lift() -> fp.Problem:
         horizon=fp.Horizon(stages=20, step=0.02),
         cost=fp.Quadratic(outputs={"y": 1e4}, rate={"flow": 1e-4}),
     )
+
+
+def tank() -> fp.Problem:
+    """A level behind a pump of 1.5 s of dead time, with a window of 7 s: no gain is better than none without a prediction."""
+    both = {"c": fp.Parameter(2e-3, 4e-3, "m^2.5/s"), "area": fp.Parameter(0.5, 0.35, "m^2")}
+    level = lambda q, u, p: {"h": (1e-3 * u.pump - p.c * ca.sqrt(q.h)) / p.area}  # noqa: E731
+    return fp.Problem(
+        fp.Plant({"h": "m"}, {"pump": "l/s"}, both, level, order=1),
+        fp.Trajectory(lambda t: {"h": 1 + 0.3 * ca.sin(0.05 * t)}),
+        {"h": 0.8},
+        **{"period": 0.5, "duration": 300.0, "measure_from": 60.0, "limits": fp.Limits(inputs={"pump": (0.0, 25.0)})},
+        sensing=fp.Sensing({"h": fp.Sensor(noise=fp.Noise(1e-3))}, fp.SavitzkyGolay(window=15, degree=1)),
+        **{"dead_time": fp.DeadTime(inputs={"pump": 1.5}), "horizon": fp.Horizon(stages=20, step=1.0)},
+        cost=fp.Quadratic(states={"h": 1e4}, deviation={"pump": 1e-2}),
+    )

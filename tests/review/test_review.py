@@ -18,7 +18,7 @@ NAMES = {  # of numbers by key, which scripts read
     "turns": {"jumps"}, "posed": {"share_finite"}, "inverse": {"condition"},
     "ranges": {"without", "measured"}, "plans": {"not_converged", "error", "error_with_more_iterations"},
     "gain": {"error", "error_recommended", "error_at_half", "error_at_twice", "error_at_four_times", "error_turned",
-             "recommended_times", "recommended_gain", "movement", "movement_recommended", "movement_without"},
+             "recommended_times", "recommended_gain", "error_without", "movement", "movement_recommended", "movement_without"},
     "follows": {"rms_error", "error", "size", "mean_error"},
     "input_limits": {"at_a_limit", "largest", "share_of_the_limit", "needed"},
     "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "doubles_in", "mean_step"},

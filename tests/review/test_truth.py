@@ -21,6 +21,10 @@ import fpirhc as fp
 
 UNWRAP = "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error."
 Pick = Callable[[], tuple[fp.Problem, dict[str, Any]]]
+SHORTER, LEAVE = "or shorten the window of the estimator, ", "or leave the deformation out."
+LATE = "No gain that was tried helps: predict the dead time: Predicted(controller, inputs=...), "
+BUSY = "Weigh the changes of the inputs more in the cost: with more gain of the inputs it is lost."
+START = "Its map is model-referenced already: the start of the plan or the estimator's window is the cause: RecedingHorizon("
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
 
 
@@ -47,6 +51,7 @@ def foreign(name: str, *controllers: str, variant: str = "problem") -> Pick:
     return shipped(name, *controllers, of=lambda n: load(n, variant))
 
 
+sigmoid = lambda gain: fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(gain=gain)))  # noqa: E731
 SERVO = -1.0, -1.97, -2.12
 CTC6, PAIRED = "CTC+FPI (eq 6)", "CTC+FPI paired"
 CASES: dict[str, Case] = {
@@ -74,6 +79,9 @@ CASES: dict[str, Case] = {
         {("RHC", "limits"): "yes", ("RHC+FPI", "limits"): "yes", ("RHC+FPI", "pays"): "no"},
         {("RHC", "limits", "share_of_cycles"): (0, 0), ("RHC+FPI", "pays", "error_without"): (0.637, 0.01)},
         never=("problem",),
+        changes={
+            ("RHC+FPI", "follows"): f"Adaptation spoils it: no gain that was tried helps: use another form, {LEAVE}"
+        },
     ),
     "an angle that wraps": Case(
         lambda: (turntable(lambda t: ca.atan2(ca.sin(t), ca.cos(t))), plans(iterations=2)),
@@ -117,12 +125,20 @@ CASES: dict[str, Case] = {
         changes={("-1.0", "returns"): "Set the gain to -2."},
     ),
     "a map that swings while plans converge": Case(
-        lambda: (
-            reviewed.lift(),
-            {"it": fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(gain=-1.0)))},
-        ),
+        lambda: (reviewed.lift(), {"it": sigmoid(-1.0)}),
         {("it", "plans"): "yes", ("it", "gain"): "caution", ("it", "horizon"): "yes"},
         changes={("it", "gain"): "Set the gain to -2."},
+    ),
+    "a dead time that no gain makes up for": Case(
+        lambda: (reviewed.tank(), {"it": sigmoid(-0.3), "predicted": fp.Predicted(sigmoid(-0.6), inputs=1.5)}),
+        {("it", "gain"): "no", ("predicted", "gain"): "yes", ("predicted", "returns"): "caution"},
+        {("it", "gain", "error_without"): (0.0865, 1e-3), ("it", "gain", "error"): (0.0956, 1e-3)},
+        changes={("it", "gain"): LATE + SHORTER + LEAVE, ("predicted", "input_gain"): BUSY},
+    ),
+    "a map of a right model behind a window that is too long": Case(
+        lambda: (replace(reviewed.lift(), sensing=fp.Sensing({}, fp.SavitzkyGolay(41, 3))), {"it": sigmoid(-2.0)}),
+        {("it", "model"): "no"},
+        changes={("it", "model"): f"{START}replanning=FromMeasurement(consistent=False)), a shorter window, {LEAVE}"},
     ),
     "an inverse with two branches": Case(
         foreign("cstr", "RHC", "RHC+FPI"),
@@ -258,6 +274,7 @@ def test_the_harm_of_a_bias_is_that_of_runs():
     pair = [rms(biased(1.0), one) for one in plans().values()]
     assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=0.02)
     assert pair[1] > 1.2 * pair[0]
+    assert f"{pair[1] / pair[0]:.2g}" in found.evidence.split(", ")[-1].removesuffix(" times larger")
 
 
 @pytest.mark.slow
