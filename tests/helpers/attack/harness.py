@@ -139,7 +139,7 @@ class Bench:
         memories = [self.stepper.start()] * 2
         x = np.array(self.problem.start_state)
         generator = np.random.default_rng(0)
-        size = self.stepper.signals["desired"].size
+        size = len(self._names)
         for k in range(fault.first + 10):
             state, realised = x + 1e-3 * generator.standard_normal(x.size), generator.standard_normal(size)
             clean = Cycle(k, k * self.problem.period, state, realised, memories[1], [])
