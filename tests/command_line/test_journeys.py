@@ -209,7 +209,9 @@ def test_plans_are_certified_side_by_side(folder, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     receding()
     assert main(["compare", "line.py", "--plans", "--optimisers", "fixed-point", "ipopt"]) == 0
-    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] in (["FixedPoint"], ["IPOPT"])]
+    rows = [
+        line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] in (["FixedPoint"], ["IPOPT"])
+    ]
     assert len({row[1] for row in rows}) == 1
     assert all(float(row[4]) < 1 and float(row[5]) < 1e-3 for row in rows)
     assert (folder / "results/line/plan.png").stat().st_size > 10_000

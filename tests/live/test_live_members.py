@@ -19,9 +19,10 @@ KALMAN = fp.Estimating(
     fp.ComputedTorque(TRACKING, SIGMOID), fp.DisturbanceKalman({"a": 1.0, "b": 1.0}, MEASURED, noise={"a": 0.1})
 )
 STRUCTURE = "decides what the loop is made of", "does not use it"
-COMPUTED = (  # by Python
+# By Python.
+COMPUTED = (
     "needs its number while the loop is built",
-    "the code of the optimiser is computed",
+    "code of the optimiser is computed",
     "turns one of them into a number",
 )
 WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}, "deviation": {"Fa": 1e-3, "Fb": 1e-3}}
