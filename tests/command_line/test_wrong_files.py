@@ -215,6 +215,7 @@ limits reversed
     'pump1' has lower 2.0 above upper 0.0; swap them ... 'h1' has lower 2.0 above upper 0.0; swap them
 gain of the wrong sign
   gain=-0.7 -> gain=0.7
+  {"pump1": (0.0, 2.0), "pump2": (0.0, 2.0)} -> {"pump1": (-2.0, 2.0), "pump2": (-2.0, 2.0)}
     no Is the gain admissible? ... Set the gain to -0.7
 """
 OTHERS = {
