@@ -493,8 +493,8 @@ QUESTIONS = (
              "{at_a_limit:%} of the cycles ({counted})| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the "
              "model or the plant the reference needs {needed:%}", "Slow the reference, widen the limits, or mend the model."),
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges {left:%} "
-             "is left| {halfway} after one by 10 % {left_of_ten_times:%}| contraction factor {factor:5} per cycle| time constant "
-             "{time_constant} {time}| doubles in {doubles_in} {time}| largest factor {largest_factor:5}| commands change by "
+             "is left| {halfway} after one by 10 % {left_of_ten_times:%}| a cycle leaves {factor:5} of it| time constant "
+             "{time_constant} {time}| doubles in {doubles_in} {time}| at worst {largest_factor:5}| commands change by "
              "{mean_step:%} of what they cover a cycle", "{slower}, shorten the period, or {dead}."),
     Question("horizon", "Is the horizon long enough?", _horizon, "relative rms error {error:%} ({half})| "
              "{error_with_twice_the_horizon:%} with twice the stages", "Lengthen it, or weigh its end (LQRTerminal)."),
