@@ -1,4 +1,4 @@
-"""Limits of other quantities than states: rates of inputs, paths, and the end of the horizon.
+"""Limits of other quantities than states: rates of inputs, and paths.
 
 Each limit adds an entry z to the stage's state, z_{i+1} = c(s_i, u_i, theta_i), with bounds. So every optimiser that keeps bounds
 of states keeps these limits too, and they are verified and named like states.
@@ -16,7 +16,6 @@ import numpy as np
 from fpirhc.errors import Mistakes
 from fpirhc.horizon.cost import Cost, View, read_by, read_by_cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.problem import GAP
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression, Named, Signal
@@ -58,14 +57,9 @@ def _read_by(name: str, one: Limit, plant: Plant) -> frozenset[str]:
     return read_by(plant, lambda view: [one.named_value(name, view)])
 
 
-def check_names(plant: Plant, horizon: Horizon, limits: Limits) -> None:
-    """Raise where the end or a margin is that of no state, or a margin leaves nothing between two limits."""
+def check_names(horizon: Horizon, limits: Limits) -> None:
+    """Raise where a margin is that of no limited state, or leaves nothing between two limits."""
     mistakes = Mistakes("horizon")
-    mistakes.unknown("terminal: state", horizon.terminal, plant.state.elements)
-    if plant.output.elements != plant.state.elements and horizon.terminal:
-        mistakes.add(
-            "terminal: the states of a plant with outputs have no reference to meet; leave it out, or weigh the end"
-        )
     mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
     for name in sorted(horizon.margins.keys() & {*limits.soft, *limits.prices}):
         mistakes.add(
@@ -95,18 +89,6 @@ def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> 
         if "input_before" not in _read_by(name, one, plant)
     ]
     return [replace(w, name=f"{w.name}, step {step}") for w in (*states, *paths) if w.name not in nodes_alone]
-
-
-def ends(
-    names: tuple[str, ...], plant: Plant, next_state: Expression, target: Expression, last: Expression
-) -> list[ConstraintState]:
-    """State minus reference where `last` is 1, else zero; with a small gap: a solver counts a fixed variable as an equation."""
-    places = {e: k for k, e in enumerate(plant.state.elements)}
-    units = dict(zip(plant.state.elements, plant.state.units, strict=True))
-    return [
-        ConstraintState(f"{e} at the end", units[e], last * (next_state[places[e]] - target[places[e]]), -GAP, GAP)
-        for e in dict.fromkeys(names)
-    ]
 
 
 def measured(names: Collection[str], limits: Limits, plant: Plant, next_state: Expression) -> list[ConstraintState]:

@@ -30,7 +30,6 @@ class Horizon(Checked):
         step: length of one stage, s, over which the input is constant.
         discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), Collocation(). A
             map has none: a stage is a whole number of its steps.
-        terminal: names of states that must meet the reference at the end of the horizon.
         lengths: of the stages, as multiples of `step`, which is that of the first one: fine stages first. One number of at least
             1 for every stage, a whole one on a map; empty: all stages are equal. Every stage counts with its length in the cost,
             limits and costs of input changes with the time since the change before. Prices of limits count every node alike.
@@ -56,7 +55,6 @@ class Horizon(Checked):
     stages: Count
     step: Duration
     discretisation: Integrator = USUAL
-    terminal: tuple[str, ...] = ()
     blocks: tuple[Count, ...] = ()
     margins: Mapping[str, NotNegative] = field(default_factory=dict, hash=False, metadata={"setting": "where given"})
     lengths: tuple[AtLeastOne, ...] = field(default=(), kw_only=True, metadata={"setting": "where given"})
@@ -67,7 +65,7 @@ class Horizon(Checked):
     share: float = field(default=1.0, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
-        for name in ("terminal", "blocks", "lengths", "measured"):
+        for name in ("blocks", "lengths", "measured"):
             object.__setattr__(self, name, in_tuple(getattr(self, name)))
         if self.lengths and (len(self.lengths) != self.stages or self.lengths[0] != 1):
             raise InvalidValue(

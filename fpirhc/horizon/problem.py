@@ -17,7 +17,6 @@ import numpy as np
 
 from fpirhc.symbolic.layout import Layout, Signal
 
-GAP = 1e-9  # half width of the bounds of what the end must meet, in sizes of the state
 _LEAST = 1e-3  # of what inputs move a state by: a smaller spread of the reference is no measure of it
 _NOTHING = 1e-9  # of the same: a spread of rounding
 _POWER_STEPS = 50
@@ -48,8 +47,7 @@ class OptimalControl:
             units of the inputs.
         nodes: states, inputs and data along the reference from t = 0.
         along: quadratic model of the cost along the reference.
-        written: number of the last entries of the state, which are limits of rates, paths and the end; they are zero in s_0.
-        met: number of the last of these, which must meet the reference at the end.
+        written: number of the last entries of the state, which are limits of rates and paths; they are zero in s_0.
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
@@ -87,7 +85,6 @@ class OptimalControl:
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
     soft_end: ca.Function | None = None
-    met: int = 0
 
     @property
     def scale(self) -> np.ndarray:
@@ -113,17 +110,10 @@ class OptimalControl:
         return float(sizes.min())
 
     @property
-    def _meets(self) -> np.ndarray:
-        return np.arange(self.state.size) >= self.state.size - self.met
-
-    @property
     def half_ranges(self) -> np.ndarray:
-        """Half the range of every state's limits (ns,); infinite where a side is free or the limits are equal.
-
-        What the end must meet has the size of its state, which the gap of its bounds is made of.
-        """
+        """Half the range of every state's limits (ns,); infinite where a side is free or the limits are equal."""
         with np.errstate(invalid="ignore"):
-            half = 0.5 * (self.state_upper - self.state_lower) / np.where(self._meets, GAP, 1.0)
+            half = 0.5 * (self.state_upper - self.state_lower)
         return np.where(self.state_lower == self.state_upper, np.inf, half)
 
     @property

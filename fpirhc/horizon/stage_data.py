@@ -28,19 +28,18 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     offset = (Signal("offset", shown, tuple(units[e] for e in shown)),) if shown else ()
     haste = (scalar("haste"),) if hastened(horizon) else ()
     length = (scalar("length"),) if horizon.lengths else ()
-    signals = (
-        time_signal(plant),
-        Signal("reference", plant.output.elements, plant.output.units),
-        Signal("feedforward", plant.input.elements, plant.input.units),
-        plant.parameter,
-        *free,
-        *offset,
-        *haste,
-        *length,
+    return Layout(
+        (
+            time_signal(plant),
+            Signal("reference", plant.output.elements, plant.output.units),
+            Signal("feedforward", plant.input.elements, plant.input.units),
+            plant.parameter,
+            *free,
+            *offset,
+            *haste,
+            *length,
+        )
     )
-    if not horizon.terminal:
-        return Layout(signals)
-    return Layout((*signals, scalar("last"), Signal("target", plant.state.elements, plant.state.units)))
 
 
 def hastened(horizon: Horizon) -> bool:
@@ -74,7 +73,7 @@ def stage_data(
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if "feedforward" in read_by_cost(plant, cost) else zero
     # These rows come out of the same call where they follow these rows: joining tables would copy both.
-    plain = not (horizon.blocks or horizon.terminal or horizon.measured) and not hastened(horizon)
+    plain = not (horizon.blocks or horizon.measured) and not hastened(horizon)
     joined = bool(settings) and plain
     rows = [matrix.sym("settings", settings)] if joined else []
     stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
@@ -98,11 +97,6 @@ def stage_data(
         table = ca.vertcat(table, 1 / np.array([[horizon.share, *horizon.relative_lengths]]))
     if horizon.lengths:
         table = ca.vertcat(table, np.array([[*horizon.lengths, horizon.lengths[-1]]]))
-    if horizon.terminal:
-        last, after = np.zeros((1, nodes)), [*range(1, nodes), nodes - 1]
-        last[0, nodes - 2] = 1.0
-        targets = table[data_layout(plant, horizon).slice("reference"), :][:, after]
-        table = ca.vertcat(table, last, targets)
     if settings and not joined:
         table = ca.vertcat(table, ca.repmat(given[0], 1, nodes))
     names = ["t", *columns, "p", *(["settings"] if settings else [])]

@@ -14,7 +14,6 @@ from fpirhc.horizon.constraint_states import (
     ConstraintState,
     check_feedforward,
     check_names,
-    ends,
     hard,
     hard_state_bounds,
     inside,
@@ -28,7 +27,7 @@ from fpirhc.horizon.constraint_states import (
 from fpirhc.horizon.cost import Cost, Linearisation, View, read_by_cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
-from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature, sizes_along
+from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data, with_rows
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
@@ -69,7 +68,7 @@ def _transcribed(
     signals: ca.Function | None,
     start: np.ndarray | None,
 ) -> OptimalControl:
-    check_names(plant, horizon, limits)
+    check_names(horizon, limits)
     whole = limits
     if horizon.margins:
         inside_by = {
@@ -97,7 +96,6 @@ def _transcribed(
     functions: dict[object, ca.Function] = {}
     along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
     lower, upper = hard_state_bounds(limits, plant, horizon.measured)
-    of_entries = _sizes_of_entries(plant, horizon, limits, nodes[0], len(binding))
     state = _stage_state(plant, bool(free), binding)
     return OptimalControl(
         stages=horizon.stages,
@@ -111,15 +109,14 @@ def _transcribed(
         terms=tuple(stage.terms),
         soft_end=soft_end,
         start=_start(plant, free, len(binding)),
-        state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding] * of_entries]),
-        state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding] * of_entries]),
+        state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
+        state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
         input_lower=bounds[0],
         input_upper=bounds[1],
         curvature=input_curvature(along, horizon.step),
         nodes=nodes,
         along=along,
         written=len(binding),
-        met=len(set(horizon.terminal)),
         state_price=state_prices(limits, state, plant, horizon.step),
         settings=settings,
         inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
@@ -215,14 +212,6 @@ def _stage_functions(stage: _Stage) -> tuple[ca.Function, ...]:
     )
 
 
-def _sizes_of_entries(plant: Plant, horizon: Horizon, limits: Limits, states: np.ndarray, written: int) -> np.ndarray:
-    """What the bounds of the written entries are multiplied by: the size of the state that the end must meet, ones for others."""
-    half = 0.5 * np.subtract(*reversed(limits.state_bounds(plant)))
-    places = [plant.state.elements.index(e) for e in dict.fromkeys(horizon.terminal)]
-    sizes = np.where(np.isfinite(half) & (half > 0), half, sizes_along(states[: plant.state.size]))[places]
-    return np.concatenate([np.ones(written - len(places)), sizes])
-
-
 def _reach(limits: Limits, plant: Plant) -> ca.DM:
     """Half the range of every input, 1 where it is free."""
     lower, upper = limits.input_bounds(plant)
@@ -277,8 +266,6 @@ def _written(
     seen_next = _seen(plant, horizon, x_next, data)
     hard_ones = [name for name in horizon.measured if name not in limits.soft]
     entries += measured(hard_ones, limits, plant, seen_next)
-    if horizon.terminal:
-        entries += ends(horizon.terminal, plant, x_next, data["target"], data["last"])
     return entries
 
 

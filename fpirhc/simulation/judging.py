@@ -127,7 +127,7 @@ def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl,
     assert problem.horizon is not None
     assert problem.cost is not None
     plant, own = problem.plant, bool(own_signals(problem))
-    one_cycle = replace(problem.horizon, stages=1, step=problem.period, terminal=(), blocks=(), margins={}, lengths=())
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, blocks=(), margins={}, lengths=())
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
     outside = real_values(plant, problem.signals)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)

@@ -137,7 +137,7 @@ class Problem(Checked):
         checks = (
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
-            lambda: check_names(plant, self.horizon, self.limits) if self.horizon else None,
+            lambda: check_names(self.horizon, self.limits) if self.horizon else None,
             lambda: _check_reference(self),
             lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),

@@ -123,9 +123,6 @@ cost on unknown names
 cost of an unknown member
   fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}) -> fp.CustomCost(lambda v: {"e": v.x.angle**2})
     line 31): a View has no 'x' ... Valid: state, reference, input
-terminal of a path
-  stages=6, step=2e-2 -> stages=6, step=2e-2, terminal=("end",)
-    mine.py, line 23: problem = fp.Problem( ... horizon: terminal: state 'end' is unknown. Valid: angle, angle'.
 reference without a function
   fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}) -> fp.Trajectory({"angle": 0.8})
     mine.py, line 25 ... expected a function of 1 argument ... write lambda t: {'angle': 0.8}

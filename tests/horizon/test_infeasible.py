@@ -22,8 +22,7 @@ def plan_of(
 ) -> fp.Plan:
     """The plan from (y, y') towards y = `at`."""
     reference = fp.Trajectory(lambda t: {"y": at + 0 * t})
-    terminal = more.pop("terminal", ())
-    horizon = fp.Horizon(stages=stages, step=STEP, terminal=terminal)
+    horizon = fp.Horizon(stages=stages, step=STEP)
     cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.01})
     limits = fp.Limits(inputs={"u": (-1.0, 1.0)}, states=states, **more)
     ocp, data = horizon_of(SLEDGE, reference, horizon, cost, limits)
@@ -43,7 +42,6 @@ OUT_OF_REACH = {
     ),  # full braking stops at 1.4 m after 1 s
     "outside at rest": ((1.3, 0.0), {"y": (-5.0, 1.0)}, 25, {}, "above 1", 0.295),  # after one stage of full braking
     "a far limit": ((0.0, 0.0), {"y": (3.0, 4.0)}, 5, {}, "below 3", 2.995),
-    "an end out of reach": ((0.0, 0.0), {}, 3, {"at": 0.5, "terminal": ("y",)}, "'y at the end'", 0.455),
 }
 
 
@@ -56,7 +54,7 @@ def test_what_cannot_be_kept_is_named_by_how_much(case):
     violations = plan.violations()
     assert limit in " ".join(violations)
     values = [float(text.partition(" is ")[2].split()[0]) for text in violations if "at stage 0" not in text]
-    bound = 0.0 if "terminal" in more else next(v for v in states["y"] if f" {v:g}" in limit)
+    bound = next(v for v in states["y"] if f" {v:g}" in limit)
     assert max(abs(value - bound) for value in values) == pytest.approx(most, abs=1e-3)
     assert "soften state limits, or lengthen the horizon" in plan._repr_html_()
 

@@ -191,11 +191,10 @@ TASKS = {
     "Euler": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.Euler(2), replan="cycle")),
     "limits of rates": lambda: task(limits=replace(LIMITED, rates={"torque": (-FASTEST, FASTEST)}), replan=2),
     "soft limits": lambda: task(limits=replace(LIMITED, soft={"angle": 100.0})),
-    "the end": lambda: task(horizon=fp.Horizon(STAGES, STEP, terminal=("angle",), replan="cycle")),
     "blocks": lambda: task(horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle")),
     "lengths, limits": lambda: task(limits=LIMITED, horizon=fp.Horizon(STAGES, STEP, replan=2, lengths=GROWING)),
-    "lengths, blocks, end": lambda: task(
-        horizon=fp.Horizon(STAGES, STEP, terminal=("angle",), blocks=(1, 2, 3), replan="cycle", lengths=GROWING)
+    "lengths, blocks": lambda: task(
+        horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle", lengths=GROWING)
     ),
     "dead time": lambda: task(dead_time=fp.DeadTime(inputs={"torque": 2 * PERIOD})),
 }
