@@ -118,11 +118,8 @@ def main() -> None:
     }
     base = micro["closed loop, compiled C, every signal logged"]
     rows = [(name, f"{1e6 * value:.2f}", f"{value / base:.1f}") for name, value in micro.items()]
-    write_table(
-        "closed loop",
-        ("two_mass, CTC with eq (6), 10 s at 1 kHz", "microseconds per cycle", "times the compiled loop"),
-        rows,
-    )
+    heads = "two_mass, CTC with eq (6), 10 s at 1 kHz", "microseconds per cycle", "times the compiled loop"
+    write_table("closed loop", heads, rows)
     starts = {name: begun(code) for name, code in STARTS.items()}
     least = next(iter(starts.values()))
     rows = [(name, f"{value:.2f}", f"{value / least:.1f}") for name, value in starts.items()]

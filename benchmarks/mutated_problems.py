@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import fpirhc as fp
-from fpirhc.controllers.check import checked
+from fpirhc.contracts import build
 from fpirhc.errors import ProblemFileError
 
 SOURCE = '''"""A cart with everything that a problem file can have."""
@@ -89,7 +89,7 @@ def raw_error(path: Path, seed: int) -> str:
         task = fp.load_problem(str(path))
         for controller in task.controllers.values():
             with suppress(fp.FpirhcError):
-                checked(task.problem, controller)
+                build(task.problem, controller)
     except ProblemFileError as refused:
         # An error of the file itself, such as a misspelt name, is shown as Python has it; one from our own lines is not.
         inside = refused.__context__

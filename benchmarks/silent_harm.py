@@ -17,6 +17,7 @@ import warnings
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
+from functools import wraps
 from typing import Any
 
 import casadi as ca
@@ -24,9 +25,6 @@ import joblib
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.simulation.model_as_plant import behind_actuators
-from fpirhc.simulation.trials import weighed
-from fpirhc.symbolic.driver import compiled_plans
 
 HARMED, NEUTRAL, GOOD, HELD, ROUNDING, MINOR, GROWING = 1.2, 1.1, 0.25, 0.2, 1e-6, 0.01, ("factor", "largest_", "left")
 SMALL = 20  # times as often as one of these, whose durations are in their own unit of time
@@ -73,11 +71,23 @@ def loaded(plant: fp.Plant, random: np.random.Generator) -> fp.Plant:
 
 
 def lagging(problem: fp.Problem, cycles: np.ndarray) -> fp.Problem:
-    """What moves, behind actuators with lags of so many cycles."""
+    """What moves, behind actuators with lags of so many cycles, each at rest at first."""
     real = problem.reality or fp.Reality(problem.plant)
-    plant = behind_actuators(real.plant, problem.period * cycles)
-    rest = dict(zip([*plant.coordinates][-len(cycles) :], map(float, problem.inputs_before), strict=True))
-    return replace(problem, reality=fp.Reality(plant, {**real.start, **rest}))
+    plant, inputs, lags = real.plant, [*real.plant.inputs], problem.period * cycles
+    acting = {f"{n}_{len(plant.names)}": unit for n, unit in plant.inputs.items()}  # not as a lag before it
+
+    @wraps(plant.response)
+    def response(*of):
+        *motion, u, p = of
+        arrived = type(u)(inputs, ca.vertcat(*(motion[0][a] for a in acting)))
+        rates = {a: (u[n] - arrived[n]) / lag for a, n, lag in zip(acting, inputs, lags, strict=True)}
+        return {**plant.response(*motion, arrived, p), **rates}
+
+    order = dict(zip(plant.names, plant.orders, strict=True)) | dict.fromkeys(acting, 1)
+    known = {"coordinates": {**plant.coordinates, **acting}, "response": response, "order": order}
+    slower = replace(plant, **known, controlled=None, inverse=None)
+    rest = dict(zip(acting, map(float, problem.inputs_before), strict=True))
+    return replace(problem, reality=fp.Reality(slower, {**real.start, **rest}))
 
 
 def sensed(problem: fp.Problem, run: fp.Run, random: np.random.Generator) -> fp.Problem:
@@ -142,7 +152,10 @@ def judged(problem: fp.Problem, pair: Any) -> tuple[float, bool, str]:
     wanted = plain["true_error"] + motion[:, [problem.plant.output.elements.index(n) for n in names]]
     sizes = np.fmax(np.ptp(wanted, axis=0), np.abs(plain["true_error"][0])).tolist()
     rms = [m.rms_error if r.stop is None else dict.fromkeys(names, np.inf) for m, r in zip(measured, runs, strict=True)]
-    counted = [(n, s) for n, s in zip(names, sizes, strict=True) if n in (weighed(problem, pair[1]) or names) and s]
+    planner = pair[1].planner
+    cost = (planner.cost or problem.cost) if planner else None
+    weighed = {n.rstrip("'") for n in (cost.tracked if cost else None) or ()} & {*names} or names
+    counted = [(n, s) for n, s in zip(names, sizes, strict=True) if n in weighed and s]
     shares = np.array([[errors[n] / size for n, size in counted] for errors in rms])
     before, after = shares[:, shares.max(axis=0) > max(ROUNDING, MINOR * shares.max(axis=1).min())]
     ratios = [b / max(a, 1e-300) if np.isfinite(a) else 0.0 for a, b in zip(before, after, strict=True)]
@@ -153,12 +166,11 @@ def judged(problem: fp.Problem, pair: Any) -> tuple[float, bool, str]:
 def asked(seed: int, loud: bool = False) -> tuple[str, str, list[str], str]:
     """What became of a variant, what the review of its controller with adaptation says, what is wrong, and a line."""
     warnings.simplefilter("ignore")
-    with compiled_plans():
-        for attempt in itertools.count():
-            with suppress(fp.FpirhcError):  # refused: another one is drawn
-                name, told, moves, pair, untold = variant(seed, attempt)
-                ratio, good, errors = judged(moves, pair)
-                break
+    for attempt in itertools.count():
+        with suppress(fp.FpirhcError):  # refused: another one is drawn
+            name, told, moves, pair, untold = variant(seed, attempt)
+            ratio, good, errors = judged(moves, pair)
+            break
     found = fp.review(told, {"adaptive": pair[1]}, mismatch=0.0, seed=0).answers
     answers = {a.key: a for some in found.values() for a in some}
     if loud:

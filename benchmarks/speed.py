@@ -36,26 +36,14 @@ from table import write_table
 import fpirhc as fp
 from fpirhc.conformance import compiled as in_c
 from fpirhc.conformance import posed
-from fpirhc.contracts import Optimiser
-from fpirhc.horizon.problem import rollout
-from fpirhc.optimisers.nlp import (
-    MultipleShooting,
-    interleave,
-    scaled_solver,
-    separate,
-    shift_dynamics,
-    shift_variables,
-    sizes,
-)
-from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.contracts import Optimiser, reduced_gradient
 
 COLD = "--cold" in sys.argv
 PLANS, PASSES, SPENT = 100, 10, 1.0  # a solver makes PASSES passes, or as many as begin within SPENT seconds
 FLAGS = ["-O3", "-march=native"]
 LARGE = 500  # instructions of a stage; above it CasADi's solvers are compiled with -O1, else that takes minutes
 JIT = {"jit": True, "compiler": "shell", "jit_temp_suffix": True}
-# (s0, data, cold=False) -> inputs (nu, N), seconds; NaN where it has no plan
-Solve = Callable[..., tuple[np.ndarray, float]]
+Solve = Callable[..., tuple[np.ndarray, float]]  # (s0, data, cold) -> inputs (nu, N), seconds; no plan: NaN
 OURS, ONCE, IPOPT = "FixedPoint()", "one iteration", "IPOPT"
 
 
@@ -176,16 +164,33 @@ _clock_itself = 0
 _clock_itself = int(1e9 * np.median([clock(lambda: None) for _ in range(2000)]))
 
 
+class Called:
+    """A Function of dense matrices with arrays of its own, in which a call takes a fraction of a microsecond."""
+
+    def __init__(self, function: ca.Function) -> None:
+        sides = (function.size_in, function.n_in()), (function.size_out, function.n_out())
+        sizes = ([size(k) for k in range(count)] for size, count in sides)
+        self.arguments, self.results = ([np.zeros(s[0] if s[1] == 1 else s[::-1]) for s in side] for side in sizes)
+        self._buffer, self.evaluate = function.buffer()
+        for put, arrays in ((self._buffer.set_arg, self.arguments), (self._buffer.set_res, self.results)):
+            for k, array in enumerate(arrays):
+                put(k, array.data)
+
+
+def later(optimiser: Optimiser, ocp: Any) -> ca.Function:
+    """The memory of an optimiser one stage later."""
+    memory = ca.MX.sym("m", optimiser.memory(ocp).size)
+    return ca.Function("later", [memory], [optimiser.shifted(ocp, memory)])
+
+
 def ours(optimiser: Optimiser, ocp: Any) -> Solve:
     """A warm-started loop around a compiled step."""
-    evaluator, layout = Evaluator(in_c(optimiser.step(ocp))), optimiser.memory(ocp)
-    remembered = ca.MX.sym("m", layout.size)
-    shift = ca.Function("later", [remembered], [optimiser.shifted(ocp, remembered)])
+    evaluator, begin, shift = Called(in_c(optimiser.step(ocp))), optimiser.memory(ocp).start(), later(optimiser, ocp)
     s0_, data_, lower, upper, memory = evaluator.arguments
     lower[...], upper[...] = ocp.input_lower, ocp.input_upper
 
     def solve(s0: np.ndarray, data: np.ndarray, *, cold: bool = False) -> tuple[np.ndarray, float]:
-        memory[...] = layout.start() if cold else shift(evaluator.results[2]).full().ravel()
+        memory[...] = begin if cold else shift(evaluator.results[2]).full().ravel()
         s0_[...], data_[...] = s0, data.T
         seconds = clock(evaluator.evaluate)
         return evaluator.results[0].reshape(ocp.stages, -1).T.copy(), seconds
@@ -193,44 +198,47 @@ def ours(optimiser: Optimiser, ocp: Any) -> Solve:
     return solve
 
 
-def shooting(optimiser: MultipleShooting, ocp: Any, *, compiled: bool = True) -> Solve:
-    """The same around CasADi's solver alone, with its shifted variables and multipliers."""
+def predicted(ocp: Any) -> Callable[..., np.ndarray]:
+    """Function (s0, inputs, data) -> states (ns, N + 1)."""
+    rolled, free = reduced_gradient(ocp), np.zeros((ocp.state.size, ocp.stages))
+    return lambda s0, inputs, data: np.asarray(rolled(s0, inputs, data, free)[2].full())
+
+
+def shooting(kind: type[fp.Ipopt | fp.Fatrop], ocp: Any, *, compiled: bool = True, **settings: float) -> Solve:
+    """The same around CasADi's solver alone, out of the optimiser's step, with its shifted variables and multipliers."""
     flags = FLAGS if ocp.dynamics.n_instructions() < LARGE else ["-O1"]
     how = {**JIT, "jit_options": {"flags": flags, "verbose": False}} if compiled else {}
-    made = scaled_solver("rival", optimiser.plugin, ocp, {**optimiser.options(ocp), **how})
-    solver, n, (variables, constraints) = Evaluator(made), ocp.stages, sizes(ocp)
-    argument = {made.name_in(k): solver.arguments[k] for k in range(made.n_in())}
-    result = {made.name_out(k): solver.results[k] for k in range(made.n_out())}
-    w, g = ca.MX.sym("w", variables), ca.MX.sym("g", constraints)
-    later = ca.Function("later", [w, g], [shift_variables(ocp, w), shift_dynamics(ocp, g)])
-    inputs_of, predict = ca.Function("inputs", [w], [separate(ocp, w)[1]]), rollout(ocp)
-    begun = False
+    made = type(kind.__name__, (kind,), {"options": lambda self, of: {**kind.options(self, of), **how}})(**settings)
+    [alone] = [f for f in made.step(ocp).find_functions() if f.name() == "fpirhc_shooting_solver"]
+    solver, n, layout, predict = Called(alone), ocp.stages, made.memory(ocp), predicted(ocp)
+    shift, begin, remembered = later(made, ocp), layout.start(), layout.start()
+    argument = dict(zip(alone.name_in(), solver.arguments, strict=True))
+    result = dict(zip(alone.name_out(), solver.results, strict=True))
 
-    def column(states: ca.DM, inputs: ca.DM) -> np.ndarray:
-        return np.asarray(interleave(states, inputs).full()).ravel()
+    def column(states: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+        return np.append(np.vstack([states[:, :n], inputs]).ravel(order="F"), states[:, n])
 
     def solve(s0: np.ndarray, data: np.ndarray, *, cold: bool = False) -> tuple[np.ndarray, float]:
-        nonlocal begun
-        warm = begun and not cold
-        guess = ca.DM.zeros(ocp.input.size, n)
-        argument["lam_x0"][...], argument["lam_g0"][...] = 0, 0
-        if warm:
-            plan, multipliers = later(result["x"], result["lam_g"])
-            guess, argument["lam_g0"][...] = inputs_of(plan), multipliers.full().ravel()
-            argument["lam_x0"][...] = later(result["lam_x"], result["lam_g"])[0].full().ravel()
-        states = predict(s0, guess, data)[0]
-        argument["x0"][...] = column(states if states.is_regular() else ca.repmat(ca.DM(s0), 1, n + 1), guess)
+        nonlocal remembered
+        memory = begin if cold else shift(remembered).full().ravel()
+        guess = memory[layout.slice("plan_inputs")].reshape(n, -1).T
+        for name, part in (("lam_x0", "plan_variable_multipliers"), ("lam_g0", "plan_dynamics_multipliers")):
+            argument[name][...] = memory[layout.slice(part)]
+        states = predict(s0, guess, data)
+        argument["x0"][...] = column(states if np.isfinite(states).all() else np.tile(s0[:, None], n + 1), guess)
         argument["p"][...] = data.ravel(order="F")
         for name, state, box in (("lbx", ocp.state_lower, ocp.input_lower), ("ubx", ocp.state_upper, ocp.input_upper)):
-            bounds = ca.horzcat(ca.DM(s0), ca.repmat(ca.DM(state), 1, n))
-            argument[name][...] = column(bounds, ca.repmat(ca.DM(box), 1, n))
+            bounds = np.column_stack([s0, np.tile(state[:, None], n)])
+            argument[name][...] = column(bounds, np.tile(box[:, None], n))
         try:
             seconds = clock(solver.evaluate)
         except RuntimeError:  # a solver that raises has no plan
-            begun = False
+            remembered = begin
             return np.full((ocp.input.size, n), np.nan), float("nan")
-        begun = bool(np.isfinite(result["x"]).all())
-        return np.asarray(inputs_of(result["x"]).full()), seconds
+        inputs = result["x"][: -ocp.state.size].reshape(n, -1)[:, ocp.state.size :].copy()
+        plan = np.concatenate([inputs.ravel(), result["lam_x"], result["lam_g"]])
+        remembered = plan if np.isfinite(result["x"]).all() else begin
+        return inputs.T, seconds
 
     return solve
 
@@ -242,9 +250,8 @@ def condensed(ocp: Any) -> Solve:
     s0_, data_ = ca.MX.sym("s", ocp.state.size), ca.MX.sym("d", ocp.data.size, ocp.stages + 1)
     inputs = ca.MX.sym("U", ocp.input.size, ocp.stages)
     limited = np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper))
-    states, value, _ = rollout(ocp)(s0_, inputs, data_)
-    rows, flat = ca.vec(states[limited.tolist(), 1:]), ca.vec(inputs)
-    slope = ca.gradient(value, flat)
+    _, by_input, states, _ = reduced_gradient(ocp)(s0_, inputs, data_, ca.DM.zeros(ocp.state.size, ocp.stages))
+    rows, flat, slope = ca.vec(states[limited.tolist(), 1:]), ca.vec(inputs), ca.vec(by_input)
     free = ca.Function("free", [s0_, inputs, data_], [slope, rows])
     at_rest = [np.zeros(ocp.state.size), np.zeros(inputs.shape), ocp.nodes[2]]
     second = ca.Function("second", [s0_, inputs, data_], [ca.jacobian(slope, flat), ca.jacobian(rows, flat)])
@@ -295,7 +302,7 @@ def ways(name: str, ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]]) -> 
         found["DAQP"] = condensed(ocp)
     if _there("acados_template.acados_code_gen_options"):
         found |= acados(ocp, horizons)
-    return {**found, "fatrop": shooting(fp.Fatrop(), ocp), IPOPT: shooting(fp.Ipopt(), ocp)}
+    return {**found, "fatrop": shooting(fp.Fatrop, ocp), IPOPT: shooting(fp.Ipopt, ocp)}
 
 
 def _there(package: str) -> bool:
@@ -322,10 +329,10 @@ def timed(solvers: dict[str, Solve], horizons: list[tuple[np.ndarray, np.ndarray
 
 def active(ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]], plans: list[np.ndarray]) -> np.ndarray:
     """Whether a limit is met in these plans, to 1e-4 of its range."""
-    predict, boxes = rollout(ocp), ((ocp.state_lower, ocp.input_lower), (ocp.state_upper, ocp.input_upper))
+    predict, boxes = predicted(ocp), ((ocp.state_lower, ocp.input_lower), (ocp.state_upper, ocp.input_upper))
     low, high = (np.concatenate(box)[:, None] for box in boxes)
     size = np.where(np.isfinite(high - low), high - low, 2.0)
-    every = [np.vstack([predict(h[0], u, h[1])[0].full()[:, 1:], u]) for h, u in zip(horizons, plans, strict=True)]
+    every = [np.vstack([predict(h[0], u, h[1])[:, 1:], u]) for h, u in zip(horizons, plans, strict=True)]
     return np.array([(np.minimum(values - low, high - values) < 1e-4 * size).any() for values in every])
 
 
@@ -334,7 +341,7 @@ def rows_of(name: str) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
     times, errors, problem = [], [], LOOPS[name]()
     loops = {f"{word} model": Loop(problem, word == "right") for word in ("right", "wrong")}
     ocp = loops["right model"].ocp
-    first, exact = ours(fp.FixedPoint(), ocp), shooting(fp.Ipopt(accuracy=1e-10), ocp, compiled=False)
+    first, exact = ours(fp.FixedPoint(), ocp), shooting(fp.Ipopt, ocp, compiled=False, accuracy=1e-10)
     solvers = ways(name, ocp, loops["right model"].flown(first)[0])
     for which, loop in loops.items():
         horizons = loop.flown(first)[0]
@@ -359,9 +366,7 @@ def cells(both: list[tuple[dict, dict]], best: list[np.ndarray], chosen: np.ndar
         middle = [np.median(seconds[way][chosen]) for _, seconds in both]
         away = [float(np.abs(p - b).max() / np.abs(b).max()) for p, b in zip(plans, best, strict=True)]
         away = np.array(away)[chosen]
-        us, ratio = (
-            float(np.exp(np.log(values).mean())) for values in (1e6 * np.array(middle), np.divide(middle, unit))
-        )
+        us, ratio = (float(np.exp(np.log(v).mean())) for v in (1e6 * np.array(middle), np.divide(middle, unit)))
         far = int((~(away < 1e-2)).sum())
         text = f"{us:.0f} us" if way == OURS else f"{ratio:.0f}" if ratio >= 10 else f"{ratio:.2g}"
         found[way] = f"{text}; {np.median(away):.0e}" + (f", {far} far" if far else "")

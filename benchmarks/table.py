@@ -6,9 +6,8 @@ import platform
 import re
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
-
-from fpirhc.studies.view import versions
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "performance.md"
 
@@ -17,8 +16,9 @@ def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]], 
     """Print the table; with --write, replace the part of the page between the marks of this name."""
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     lines += ["| " + " | ".join(row) + " |" for row in rows]
-    versions_by_name = versions()
-    lines += ["", f"{_processor()}; " + ", ".join(f"{k} {v}" for k, v in versions_by_name.items()) + "."]
+    packages = {name: version(name) for name in ("fpirhc", "casadi", "numpy", "scipy")}
+    versions = {**packages, "python": platform.python_version(), "machine": platform.machine()}
+    lines += ["", f"{_processor()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + "."]
     text = "\n".join(lines)
     print(text)
     if "--write" in sys.argv:
@@ -31,10 +31,6 @@ def write_table(name: str, heads: Sequence[str], rows: Sequence[Sequence[str]], 
 
 
 def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
+    facts = Path("/proc/cpuinfo")
+    named = re.search(r"model name\s*: (.+)", facts.read_text(encoding="utf-8")) if facts.exists() else None
+    return named[1] if named else platform.processor() or platform.machine()

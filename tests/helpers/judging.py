@@ -8,16 +8,13 @@ least squares, and the residual is the largest entry of
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from scipy.optimize import nnls
 
-from fpirhc.horizon.problem import OptimalControl, rollout
-from fpirhc.optimisers.state_limits import scales
-
 _MET = 1e-6  # of the range: nearer limits may have a multiplier
-_ROUGH = 1e-4  # the same for a rough judgement: interior-point methods end that far from limits of small multipliers
 
 
 @dataclass(frozen=True)
@@ -27,44 +24,43 @@ class Judgement:
     cost: float
     residual: float
     violation: float
-    rough: float
 
 
 class Judge:
     """Judges plans of one problem."""
 
-    def __init__(self, ocp: OptimalControl) -> None:
-        self._ocp, self._scales = ocp, scales(ocp)
+    def __init__(self, ocp: Any) -> None:
         s0, data = ca.MX.sym("s0", ocp.state.size), ca.MX.sym("data", ocp.data.size, ocp.stages + 1)
-        inputs = ca.MX.sym("U", ocp.input.size, ocp.stages)
-        states, value, _ = rollout(ocp)(s0, inputs, data)
-        limited = ca.vec(states[list(self._scales.bounded), 1:])
-        flat = ca.vec(inputs)
-        sensitivity = ca.jacobian(limited, flat)
-        results = [value, ca.vec(states[:, 1:]), ca.gradient(value, flat), ca.densify(sensitivity)]
+        inputs, states, value = ca.MX.sym("U", ocp.input.size, ocp.stages), [s0], 0
+        for k in range(ocp.stages):
+            value += ocp.stage_cost(states[-1], inputs[:, k], data[:, k])[0]
+            states.append(ocp.dynamics(states[-1], inputs[:, k], data[:, k]))
+        value += ocp.terminal_cost(states[-1], data[:, ocp.stages])
+        bounded = np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper)).tolist()
+        limited, flat = ca.vec(ca.horzcat(*states[1:])[bounded, :]), ca.vec(inputs)
+        results = [value, limited, ca.gradient(value, flat), ca.densify(ca.jacobian(limited, flat))]
         self._values = ca.Function("values", [s0, inputs, data], results)
+        lower, upper = (
+            np.concatenate([np.tile(own, ocp.stages), np.tile(state[bounded], ocp.stages)])
+            for own, state in ((ocp.input_lower, ocp.state_lower), (ocp.input_upper, ocp.state_upper))
+        )
+        half = 0.5 * (upper - lower)
+        self._lower, self._upper, self._unit = lower, upper, np.where(np.isfinite(half) & (half > 0), half, 1.0)
+        own = self._unit[: ocp.input.size]
+        self._weight = np.tile(own / np.median(own**2 / ocp.scale), ocp.stages)
 
     def __call__(self, inputs: np.ndarray, s0: np.ndarray, data: np.ndarray) -> Judgement:
         """Return what is known about a plan (nu, N)."""
-        ocp, measures = self._ocp, self._scales
-        value, states, slope, sensitivity = (np.asarray(v.full()) for v in self._values(s0, inputs, data))
-        if not (np.isfinite(states).all() and np.isfinite(slope).all() and np.isfinite(sensitivity).all()):
-            return Judgement(np.inf, np.inf, np.inf, np.inf)
-        places, n = list(measures.bounded), ocp.stages
-        rows = states.reshape(n, -1)[:, places].ravel()
-        values = np.concatenate([inputs.ravel(order="F"), rows])
-        unit = np.concatenate([np.tile(measures.inputs, n), np.tile(measures.states[places], n)])
-        lower = np.concatenate([np.tile(ocp.input_lower, n), np.tile(ocp.state_lower[places], n)])
-        upper = np.concatenate([np.tile(ocp.input_upper, n), np.tile(ocp.state_upper[places], n)])
-        violation = max(np.max((lower - values) / unit, initial=0.0), np.max((values - upper) / unit, initial=0.0))
+        value, limited, slope, sensitivity = (np.asarray(v.full()) for v in self._values(s0, inputs, data))
+        if not all(np.isfinite(v).all() for v in (limited, slope, sensitivity)):
+            return Judgement(np.inf, np.inf, np.inf)
+        values, unit = np.concatenate([inputs.ravel(order="F"), limited.ravel()]), self._unit
+        violation = max(((self._lower - values) / unit).max(), ((values - self._upper) / unit).max(), 0.0)
+        low, high = values <= self._lower + _MET * unit, values >= self._upper - _MET * unit
         jacobian = np.vstack([np.eye(inputs.size), sensitivity])
-        weight = np.tile(measures.inputs / measures.cost, n)[:, None]
-        residuals = []
-        for met in (_MET, _ROUGH):
-            low, high = values <= lower + met * unit, values >= upper - met * unit
-            columns = np.vstack([jacobian[low], -jacobian[high]]).T
-            residuals.append(_left(weight * columns, (weight * slope).ravel()))
-        return Judgement(float(value.item()), residuals[0], float(violation), residuals[1])
+        columns = np.vstack([jacobian[low], -jacobian[high]]).T
+        residual = _left(self._weight[:, None] * columns, self._weight * slope.ravel())
+        return Judgement(float(value.item()), residual, float(violation))
 
 
 def _left(columns: np.ndarray, target: np.ndarray) -> float:
