@@ -16,8 +16,7 @@ import numpy.typing as npt
 from fpirhc.conformance.laws import frozen_value, hold, keep, within
 from fpirhc.conformance.loops import REPLAYED, Replay, Trial, coarse_steps, spelled_by_states, two_masses
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import build
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import build, checked
 from fpirhc.controllers.composed import compose_controller
 from fpirhc.controllers.contract import tracking_law, with_field
 from fpirhc.deformation.affine import Affine

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import build
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import build, checked
 from fpirhc.controllers.composed import compose_controller
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon

@@ -1,7 +1,7 @@
 """Whether an iteration converges whose response is late, smoothed or estimated: asked of the Jacobian of the map's own step.
 
 The map runs on the responses to its own requests, f_k = sum_j w_j J r_{k-j}, about zero; it converges where the spectral radius of
-what it carries from cycle to cycle is below one.
+what it carries from cycle to cycle is below one. A loop is refused by the Jacobian at its start, before a run.
 """
 
 from __future__ import annotations
@@ -12,14 +12,20 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.spectrum import Array
-from fpirhc.deformation.base import Deformation
+from fpirhc.contraction.spectrum import Array, Spectrum, assess_gain, jacobians_along, linear_limit
+from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
+from fpirhc.deformation.wrappers.delayed import Paired
+from fpirhc.errors import NotContractive
+from fpirhc.symbolic.evaluate import Latest
+from fpirhc.task.problem import Problem
 
 _SETTLED = 5000  # cycles in which a memory comes to rest at most
 _RANGE = 1e-3, 20.0  # of the gain times the largest eigenvalue that is searched
 _STEPS, _HALVINGS = 60, 25
 _SHARES = 0.15, 0.3, 0.45, 0.6, 0.75, 0.9  # of a gain that converge too
 _SPARE, _SPARE_OF_TWO_POLES = 1.25, 1.5
+_NOTHING = 1e-12  # largest eigenvalue of a Jacobian that has no effect
+_JACOBIANS: Latest[Array] = Latest(8)  # a search checks many gains at the same start
 
 
 def delayed(weights: Array, cycles: float) -> Array:
@@ -121,3 +127,74 @@ def step_for_basin(largest_error: float, poles: int, rate: float, period: float)
     angle = (poles - 1) * math.pi / (2 * poles)
     spare = _SPARE_OF_TWO_POLES if poles == 2 else _SPARE
     return spare * math.sin(angle) ** poles * math.tan(angle) * rate * period * largest_error
+
+
+def require_converging(problem: Problem, deformation: Deformation) -> None:
+    """Raise if the deformation cannot converge from the start of the problem: no gain does, or not one of this sign or size.
+
+    The limit of the size is that of the plant itself, or behind the delay of estimator and filter. The dead time of the problem is
+    added where all inputs have the same; without an estimator it is not judged. A map that changes its gain on line begins where
+    it likes. With a reality the response is that at the end of a cycle; nothing is judged where the command has not reached it.
+    """
+    gain = deformation.effective_gain()
+    if gain == 0:
+        return
+    jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian_at_start(problem.of_equations))
+    weighted = deformation.form.weighted(jacobian)
+    if not np.isfinite(jacobian).all() or np.abs(np.linalg.eigvals(weighted)).max() <= _NOTHING:
+        return
+    spectrum, delay = Spectrum(np.linalg.eigvals(weighted)), problem.response_delay
+    limit = sum(linear_limit(spectrum.eigenvalues))
+    if limit * gain <= 0:
+        report = assess_gain(deformation, spectrum, delay)
+        turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
+        why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
+        raise NotContractive(f"{report.fault}{why}", report.remedy)
+    seen = _weights_of_estimators(problem)
+    if not deformation.form.steady or (seen is None and abs(gain) < abs(limit)):
+        return
+    weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)
+    if converges(deformation, jacobian, weights):
+        return
+    name, value = own_gain(deformation)
+    if seen is None:
+        remembers = deformation.memory(problem.plant.controlled_names).size
+        largest = largest_gain(deformation, jacobian, weights) if remembers else limit
+        top = max(spectrum.eigenvalues.ravel(), key=abs)
+        raise NotContractive(
+            f"{with_its_gain(deformation)} is too large",
+            f"use 0 < |{name}| < {abs(largest / gain * value):.3g}, where the iteration converges: the largest eigenvalue of the "
+            f"response Jacobian at the start is {f'{top.real if top.imag == 0 else top:.3g}'}",
+        )
+    largest = largest_gain(deformation, jacobian, weights)
+    # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
+    pairs = (Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0)
+    usable = (one for one in pairs if not any(against_wrappers(one)) and converges(one, jacobian, weights))
+    estimator, of_estimator = problem.sensing.estimator, problem.sensing.delay(problem.plant, problem.period)
+    apart = f"dead time {delay - of_estimator:.4g}, {estimator} {of_estimator:.4g}"
+    remedies = [f"0 < |{name}| < {abs(largest / gain * value):.3g}"] if largest else []
+    remedies += [f"Paired(map, cycles={one.cycles:.4g})" for one in usable][:1]
+    # These remedies stay beside an advice on the gain, because all but the first change something else.
+    raise NotContractive(
+        f"{with_its_gain(deformation)}: the response comes {delay:.4g} cycles late "
+        f"({estimator if delay == of_estimator else apart}), so the iteration does not converge with this {name}; what helps: "
+        f"{', '.join([*remedies, 'a shorter window or time constant'])}"
+    )
+
+
+def _jacobian_at_start(problem: Problem) -> Array:
+    plant, exact = problem.plant, problem.real_plant.exact[None, :]
+    real, state = problem.real_start[None, :], problem.start_state[None, :]
+    response = plant.equations.controlled_response(problem.start_state, problem.inputs_before, plant.approximate)
+    return jacobians_along(problem, real, state, response.full().T, plant.approximate, exact)[0]
+
+
+def _weights_of_estimators(problem: Problem) -> list[Array] | None:
+    """Weights of past requests in every estimated response, dead time included; None where no estimator spreads them."""
+    orders = problem.plant.response_orders.values()
+    weights = [problem.sensing.estimator.weights(order, problem.period) for order in orders]
+    dead_times = {problem.dead_time.inputs.get(name, 0.0) for name in problem.plant.inputs}
+    if all(w.size == 1 for w in weights) or len(dead_times) > 1:
+        return None
+    dead_time = (dead_times.pop() + problem.dead_time.measurement) / problem.period
+    return [delayed(w, dead_time) for w in weights]

@@ -261,24 +261,12 @@ class ContractionReport:
     remedy: str = ""  # what would do instead
 
 
-def check_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
-    """Return the report of a deformation that converges on plants with these eigenvalues.
-
-    A gain between the sector and the linear limit is not refused. Where the response is late by some cycles, the limits are those
-    without this delay, and the text says so.
-
-    Raises:
-        NotContractive: eigenvalues with real parts of both signs, or a gain that is zero, of the wrong sign, or beyond the linear
-            limit; the message names the admissible gains.
-    """
-    report = assess_gain(deformation, spectrum, late)
-    if report.fault:
-        raise NotContractive(report.fault, report.remedy)
-    return report
-
-
 def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
-    """Return the report of `check_gain`; where `check_gain` raises, one with the fault and the same text."""
+    """Return whether a deformation converges on plants with these eigenvalues, with the fault and what would do instead.
+
+    A gain between the sector and the linear limit is no fault. Where the response is late by some cycles, the limits are those
+    without this delay, and the text says so.
+    """
     gain, (name, value) = deformation.effective_gain(), own_gain(deformation)
     predicted = predicted_factor(spectrum.eigenvalues, gain)
     try:

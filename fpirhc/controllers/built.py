@@ -7,16 +7,20 @@ Blocks are handed the result. They read facts from it, and look nothing up again
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.controllers.check import checked
-from fpirhc.controllers.contract import Controller, PlantModel
+from fpirhc.contraction.delayed import require_converging
+from fpirhc.controllers.contract import Controller, PlantModel, resolved
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
 from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
-from fpirhc.controllers.seeing import given_states, raw_signal
-from fpirhc.deformation.base import Deformation
+from fpirhc.controllers.seeing import check_believed, given_states, raw_signal
+from fpirhc.deformation.base import Deformation, against_wrappers
+from fpirhc.errors import refuse
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -24,6 +28,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal, vector
+from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem, cycles_per_plan
 
 
@@ -129,3 +134,69 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         every=cycles_per_plan(planned.horizon, problem.period) if planned and planned.horizon else 1,
         opened=opened,
     )
+
+
+_REFUSES = ContextVar("fpirhc_refuses_gains", default=True)
+_CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
+
+
+@contextmanager
+def any_gain() -> Iterator[None]:
+    """Within it no gain is refused: a review asks loops that no run would begin."""
+    token = _REFUSES.set(False)
+    try:
+        yield
+    finally:
+        _REFUSES.reset(token)
+
+
+def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
+    """Return the resolved controller, checked against the problem.
+
+    Args:
+        numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
+    """
+    facts = numbers_only, _REFUSES.get()
+    return _CHECKED.of((problem, controller), facts, lambda: _checked(problem, controller, numbers_only))
+
+
+def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
+    refuse(_against_outputs(problem))
+    ready = resolved(problem, controller)
+    if numbers_only and ready.inner is None and ready.planner is not None:
+        ready.planner.check_weights(problem)
+    else:
+        ready.check(problem)
+    refuse(_against_form(problem, ready.deformation))
+    check_believed(problem, ready)
+    if ready.deforms not in ("target", "turns") and _REFUSES.get():  # their own checks judge gains
+        require_converging(problem, ready.deformation)
+    return ready
+
+
+def _against_outputs(problem: Problem) -> Iterator[str]:
+    """Reasons against outputs; those of order 0 have a response that is measured."""
+    instant = [name for name, order in problem.plant.response_orders.items() if not order]
+    if instant and not problem.sensing.estimator.measures_all:
+        yield (
+            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
+            "need none; leave the estimator out: Sensing(sensors=...)"
+        )
+
+
+def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
+    """Reasons against the form, the first one first."""
+    plant, form, names = problem.plant, deformation.form, problem.plant.controlled_names
+    given = "dead times" if form.weights is None else "weights"
+    if form.channels not in (None, len(names)):
+        yield (
+            f"{type(deformation).__name__}: {form.channels} {given} are given, but the plant has {len(names)} "
+            f"controlled coordinates ({', '.join(names)}); give one for each, or one number for all"
+        )
+    yield from against_wrappers(deformation)
+    for setting, values in (("cycles", every(form.cycles)), ("lag", every(form.lag))):
+        if form.modelled and len(values) not in (1, len(plant.inputs)):
+            own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
+            yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
+    if plant.step is not None and any(every(form.lag)):
+        yield f"{type(deformation).__name__}: a map has no lag; write an actuator as a state of the map"

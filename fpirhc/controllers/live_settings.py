@@ -16,8 +16,7 @@ from typing import cast
 
 import numpy as np
 
-from fpirhc.controllers.built import Built, build
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import Built, build, checked
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidField, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import expects_whole_number

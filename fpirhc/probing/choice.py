@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import any_gain
+from fpirhc.controllers.built import any_gain
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation

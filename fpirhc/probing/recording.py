@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import any_gain
+from fpirhc.controllers.built import any_gain
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Identity
 from fpirhc.deformation.model_referenced import ModelReferenced

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings

@@ -18,7 +18,7 @@ from typing import Any
 import joblib
 import pandas as pd
 
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
 from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable

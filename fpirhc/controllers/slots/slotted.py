@@ -15,8 +15,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, judge_block, like, reference_block, under_names, warm_up_block
-from fpirhc.controllers.built import Built, build
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import Built, build, checked
 from fpirhc.controllers.composed import with_aim
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.path import measured_output

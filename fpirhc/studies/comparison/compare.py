@@ -12,7 +12,7 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.check import checked
+from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.live_settings import Changes
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
