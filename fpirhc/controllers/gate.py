@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
-AGAIN = 100 * FINITE  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
+AGAIN = math.inf  # time of a cycle that is given once more: no number that fits, and no cycle that is missing
 # In the memory: cycles since the last good sample, which whoever calls the step replays (`fpirhc.simulation.replay`); -1 before the
 # first one.
 MISSING = Signal("missing_cycles", start=(-1.0,))
@@ -41,7 +42,7 @@ def outcome(
 
     `ran`: whether the results are to be kept where they are fine. `opaque`: whether the step is a graph of calls.
     """
-    said = expression(1.0) if "status" not in layout else trace[layout.slice("status")] != int(Status.NON_FINITE)
+    said = trace[layout.slice("status")] != int(Status.NON_FINITE)
     if not opaque:
         fine = ca.logic_and(every_finite(ca.vertcat(memory_next, command)), said)
         return ca.if_else(ca.logic_and(ran, fine), memory_next, memory), fine
@@ -52,13 +53,13 @@ def outcome(
 
 def counted(failed: Expression, fits: Expression, fine: Expression) -> Expression:
     """Return the count of the next cycle: bad samples leave it, and after a trial it begins anew; NaN counts as none."""
-    more = ca.if_else(failed < PATIENCE - 0.5, failed + 1, 0)
-    return ca.if_else(fits, ca.if_else(fine, 0, more), ca.if_else(failed < PATIENCE + 0.5, failed, 0))
+    more = ca.if_else(failed < PATIENCE, failed + 1, 0)
+    return ca.if_else(fits, ca.if_else(fine, 0, more), ca.if_else(failed <= PATIENCE, failed, 0))
 
 
 def is_trial(failed: Expression) -> Expression:
     """Return whether this cycle is tried with the memory of the start; a count that cannot be, after a flipped bit, is none."""
-    return ca.fabs(failed - PATIENCE) < 0.5
+    return failed == PATIENCE
 
 
 def was_skipped(status: Expression) -> Expression:
@@ -82,7 +83,6 @@ class _Judged:
     fits: ca.SX  # whether the sample fits
     held: ca.SX  # the last command
     stored: ca.SX  # of the last good sample, which may be this one
-    missing: Expression  # cycles since the last good sample, of the next cycle
 
 
 def _scalar(name: str, symbols: Sequence[ca.SX], results: Sequence[Expression]) -> ca.Function:
@@ -164,7 +164,6 @@ class Gate:
     def block(self) -> Block:
         """Return the step behind the gate as one block: (sample, parameters) -> the controller's trace."""
         trace, before, after = self.inner.trace, self._before(), self._after()
-        status = ["status"] if "status" in trace else []
 
         def step(s: Signals) -> dict[str, Expression]:
             replayed = {m.name.removeprefix("replayed_"): getattr(s, m.name) for m in self.replayed.signals[1:]}
@@ -175,19 +174,22 @@ class Gate:
             told = self.stored.split(column)
             sample = [told[r] if r in told and self.inner.opaque else getattr(s, r) for r in self.inner.reads.names]
             memory = self.controller_memory.join(vars(s))
-            usable = expression(1.0)
+            usable = expression(True)
             if "memory" not in self.trusted:
                 failed = is_trial(getattr(s, FAILED))
                 usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(failed))
             memory_next, shown, command, fine = self._stepped(fits, usable, memory, sample)
             values = trace.split(shown)
-            said = ca.vertcat(*(values[n] for n in status))
-            ended, own_next = after(now, own, s.time if self.samples else 0, usable, fine, said, command)
+            status, own_next = after(now, own, s.time if self.samples else 0, usable, fine, values["status"], command)
             kept = self.kept.split(own_next)
             remembered = {**self.controller_memory.split(memory_next), **kept}
             remembered |= {m.name: expression(ca.DM.zeros(m.size)) for m in self.replayed.signals}
-            values |= dict.fromkeys(status, ended)
-            return {**values, "command": kept[HELD], **{f"{m}_next": v for m, v in remembered.items()}}
+            return {
+                **values,
+                "status": status,
+                "command": kept[HELD],
+                **{f"{m}_next": v for m, v in remembered.items()},
+            }
 
         opaque, inside = self.inner.opaque, self.inner
         return Block("gate", self.reads, trace, step, self.memory, opaque=opaque, inside=inside)
@@ -203,10 +205,8 @@ class Gate:
     def _after(self) -> ca.Function:
         """Function (sample, kept, time, usable, fine, status, command) -> (status, kept one cycle later)."""
         symbols, judged = self._judged
-        own, status = self.kept.split(symbols[1]), ca.SX.sym("status", int("status" in self.inner.trace))
-        usable, fine, command = (
-            ca.SX.sym(n, k) for n, k in (("usable", 1), ("fine", 1), ("command", judged.held.numel()))
-        )
+        own, command = self.kept.split(symbols[1]), ca.SX.sym("command", judged.held.numel())
+        usable, fine, status = (ca.SX.sym(name) for name in ("usable", "fine", "status"))
         fits, ran = judged.fits, ca.logic_and(judged.fits, fine)
         following = {HELD: ca.if_else(ran, command, judged.held)}
         following |= {
@@ -219,9 +219,9 @@ class Gate:
                 start = ca.DM(self.kept[f"good_{n}"].start_vector())
                 following[f"good_{n}@{k}"] = ca.if_else(every_finite(kept), kept, start)
         if self.samples:
+            before, missing = own[MISSING.name], self._missing(own[MISSING.name], symbols[2])
             # a good sample that the step cannot use is not missing
-            before = ca.if_else(fits, own[MISSING.name], judged.missing)
-            following[MISSING.name] = ca.if_else(ran, 0, before)
+            following[MISSING.name] = ca.if_else(ran, 0, ca.if_else(fits, before, missing))
         ended = ca.if_else(usable, status, int(Status.RESTARTED))
         ended = ca.if_else(fits, ca.if_else(fine, ended, int(Status.NON_FINITE)), int(Status.BAD_SAMPLE))
         return _scalar("after", [*symbols, usable, fine, status, command], [ended, self.kept.join(following)])
@@ -246,13 +246,14 @@ class Gate:
         fits = ca.logic_and(self._possible(sample, last), self._inside(sample))
         now = ca.vertcat(ca.SX(0, 1), *(sample[self.sample.slice(n)] for n in self.stored.names))
         stored = ca.if_else(fits, now, last)
-        missing: Expression = ca.SX(0)
-        if self.samples:
-            before = values[MISSING.name]
-            before = ca.if_else(ca.fabs(before) <= MOST_MISSING, before, -1)
-            passes = ca.logic_and(before > -0.5, ca.logic_not(time >= AGAIN))
-            missing = ca.if_else(passes, ca.fmin(before + 1, MOST_MISSING), before)
-        return [sample, own, time], _Judged(fits, command, stored, missing)
+        return [sample, own, time], _Judged(fits, command, stored)
+
+    @staticmethod
+    def _missing(before: Expression, time: Expression) -> Expression:
+        """Cycles since the last good sample, where that of now is bad."""
+        before = ca.if_else(ca.fabs(before) <= MOST_MISSING, before, -1)
+        passes = ca.logic_and(before >= 0, time != AGAIN)
+        return ca.if_else(passes, ca.fmin(before + 1, MOST_MISSING), before)
 
     def _possible(self, sample: Expression, good: Expression) -> Expression:
         """Whether every entry is finite, and the time stamp is new."""
@@ -267,7 +268,7 @@ class Gate:
 
     def _inside(self, sample: Expression) -> Expression:
         """Whether every entry is inside its interval, and no sample is lost; NaN is inside none."""
-        inside: Expression = ca.SX(1)
+        inside: Expression = ca.SX(True)
         for k, column in enumerate(self.sample.columns):
             lower, upper = (-np.inf, 0.0) if column == LOST.name else self.ranges.get(column, (-np.inf, np.inf))
             inside = ca.logic_and(inside, sample[k] >= lower) if np.isfinite(lower) else inside
@@ -282,6 +283,6 @@ class Gate:
         if "memory" not in self.trusted:
             # Of a graph it is copied as a whole.
             remembered = ca.if_else(usable, memory, ca.DM(inner.memory.start()), opaque)
-        memory_next, trace, command = inner.function.call([remembered, *sample], opaque, False)
+        memory_next, trace, command = inner.function.call([remembered, *sample], opaque)
         after, fine = outcome(memory_next, memory, command, trace, inner.trace, fits, opaque=opaque)
         return after, trace, command, fine

@@ -211,7 +211,7 @@ def innermost(deformation: Deformation) -> Deformation:
 def own_gain(deformation: Deformation) -> tuple[str, float]:
     """Return the gain that the user sets, by name: the number that another effective gain changes; without one the latter."""
     own, gain = innermost(deformation), deformation.effective_gain()
-    other = own.with_effective_gain(2 * own.effective_gain()) if gain else own
+    other = own.with_effective_gain(-own.effective_gain()) if gain else own
     numbers = [(n, v) for n, v in vars(own).items() if isinstance(v, int | float) and v != getattr(other, n, v)]
     return (numbers[0][0], float(numbers[0][1])) if numbers else ("effective gain", gain)
 

@@ -146,7 +146,7 @@ def test_after_ten_steps_that_are_not_finite_one_is_tried_from_the_start(opaque)
     """Samples outside the domain stay so: the memory is kept. A good sample then tells that the memory was at fault."""
     gated, rules, taken = stepper(opaque), Rules(), []
     memory = gated.start()
-    for k, b in enumerate([1.0, *[0.125] * 25, 1.0, *[0.25] * 10, 1.0, 1.0]):
+    for k, b in enumerate([1.0, *[0.125] * 25, 1.0, *[0.25] * 9, 1.0, *[0.25] * 10, 1.0, 1.0]):
         time, state = k * PROBLEM.period, np.array([0.5, b, 0.0, 0.0])
         command, memory = gated.step(time, state, np.zeros(2), memory, taken=time)
         expected, status = rules.step(time, state, np.zeros(2), time)

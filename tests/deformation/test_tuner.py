@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.iteration import Scalar
 from helpers.kinds import slow_but
+from scipy.special import betainc
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
@@ -18,14 +19,13 @@ SMOOTH = np.sin(0.01 * np.arange(CYCLES))
 
 
 def run(deformation, gains, noise=None):
-    """True response errors of the scalar loop f = gain r along a slow wave, and the tuner's factors."""
-    step, request, errors, factors = Scalar(deformation), 0.0, [], []
+    """True response errors of the scalar loop f = gain r along a slow wave."""
+    step, request, errors = Scalar(deformation), 0.0, []
     for k in range(1, CYCLES):
         response = gains[k] * request
         errors.append(response - SMOOTH[k])
         request = step(request, response + (0.0 if noise is None else noise[k]), SMOOTH[k])
-        factors.append(step.remembered("tuner_factor") if "tuner_factor" in step.layout.names else 1.0)
-    return np.array(errors), np.array(factors)
+    return np.array(errors)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
@@ -37,17 +37,14 @@ def test_tuner_follows_a_plant_whose_gain_jumps(noise):
     tuned = fp.Tuned(sigmoid, largest_gain=1.69 * sigmoid.slope)
     results = {}
     for deformation in (sigmoid, tuned):
-        errors, _ = run(deformation, gains, white)
+        errors = run(deformation, gains, white)
         results[deformation] = [np.sqrt(np.mean(part[500:] ** 2)) for part in np.split(errors[: CYCLES - 3], 3)]
     assert max(results[tuned]) < 0.14
     assert results[sigmoid][1] > 10
 
 
-def test_tuner_never_exceeds_its_cap_and_forgets_what_is_no_number():
-    """Where the plant answers weakly, the factor ends at the cap."""
-    tuned = fp.Tuned(fp.Affine(gain=-0.5), largest_gain=0.8)
-    assert run(tuned, np.full(CYCLES, 0.05))[1].max() == pytest.approx(0.8 / 0.25)
-    step = Scalar(tuned)
+def test_tuner_forgets_what_is_no_number():
+    step = Scalar(fp.Tuned(fp.Affine(gain=-0.5), largest_gain=0.8))
     for response in (1.0, np.nan, 1.0, 1.0, 1.0):
         step(0.0, response, 0.5)
     assert np.isfinite(step.memory.full()).all()
@@ -68,13 +65,49 @@ def test_tuner_needs_a_bound_and_a_target_that_converges(settings, words):
 
 def in_noise(tuned, components, count, seed):
     """Factors of the tuner whose errors are white noise alone."""
+    return factors_of(tuned, np.random.default_rng(seed).standard_normal((components, count)))
+
+
+def factors_of(tuned, noise):
+    """Factors of the tuner, after every step, where the response is the request and noise."""
+    components, count = noise.shape
     layout = tuned.memory(tuple(f"q{k}" for k in range(components)))
     r, n, m = (ca.SX.sym(name, size) for name, size in (("r", components), ("n", components), ("m", layout.size)))
     request, following = tuned.step(r, r + n, ca.SX.zeros(components), layout.split(m))
     step = ca.Function("s", [ca.vertcat(r, m), n], [ca.vertcat(request, layout.join(following))])
-    noise = np.random.default_rng(seed).standard_normal((components, count))
     log = step.mapaccum("run", count)(np.append(np.zeros(components), layout.start()), noise).full()
     return log[components + layout.slice("tuner_factor").start]
+
+
+@pytest.mark.parametrize("components", [1, 2, 3, 4, 5])
+def test_the_tuner_is_its_rule_in_numpy(components):
+    """Growing errors, two-cycles, and noise around them; the mean sign of white noise is that of scipy's beta function."""
+    random, target, cap, half = np.random.default_rng(components), 0.5, 1.3, components / 2
+    swing = np.concatenate([np.cumprod(random.uniform(0.9, g, 60)) for g in (1.15, 1.3, 1.02)] + [np.ones(60)])
+    noise = random.choice([0.0, 0.1, 3.0], len(swing)) * random.standard_normal((components, len(swing)))
+    noise = np.tile(noise + swing * (-1) ** np.arange(len(swing)), 4)
+    noise = np.hstack([np.cumsum(np.ones((components, 60)), axis=1), noise])  # a ramp first
+    tuned = fp.Tuned(fp.Affine(gain=-1.0), largest_gain=0.5 * cap, target=target)
+    factor, growing, returning, expected = 1.0, 0.0, 0, []
+    request = before = earlier = np.zeros(components)
+    for error in noise.T:
+        error = request + error
+        turned, size = error @ before < 0, error @ error
+        much = size > (1.0 if factor < 1 else 1.5) ** 2 * (before @ before)
+        growing = growing + (1 if much else 1 / 3) if turned and size > before @ before else 0
+        back = (error - earlier) @ (error - earlier) < 0.3**2 * size
+        returning = returning + 1 if turned and back else 0
+        mean = 2 * betainc(half, half, (1 - max(target, 1.0 if factor < 1 else 0.0) / 2) / 2) - 1
+        sign = np.sign(error @ before)
+        tuned_to = factor * np.exp(0.02 * (sign - mean) * abs(sign))
+        tuned_to = min(max(tuned_to, 1e-3 if factor < 1 else 1.0), cap)
+        if growing > 5 - 1 / 6 or returning >= 8:
+            tuned_to, growing, returning = max(factor / 2, 1e-3), 0, 0
+        request = request - factor * 0.5 * error
+        factor, before, earlier = tuned_to, error, before
+        expected.append(factor)
+    np.testing.assert_allclose(factors_of(tuned, noise), expected, rtol=1e-9)
+    assert (min(expected), max(expected)) == (0.001, cap)
 
 
 @pytest.mark.parametrize(("start", "components"), [(0.02, 1), (0.1, 3)])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.conformance import check_deformation
 from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidValue, NotContractive, NotSupported
 
@@ -52,12 +51,6 @@ def test_the_step_is_the_matrix_times_the_error(weights):
     after, memory = one.step(ca.SX(r), ca.SX(f), ca.SX(d), {})
     assert np.asarray(ca.evalf(ca.SX(after))).ravel() == pytest.approx(r - 0.3 * matrix @ (f - d), abs=1e-15)
     assert memory == {}
-
-
-def test_with_equal_weights_all_laws_hold():
-    """W = 1 is the map without weights, and keeps its laws."""
-    check_deformation(replace(fp.Affine(gain=-0.5), weights=None), seed=0)
-    assert error(fp.Affine(gain=-0.5, weights=(1.0, 1.0))) == pytest.approx(error(fp.Affine(gain=-0.5)), rel=1e-9)
 
 
 def test_the_inverse_of_the_gains_is_deadbeat():

@@ -28,9 +28,6 @@ class Scalar:
         after, self.memory = self.step(request, response, desired, self.memory)
         return float(after)
 
-    def remembered(self, name: str) -> float:
-        return float(ca.DM(self.memory).full()[self.layout.slice(name)].item(0))
-
 
 def iteration_radius(deformation: Deformation, delay: int) -> float:
     """Spectral radius of the scalar iteration whose response is the request of `delay` cycles earlier."""
