@@ -4,7 +4,6 @@ docs/extending.md has an example of each; `fpirhc.conformance` has the laws.
 """
 
 from fpirhc.controllers.base import closing_blocks as closing_blocks
-from fpirhc.controllers.base import like as like
 from fpirhc.controllers.base import reference_block as reference_block
 from fpirhc.controllers.built import Built as Built
 from fpirhc.controllers.built import build as build
@@ -32,6 +31,7 @@ from fpirhc.symbolic.expression import is_finite as is_finite
 from fpirhc.symbolic.layout import Layout as Layout
 from fpirhc.symbolic.layout import Signal as Signal
 from fpirhc.symbolic.layout import discrete as discrete
+from fpirhc.symbolic.layout import like as like
 from fpirhc.symbolic.layout import scalar as scalar
 from fpirhc.symbolic.layout import vector as vector
 from fpirhc.task.disturbance import Disturbance as Disturbance

@@ -6,8 +6,7 @@ Theory: docs/theory.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
 from functools import reduce
 
 import casadi as ca
@@ -20,41 +19,13 @@ from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, Value, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
+from fpirhc.symbolic.block import Block, Delay, rename
+from fpirhc.symbolic.expression import Signals, is_finite
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like, scalar
 from fpirhc.tracking.base import Tracking
 
 _REQUEST = Form().request
 _ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
-
-
-def fed(block: Block, name: str, source: Signal) -> Block:
-    """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
-    if name not in block.reads:
-        return block
-    reads = {one.name: one for one in (source if s.name == name else s for s in block.reads.signals)}
-
-    def step(s: Signals) -> Mapping[str, Value]:
-        return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
-
-    return replace(block, reads=Layout(tuple(reads.values())), step=step)
-
-
-def under_names(block: Block, names: Mapping[str, str]) -> Block:
-    """Return the block with other names for the signals that it reads, writes and remembers."""
-
-    def other(layout: Layout) -> Layout:
-        return Layout(tuple(replace(s, name=names.get(s.name, s.name)) for s in layout.signals))
-
-    def step(s: Signals) -> dict[str, Value]:
-        incoming = {names.get(n, n): n for n in (*block.reads.names, *block.memory.names)}
-        values = block.step(Signals({n: getattr(s, new) for new, n in incoming.items()}))
-        later = {f"{n}_next": f"{names.get(n, n)}_next" for n in block.memory.names}
-        return {later.get(n, names.get(n, n)): value for n, value in values.items()}
-
-    reads, writes, memory = map(other, (block.reads, block.writes, block.memory))
-    return replace(block, reads=reads, writes=writes, memory=memory, step=step)
 
 
 def reference_block(built: Built) -> Block:
@@ -71,11 +42,6 @@ def reference_block(built: Built) -> Block:
     reads = Layout((time_signal(plant), seen, *built.own))
     writes = Layout((like(seen, "reference"), plant.response_signal("_reference_response"), built.error))
     return Block("reference", reads, writes, step, opaque=built.opaque)
-
-
-def rename(name: str, source: Signal, target: Signal) -> Block:
-    """Block that gives `source` a second name."""
-    return Block(name, Layout((source,)), Layout((target,)), lambda s: {target.name: getattr(s, source.name)})
 
 
 def closing_blocks(
@@ -248,11 +214,6 @@ def judge_block(judged: Sequence[Signal] = ()) -> Block:
         return {"status": worst}
 
     return Block("judge", reads, Layout((scalar("status"),)), step)
-
-
-def like(signal: Signal, name: str) -> Signal:
-    """Return a signal of the same shape and units under another name."""
-    return Signal(name, signal.elements, signal.units)
 
 
 def desired_blocks(built: Built, tracking: Tracking) -> list[Block]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import casadi as ca
 
@@ -18,12 +19,12 @@ from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
 from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
-from fpirhc.controllers.seeing import check_believed, given_states, raw_signal
+from fpirhc.controllers.seeing import check_believed, given_states, raw_signal, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import refuse
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
@@ -75,6 +76,11 @@ class Built:
     def told(self) -> Told:
         """What the model is told of signals from outside."""
         return Told(self.model.plant, self.model.signals, self.period)
+
+    @cached_property
+    def seeing(self) -> tuple[list[Block], list[Delay]]:
+        """Blocks from the raw measurements to state, outputs and response, and what they remember."""
+        return seeing_blocks(self.problem)
 
     def own_values(self, s: Signals) -> list[Expression]:
         """Return the reference's own signals inside a step."""

@@ -10,19 +10,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.path import ACTED, MEASURED_TIME, NOW, measured_output, measured_state
-from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.errors import InvalidProblem
 from fpirhc.fields.kinds import described
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
-from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Composite, Delay, compose
+from fpirhc.symbolic.block import Block, Composite, Delay, compose, fed, rename
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like
 
 _LATEST: Latest[Composite] = Latest(4)
 
@@ -39,17 +36,14 @@ def _composed(built: Built) -> Composite:
     if built.raw is None:
         return compose_controller(built)
     blocks, delays = _blocks_of(built)
-    seeing, seen = seeing_blocks(built.problem)
-    time, *others = _reads(built).signals
-    reads = Layout((time, *built.states, built.raw, *others[1 + len(measured_signals(built.plant)) :]))
-    return _informed(built, reads, [*seeing, *_at_once(built.plant, blocks)], [*delays, *seen])
+    seeing, seen = built.seeing
+    reads = _reads(built, *built.states, built.raw)
+    return _informed(built, reads, [*seeing, *_measuring(built, blocks), *blocks], [*delays, *seen])
 
 
-def _reads(built: Built) -> Layout:
-    """What a controller reads in every cycle: time, motion, realised response, parameters, and what a reference is given."""
-    plant = built.plant
-    measured = *measured_signals(plant), plant.response_signal("realised")
-    return Layout((time_signal(plant), *measured, built.model.plant.parameter, *built.given))
+def _reads(built: Built, *seen: Signal) -> Layout:
+    """What a controller reads in every cycle: time, what is seen, parameters, and what a reference is given."""
+    return Layout((time_signal(built.plant), *seen, built.model.plant.parameter, *built.given))
 
 
 def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
@@ -59,10 +53,25 @@ def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
     and the signals of the last cycle, where a block needs them.
     """
     blocks, delays = _blocks_of(built)
+    reads = _reads(built, *measured_signals(built.plant), built.plant.response_signal("realised"))
+    measuring = _measuring(built, blocks)
     if ahead:
-        reads = _reads(built) + Layout(_measured_reads(built.plant, blocks))
+        reads = reads + Layout(tuple(signal for block in measuring for signal in block.writes.signals))
         return _informed(built, reads, blocks, delays, ahead=True)
-    return _informed(built, _reads(built), _at_once(built.plant, blocks), delays)
+    return _informed(built, reads, [*measuring, *blocks], delays)
+
+
+def _measuring(built: Built, blocks: Sequence[Block]) -> list[Block]:
+    """Blocks that write what is measured, where some blocks read it: what is given, unless a controller acts on predictions."""
+    plant, read = built.plant, _read_by(blocks)
+    now = replace(time_signal(plant), name=MEASURED_TIME)
+    pairs = (plant.state, measured_state(plant)), (plant.output, measured_output(plant)), (time_signal(plant), now)
+    named = {one.name: (given, one) for given, one in pairs if one.name in read}
+    return [rename(f"measured_{given.name}", given, one) for given, one in named.values()]
+
+
+def _read_by(blocks: Sequence[Block]) -> set[str]:
+    return {name for block in blocks for name in block.reads.names}
 
 
 def dependencies_of_command(step: Composite) -> frozenset[str]:
@@ -86,9 +95,8 @@ def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
 
 def with_aim(built: Built, blocks: Sequence[Block]) -> list[Block]:
     """Return the blocks of a controller after the reference's own block, where some of them read its signals."""
-    names = {name for block in blocks for name in block.reads.names} if built.aim is not None else set()
-    aim = [built.aim] if built.aim is not None and any(signal.name in names for signal in built.own) else []
-    return [*aim, *blocks]
+    own = {signal.name for signal in built.own}
+    return [*([built.aim] if built.aim is not None and own & _read_by(blocks) else []), *blocks]
 
 
 def _holds(part: object, kind: type) -> bool:
@@ -103,7 +111,7 @@ def _informed(
     `ahead`: whether the time is the one at which the command will act.
     """
     told = built.told
-    compares = bool(told.places) and any(ACTED in block.reads for block in blocks)
+    compares = bool(told.places) and ACTED in _read_by(blocks)
     first = told.block(remembers=compares and not ahead)
     if first is None:
         return compose("controller", reads, blocks, delays, outputs=("command",))
@@ -129,24 +137,3 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
 
     inside = composite.trace, step, composite.memory, composite.opaque
     return Block(name, Layout(reads), *inside)
-
-
-def _measured(plant: Plant) -> dict[str, tuple[Signal, Signal]]:
-    """What is measured, by name, where a controller may act on predictions, and what is given in its place where none does."""
-    now = replace(time_signal(plant), name=MEASURED_TIME)
-    every = (measured_state(plant), plant.state), (measured_output(plant), plant.output), (now, time_signal(plant))
-    return {one.name: (one, given) for one, given in every}
-
-
-def _measured_reads(plant: Plant, blocks: Sequence[Block]) -> tuple[Signal, ...]:
-    """The signals of the measured state and outputs and of their time, as far as some blocks read them."""
-    read = {name for block in blocks for name in block.reads.names}
-    return tuple(one for name, (one, _) in _measured(plant).items() if name in read)
-
-
-def _at_once(plant: Plant, blocks: Sequence[Block]) -> list[Block]:
-    """The blocks with the state, outputs and time that are given in place of the measured ones."""
-    read = {name for block in blocks for name in block.reads.names}
-    for name, (_, given) in _measured(plant).items():
-        blocks = [fed(block, name, given) for block in blocks] if name in read else blocks
-    return list(blocks)

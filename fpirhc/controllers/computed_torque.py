@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block, tracked_blocks
+from fpirhc.controllers.base import Controller, commanding_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
@@ -20,7 +20,7 @@ from fpirhc.members import Example
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.layout import Expression, Layout, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 from fpirhc.tracking.linear_law import Exponential

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.reference_states import own_signals, own_values, preview_of
@@ -38,7 +38,7 @@ from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, like, scalar
 from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
 from fpirhc.task.exogenous import previewed_values
 from fpirhc.task.problem import Problem

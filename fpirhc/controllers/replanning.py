@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import fed, like
 from fpirhc.controllers.built import Built
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
@@ -19,11 +18,11 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.plant.chain import without_disturbances
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fpirhc.controllers.base import Controller, commanding_blocks, like, reference_block
+from fpirhc.controllers.base import Controller, commanding_blocks, reference_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.contract import PlantModel, Undeformed
@@ -25,7 +25,7 @@ from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
 from fpirhc.simulation.tables import disturbance_signals
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like
 from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
 

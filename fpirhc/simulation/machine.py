@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, fed, under_names
+from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.gate import Gate, was_skipped
@@ -29,7 +29,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
 from fpirhc.simulation.replay import known_samples
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Block, Composite, compose
+from fpirhc.symbolic.block import Block, Composite, compose, fed, under_names
 from fpirhc.symbolic.driver import every_finite
 from fpirhc.symbolic.expression import FINITE, Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector

@@ -15,7 +15,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import like
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import own_step
@@ -26,7 +25,7 @@ from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
 from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal, logged_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.external_plant import ExternalPlant, quantities

@@ -9,7 +9,6 @@ from typing import TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import like, rename
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.seeing import sensor_ranges
@@ -17,9 +16,9 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.path import HELD, Mover, moving, real_signals
-from fpirhc.symbolic.block import Block
+from fpirhc.symbolic.block import Block, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
 from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
 from fpirhc.task.problem import Problem
 

@@ -219,6 +219,39 @@ def open_settings(blocks: Sequence[Block]) -> Layout:
     return _settings([s for b in blocks for s in b._built[1].signals])
 
 
+def fed(block: Block, name: str, source: Signal) -> Block:
+    """Return the block with `source` in place of the signal `name`; a block that does not read `name` stays as it is."""
+    if name not in block.reads:
+        return block
+    reads = {one.name: one for one in (source if s.name == name else s for s in block.reads.signals)}
+
+    def step(s: Signals) -> Mapping[str, Value]:
+        return block.step(Signals({**vars(s), name: getattr(s, source.name)}))
+
+    return replace(block, reads=Layout(tuple(reads.values())), step=step)
+
+
+def under_names(block: Block, names: Mapping[str, str]) -> Block:
+    """Return the block with other names for the signals that it reads, writes and remembers."""
+
+    def other(layout: Layout) -> Layout:
+        return Layout(tuple(replace(s, name=names.get(s.name, s.name)) for s in layout.signals))
+
+    def step(s: Signals) -> dict[str, Value]:
+        incoming = {names.get(n, n): n for n in (*block.reads.names, *block.memory.names)}
+        values = block.step(Signals({n: getattr(s, new) for new, n in incoming.items()}))
+        later = {f"{n}_next": f"{names.get(n, n)}_next" for n in block.memory.names}
+        return {later.get(n, names.get(n, n)): value for n, value in values.items()}
+
+    reads, writes, memory = map(other, (block.reads, block.writes, block.memory))
+    return replace(block, reads=reads, writes=writes, memory=memory, step=step)
+
+
+def rename(name: str, source: Signal, target: Signal) -> Block:
+    """Block that gives `source` a second name."""
+    return Block(name, Layout((source,)), Layout((target,)), lambda s: {target.name: getattr(s, source.name)})
+
+
 def every(block: Block, cycles: int) -> Block:
     """Return a block that runs `block` in every `cycles`-th cycle and holds its writes in between.
 

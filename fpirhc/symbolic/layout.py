@@ -21,7 +21,7 @@ import numpy.typing as npt
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, derivative_of, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, column
 
-__all__ = ["Expression", "Kind", "Layout", "Named", "Signal", "discrete", "scalar", "vector"]
+__all__ = ["Expression", "Kind", "Layout", "Named", "Signal", "discrete", "like", "scalar", "vector"]
 
 
 T = TypeVar("T")
@@ -82,6 +82,11 @@ class Signal:
 def _each(values: tuple[T, ...], size: int) -> tuple[T, ...]:
     """One value per entry, of one per entry or one for all."""
     return values if len(values) == size else values * size
+
+
+def like(signal: Signal, name: str) -> Signal:
+    """Return a signal of the same shape and units under another name."""
+    return Signal(name, signal.elements, signal.units)
 
 
 def scalar(name: str, unit: str = "1", start: float = 0.0) -> Signal:

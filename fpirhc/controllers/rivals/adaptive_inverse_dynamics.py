@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks, fed, like
+from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.path import MEASURED_TIME
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
@@ -18,9 +18,9 @@ from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import time_signal
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import commanding_blocks, like, reference_block, rename
+from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_chains
 from fpirhc.controllers.rivals.reference_model import decay_gains
@@ -20,9 +20,9 @@ from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes, step_of
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, rename
 from fpirhc.symbolic.expression import Signals, is_finite, power, total
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, own_errors
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, closing_blocks, like, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.rivals.reference_model import decay_gains, model_block
 from fpirhc.deformation.base import Deformation
@@ -21,7 +21,7 @@ from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, vector
+from fpirhc.symbolic.layout import Expression, Layout, like, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

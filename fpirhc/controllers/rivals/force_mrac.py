@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, law_blocks, like
+from fpirhc.controllers.base import Controller, law_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
@@ -21,7 +21,7 @@ from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.layout import Expression, Layout, like, scalar
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import law_blocks, like
+from fpirhc.controllers.base import law_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import PairedAtOnce
 from fpirhc.fields.kinds import Accuracy, Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, discrete, scalar
+from fpirhc.symbolic.layout import Expression, Layout, discrete, like, scalar
 from fpirhc.tracking.base import Tracking
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import law_blocks, like
+from fpirhc.controllers.base import law_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
@@ -24,7 +24,7 @@ from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, own_errors
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import clip, like
+from fpirhc.controllers.base import clip
 from fpirhc.controllers.built import Built
 from fpirhc.errors import InvalidValue, refuse
 from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
@@ -23,7 +23,7 @@ from fpirhc.plant.regressor import Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, is_finite, pair
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 
 Gradient = Callable[[Signals, Expression, Expression], Pair]  # (signals, state of the response, estimate) -> (G, w)

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import commanding_blocks, like, reference_block
+from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
@@ -22,7 +22,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import commanding_blocks, fed, like, reference_block, rename
+from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
@@ -17,9 +17,9 @@ from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, fed, rename
 from fpirhc.symbolic.expression import Signals, total
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import (
     Useful,

@@ -10,12 +10,11 @@ import math
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import like
 from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, expression, power
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.tracking.base import error_chains
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import commanding_blocks, invert_block, like, reference_block
+from fpirhc.controllers.base import commanding_blocks, invert_block, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed, check_derivatives
 from fpirhc.controllers.rivals.reference_model import decay_gains
@@ -18,7 +18,7 @@ from fpirhc.members import Example
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, scalar
+from fpirhc.symbolic.layout import Expression, Layout, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import closing_blocks, like, reference_block, rename
+from fpirhc.controllers.base import closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
@@ -19,9 +19,9 @@ from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, rename
 from fpirhc.symbolic.expression import Signals, power
-from fpirhc.symbolic.layout import Expression, Layout, vector
+from fpirhc.symbolic.layout import Expression, Layout, like, vector
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 

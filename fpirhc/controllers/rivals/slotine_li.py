@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, closing_blocks, fed, like, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.rivals.learned_parameters import Learning, learning_delays
 from fpirhc.deformation.base import Deformation, Identity
@@ -17,9 +17,9 @@ from fpirhc.learning.rules.base import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import derivative_unit, places
 from fpirhc.plant.regressor import Regressor
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
 from fpirhc.task.problem import Problem
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, judge_block, like, reference_block, under_names, warm_up_block
+from fpirhc.controllers.base import Controller, judge_block, reference_block, warm_up_block
 from fpirhc.controllers.built import Built, build, checked
 from fpirhc.controllers.composed import with_aim
 from fpirhc.controllers.contract import resolved
@@ -27,10 +27,10 @@ from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Output, Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite, left_after
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like, scalar
 from fpirhc.task.problem import Problem
 
 

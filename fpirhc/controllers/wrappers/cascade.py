@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, like, reference_block, under_names
+from fpirhc.controllers.base import Controller, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
@@ -26,9 +26,9 @@ from fpirhc.members import Example
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.expression import Signals, is_finite, kind
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.dead_time import MOST, Queue, every
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Reference, Steps

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, dependencies_of_command, embedded
 from fpirhc.controllers.contract import ControllerWrapper, Planner, innermost, with_field
@@ -25,7 +25,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
-from fpirhc.symbolic.layout import Layout, Signal, discrete
+from fpirhc.symbolic.layout import Layout, Signal, discrete, like
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, like
+from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
@@ -27,7 +27,7 @@ from fpirhc.plant.motion import forcing_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like
 from fpirhc.task.dead_time import MOST, DeadTime, Queue
 from fpirhc.task.problem import Problem
 
