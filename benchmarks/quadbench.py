@@ -34,7 +34,7 @@ import vehicle  # noqa: E402
 
 LOST = 1.0  # m
 AHEAD = 0.03  # s, of a controller that predicts its state
-PREDICTIONS = {"by model": fp.ByModel(), "with residual": fp.ByModel(residual_time=0.1), "by desired": fp.ByDesired()}
+PREDICTIONS = {"by model": {}, "with residual": {"residual_time": 0.1}, "by desired": {"by": "desired"}}
 MOMENTS = 0.1  # gain of the second iteration, on the moments
 TURN = 2 * np.pi * 0.2  # rad/s, of the circle
 BUTTER = ((0.39133577, 0.78267155, 0.39133577), (0.36952738, 0.19581571))  # numerator; denominator without its one
@@ -188,7 +188,7 @@ def circle(task: Any) -> None:
     adapted = {name: one for name, one in task.controllers.items() if one.deformation.adapts}
     halves = {f"{name}, half the gain": halved(one) for name, one in adapted.items()}
     predicted = {
-        f"CTC+FPI, 30 ms ahead {name}": fp.Predicted(task.controllers["CTC+FPI"], inputs=AHEAD, by=by)
+        f"CTC+FPI, 30 ms ahead {name}": fp.Predicted(task.controllers["CTC+FPI"], inputs=AHEAD, **by)
         for name, by in PREDICTIONS.items()
     }
     controllers = {**task.controllers, **halves, **predicted}

@@ -15,8 +15,6 @@ from .controllers.wrappers.cascade import Cascade as Cascade
 from .controllers.wrappers.cascade import ThroughModel as ThroughModel
 from .controllers.wrappers.estimating import Estimating as Estimating
 from .controllers.wrappers.exact_model import ExactModel as ExactModel
-from .controllers.wrappers.predicted import ByDesired as ByDesired
-from .controllers.wrappers.predicted import ByModel as ByModel
 from .controllers.wrappers.predicted import Predicted as Predicted
 from .deformation.affine import Affine as Affine
 from .deformation.base import Identity as Identity

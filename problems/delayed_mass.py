@@ -72,7 +72,7 @@ controllers = {
     "CTC": fp.ComputedTorque(law),
     "CTC+FPI unpaired": fp.ComputedTorque(law, sigmoid),
     "CTC+FPI paired": fp.ComputedTorque(law, fp.Paired(sigmoid, cycles=DEAD_TIME / PERIOD)),
-    "CTC+FPI increment": fp.Predicted(fp.ComputedTorque(law, increment), inputs=DEAD_TIME, by=fp.ByDesired()),
+    "CTC+FPI increment": fp.Predicted(fp.ComputedTorque(law, increment), inputs=DEAD_TIME, by="desired"),
 }
 headline = ("RHC", "RHC+FPI")
 why = (

@@ -73,11 +73,11 @@ sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=0.05)  # scale in m/s^2
 increment = fp.Increment(sigmoid, cycles=DEAD_TIME / PERIOD)
 plain = fp.RecedingHorizon(fp.FixedPoint())
 adaptive = fp.RecedingHorizon(plain.optimiser, increment)
-corrected = fp.ByModel(residual_time=5.0)  # s
+RESIDUAL = 5.0  # s
 
 controllers = {
-    "RHC": fp.Predicted(plain, inputs=DEAD_TIME, by=corrected),
-    "RHC+FPI": fp.Predicted(adaptive, inputs=DEAD_TIME, by=corrected),
+    "RHC": fp.Predicted(plain, inputs=DEAD_TIME, residual_time=RESIDUAL),
+    "RHC+FPI": fp.Predicted(adaptive, inputs=DEAD_TIME, residual_time=RESIDUAL),
     "RHC exact model": fp.ExactModel(fp.Predicted(plain, inputs=DEAD_TIME)),
     "RHC uncorrected": fp.Predicted(plain, inputs=DEAD_TIME),
     "RHC uncorrected+FPI": fp.Predicted(adaptive, inputs=DEAD_TIME),

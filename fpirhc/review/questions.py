@@ -106,7 +106,7 @@ def _follows(case: Case) -> Fact:
     column, by = errors[bench.first(len(errors)) :, case.problem.judged_names.index(name)], predictor(bench.controller)
     if by is None or by.residual_time or abs(column.mean()) <= OFFSET * rms or not 0.01 < share < math.inf:
         return Fact(verdict, numbers, name)
-    change = "A wrong model in the prediction leaves an offset: Predicted(controller, by=ByModel(residual_time=...))."
+    change = "A wrong model in the prediction leaves an offset: Predicted(controller, residual_time=...)."
     numbers["mean_error"] = abs(column.mean())
     return Fact(Verdict.CAUTION if verdict == Verdict.YES else verdict, numbers, name, change)
 

@@ -32,7 +32,7 @@ def waved(gain: float) -> Callable[..., Any]:
 def test_the_residual_of_an_output_is_the_forcing_that_makes_it_up() -> None:
     """Y = 3 x of a tank with a wrong leak: the residual of y'' acts on the state as a third of it, as if x had been measured."""
     runs = []
-    for gain, by in ((1.0, fp.ByModel(residual_time=0.5)), (3.0, fp.ByModel(residual_time=0.5)), (1.0, fp.ByModel())):
+    for gain, time in ((1.0, 0.5), (3.0, 0.5), (1.0, None)):
         plant = fp.Plant(
             coordinates={"x": "m"},
             inputs={"u": "N"},
@@ -49,7 +49,7 @@ def test_the_residual_of_an_output_is_the_forcing_that_makes_it_up() -> None:
             measure_from=4.0,
             dead_time=fp.DeadTime(inputs={"u": 0.1}),
         )
-        runs.append(simulated(problem, fp.Predicted(fp.ComputedTorque(LAW), inputs=0.1, by=by)))
+        runs.append(simulated(problem, fp.Predicted(fp.ComputedTorque(LAW), inputs=0.1, residual_time=time)))
     for signal in ("command", "state_ahead"):
         assert runs[1][signal] == pytest.approx(runs[0][signal], rel=1e-6, abs=1e-9)
     missed = [np.abs(run["state_ahead"][200:-5] - run["plant_state"][205:]).max() for run in runs]
@@ -104,6 +104,6 @@ def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
 
 
 def test_what_is_not_covered_says_so() -> None:
-    desired = fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE, by=fp.ByDesired())
-    with pytest.raises(NotSupported, match=r"does not predict C, E, which no desired response moves; use ByModel\(\)"):
+    desired = fp.Predicted(fp.ComputedTorque(LAW), inputs=LATE, by="desired")
+    with pytest.raises(NotSupported, match=r"does not predict C, E, which no desired response moves; use by='model'"):
         simulated(late(planned()), desired)

@@ -33,10 +33,10 @@ def mass(late: float) -> fp.Problem:
     )
 
 
-def law(late: float, form: Deformation | None = None, by: Any = None) -> Controller:
+def law(late: float, form: Deformation | None = None, **by: Any) -> Controller:
     tracking = fp.Exponential(RATE, integral=False)
     plain = fp.ComputedTorque(tracking) if form is None else fp.ComputedTorque(tracking, form)
-    return fp.Predicted(plain, inputs=late) if by is None else fp.Predicted(plain, inputs=late, by=by)
+    return fp.Predicted(plain, inputs=late, **by)
 
 
 FORM = fp.ModelReferenced(fp.Affine(gain=-0.4))
@@ -45,17 +45,17 @@ FORM = fp.ModelReferenced(fp.Affine(gain=-0.4))
 @pytest.mark.parametrize("late", [0.03, 0.08])
 @pytest.mark.parametrize(
     ("form", "by", "removed"),
-    [(None, None, 0.0), (FORM, None, 1.0), (FORM, fp.ByDesired(), 2.0), (FORM, fp.ByModel(residual_time=0.1), 2.0)],
+    [(None, {}, 0.0), (FORM, {}, 1.0), (FORM, {"by": "desired"}, 2.0), (FORM, {"residual_time": 0.1}, 2.0)],
     ids=["no adaptation", "adaptation", "what is desired", "a residual"],
 )
 def test_what_the_model_lacks_is_lacking_in_the_prediction(late, form, by, removed):
     """The error is w (1 + kd t + kp t^2 / 2) / kp; adaptation takes w / kp from it, another prediction the rest."""
     problem = mass(late)
-    run = fp.simulate(problem, law(late, form, by), seed=0, compiled=False)
+    run = fp.simulate(problem, law(late, form, **by), seed=0, compiled=False)
     expected = [FORCE / KP * (1 + KD * late + KP * late**2 / 2), FORCE / KP * (KD * late + KP * late**2 / 2), 0.0]
     assert run["true_error.q"][-1] == pytest.approx(expected[int(removed)], rel=0.01, abs=1e-6)
-    told = {a.key: a for a in fp.review(problem, {"it": law(late, form, by)}, mismatch=0.0, seed=0).answers["it"]}
-    assert ("residual_time" in told["follows"].change) == (by is None)
+    told = {a.key: a for a in fp.review(problem, {"it": law(late, form, **by)}, mismatch=0.0, seed=0).answers["it"]}
+    assert ("residual_time" in told["follows"].change) == (not by)
     said = " ".join(a.change for a in told.values())
     assert not [words for words in ("state it", "state the dead", "predict it") if words in said]
 
@@ -79,6 +79,6 @@ def test_errors_of_a_body_outside_are_those_of_now():
     )
     motion = {"reference": fp.Trajectory(lambda t: {"q": ca.sin(t)}), "start": {"q": 0.0, "q'": 1.0}}
     problem = replace(mass(0.0).with_exact(np.zeros(1)), reality=body, sensing=seen, **motion)
-    run = fp.simulate(problem, law(0.08, by=fp.ByDesired()), seed=0, compiled=False)
+    run = fp.simulate(problem, law(0.08, by="desired"), seed=0, compiled=False)
     np.testing.assert_allclose(run["true_error.q"], np.sin(run.time) - run["state.q"], atol=1e-12)
     assert np.abs(run["reference.q"] - np.sin(run.time + 0.08)).max() < 1e-12

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import casadi as ca
 import numpy as np
@@ -17,7 +16,6 @@ from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidValue, require
-from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function, measured_signals
@@ -30,90 +28,6 @@ from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like
 from fpirhc.task.dead_time import MOST, DeadTime, Queue
 from fpirhc.task.problem import Problem
-
-
-class Predictor(Checked, ABC):
-    """Contract: the signal that is queued while it is on its way, and the motion of the state under it over one cycle."""
-
-    @property
-    def residual_time(self) -> float | None:
-        """Time constant of the low-passed model residual that `advance` is given, s; None: the residual is zero."""
-        return None
-
-    @abstractmethod
-    def check(self, plant: Plant) -> None:
-        """Raise if the predictor does not support the plant.
-
-        Raises:
-            NotSupported: the plant does not fit.
-        """
-
-    @abstractmethod
-    def sent(self, built: Built) -> Signal:
-        """Return the signal of the controller that is queued, with the values that are on their way when the run begins."""
-
-    @abstractmethod
-    def advance(self, plant: Plant, period: float) -> ca.Function:
-        """Return Function (state, sent, parameters, residual of the responses) -> state one cycle later."""
-
-
-@dataclass(frozen=True)
-class ByModel(Predictor):
-    """Integrate the approximate model over the queued commands.
-
-    Args:
-        residual_time: time constant of the low-pass on the residual of the responses that is added, s; None: no residual. The loop
-            of the residual has a limit of its own: it is stable at moderate rate x dead time (0.4) and unstable at long dead times.
-    """
-
-    residual_time: Positive | None = None
-
-    def check(self, plant: Plant) -> None:
-        """Accept every plant."""
-
-    def sent(self, built: Built) -> Signal:
-        return replace(built.before, name=built.plant.input.name)
-
-    def advance(self, plant: Plant, period: float) -> ca.Function:
-        step = one_step(plant, period)
-        x, u, p = plant.symbols()
-        w = ca.SX.sym("w", len(plant.names))
-        return ca.Function("fpirhc_predict", [x, u, p, w], [step(x, u, p, w)])
-
-
-@dataclass(frozen=True)
-class ByDesired(Predictor):
-    """Integrate the queued desired responses."""
-
-    def check(self, plant: Plant) -> None:
-        """Raise if some state does not follow from the desired responses.
-
-        Raises:
-            NotSupported: the motion of a quantity that is not controlled, or of a state that is no output, needs a model.
-        """
-        hidden = [
-            e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0
-        ]
-        free = [e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names]
-        require(
-            not (hidden or free),
-            f"ByDesired() does not predict {', '.join(hidden + free)}, which no desired response moves; use ByModel()",
-        )
-
-    def sent(self, built: Built) -> Signal:
-        return built.plant.response_signal("desired")
-
-    def advance(self, plant: Plant, period: float) -> ca.Function:
-        x, u, p = plant.symbols()
-        d, w = ca.SX.sym("d", len(plant.controlled_names)), ca.SX.sym("w", len(plant.names))
-        seen = plant.equations.output(x, 0 * u, p, 0 * w)
-        elements, later = plant.output.elements, dict[str, Expression]()
-        for k, name in enumerate(plant.controlled_names):
-            chain = sorted((e for e in elements if e.rstrip("'") == name), key=len)
-            values = [seen[elements.index(e)] for e in chain] + [d[k]]
-            later |= {element: sum(_terms(values[j:], period), start=ca.SX(0)) for j, element in enumerate(chain)}
-        state_next = [later[elements[place]] for place in plant.equations.known_by_outputs]
-        return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*state_next)])
 
 
 def _terms(derivatives: Sequence[Expression], time: Expression | float) -> Iterator[Expression]:
@@ -135,7 +49,10 @@ class Predicted(ControllerWrapper):
         controller: any controller.
         inputs: dead time of all inputs, one number, s; the sum of both dead times is rounded to control cycles.
         measurement: dead time of the measurement, s.
-        by: how the state is predicted.
+        by: what is integrated over the dead time: the "model" under the commands that are on their way, or the "desired" responses.
+        residual_time: time constant of the low-pass on the residual of the model's responses that is added, s; None: no residual.
+            The loop of the residual has a limit of its own: it is stable at moderate rate x dead time (0.4) and unstable at long
+            ones.
 
     Raises:
         InvalidValue: a dead time that is negative or not finite.
@@ -145,11 +62,12 @@ class Predicted(ControllerWrapper):
 
     inputs: NotNegative = field(metadata={"structure": True})
     measurement: NotNegative = field(default=0.0, metadata={"structure": True})
-    by: Predictor = field(default_factory=ByModel)
+    by: Literal["model", "desired"] = "model"
+    residual_time: Positive | None = None
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         notes, cycles = self.controller.notes(problem), self._cycles(problem.period)
-        if self.controller.learns and self.by == ByModel() and cycles:
+        if self.controller.learns and not self._of_responses and cycles:
             notes += (
                 "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
                 "error leaves an offset; write Estimating(Predicted(controller, ...), ...)",
@@ -163,21 +81,29 @@ class Predicted(ControllerWrapper):
         )
 
     def check(self, problem: Problem) -> None:
-        """Raise if the wrapped controller, the predictor or the dead time does not fit the problem.
+        """Raise if the wrapped controller, the prediction or the dead time does not fit the problem.
 
         Raises:
             FpirhcError: the check of the wrapped controller fails.
-            NotSupported: the predictor does not support the plant, or the controller's own response.
-            InvalidValue: a dead time of more than 1000 cycles.
+            NotSupported: desired responses do not move every state, or the controller's responses are others in turn.
+            InvalidValue: a dead time of more than 1000 cycles, or a residual of what is desired.
         """
         self.controller.check(problem)
-        self.by.check(problem.plant)
+        plant, cycles = problem.plant, self._cycles(problem.period)
+        pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
+        unmoved = [e for e, place in pairs if place < 0]
+        unmoved += [e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names]
         require(
-            self.by == ByModel() or self.controller.deforms != "turns",
-            f"Predicted: {self.by} compares the responses of the plant's controlled coordinates, and "
-            f"{type(self.controller).__name__} has others in turn; use by=ByModel()",
+            self.by == "model" or not unmoved,
+            f"Predicted(by='desired') does not predict {', '.join(unmoved)}, which no desired response moves; use by='model'",
         )
-        cycles = self._cycles(problem.period)
+        require(
+            not self._of_responses or self.controller.deforms != "turns",
+            "Predicted: what is desired and a residual are responses of the plant's controlled coordinates, and "
+            f"{type(self.controller).__name__} has others in turn; use by='model' without a residual",
+        )
+        if self.by == "desired" and self.residual_time is not None:
+            raise InvalidValue("Predicted: a residual is the model's; leave residual_time or by='desired' out")
         if cycles > MOST:
             raise InvalidValue(f"Predicted: {cycles} cycles of dead time, more than {MOST}")
 
@@ -186,13 +112,18 @@ class Predicted(ControllerWrapper):
         if not self._cycles(built.period):
             return self.controller.blocks(built.inner(self))
         inner = compose_controller(built.inner(self), ahead=True)
-        ahead = {"time": like(time_signal(plant), "time_ahead"), "state": like(plant.state, "state_ahead")}
-        ahead |= {s.name: like(s, f"{s.name}_ahead") for s in measured_signals(plant)[1:]}
+        ahead = {s.name: like(s, f"{s.name}_ahead") for s in (time_signal(plant), *measured_signals(plant))}
         feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
-        sent = self.by.sent(built)
+        command = replace(built.before, name=plant.input.name)
+        sent = plant.response_signal("desired") if self.by == "desired" else command
         before = replace(sent, name="_sent_before")
         predict = self._predict_block(built, before, tuple(ahead.values()))
         return [predict, embedded("controller", inner, feeds)], [Delay(before, sent.name)]
+
+    @property
+    def _of_responses(self) -> bool:
+        """Whether the prediction needs responses beside the model."""
+        return self.by == "desired" or self.residual_time is not None
 
     def _cycles(self, period: float) -> int:
         """Cycles over which the state is predicted."""
@@ -200,39 +131,48 @@ class Predicted(ControllerWrapper):
 
     def _predict_block(self, built: Built, before: Signal, writes: tuple[Signal, ...]) -> Block:
         """Block (time, what is measured, parameters, what was sent last) -> what will be when the command acts."""
-        plant, period, size, by = built.plant, built.period, before.size, self.by
-        cycles = self._cycles(period)
-        queue = Queue(cycles)
+        plant, period, cycles = built.plant, built.period, self._cycles(built.period)
         # One value more than is on its way: the oldest acted while the response was realised.
-        past = tuple(f"{e}@{k}" for k in range(1, queue.length + 1) for e in before.elements)
-        sent = Signal("sent", past, start=tuple(before.start_vector()) * queue.length)
+        queue, calm = Queue(cycles), ca.MX.zeros(len(plant.names))
+        advance = one_step(plant, period) if self.by == "model" else _along_desired(plant, period)
+        corrected = _residual(plant, self.residual_time, period) if self.residual_time else None
         residual = Signal("residual", plant.names, forcing_units(plant))
-        advance = by.advance(plant, period)
-        corrected = _residual(plant, by.residual_time, period) if by.residual_time else None
+        # The state to which a map answered with the response that is measured now is that of the cycle before.
+        last = (replace(built.state, name="state_answered"),) * response_age(plant)
+        own = (residual, *last) if corrected else ()
         responses = (plant.response_signal("realised"),) if corrected else ()
         reads = (time_signal(plant), *measured_signals(plant), *responses, plant.parameter, before)
-        # The state to which a map answered with the response that is measured now is that of the cycle before.
-        answered = replace(built.state, name="state_answered")
-        last = (answered,) * response_age(plant) if corrected else ()
-        own = (sent, residual, *last) if corrected else (sent,)
         # An output that is the state is where the state is.
         outputs_ahead = {s.name: _output_ahead(plant) for s in measured_signals(plant)[1:]}
 
         def step(s: Signals) -> dict[str, Expression]:
-            queued = queue.pushed(s.sent, s._sent_before)
-            values = {"sent_next": queued}
-            error = expression(ca.MX.zeros(len(plant.names)))
+            queued, values = queue.column(s, "sent", getattr(s, before.name))
+            error = expression(calm)
             if corrected:
                 at = s.state_answered if last else s.state
-                error = corrected(s.residual, at, queue.delayed(queued, size), s.realised, s.parameters)
+                error = corrected(s.residual, at, queue.delayed(queued, before.size), s.realised, s.parameters)
                 values |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
-            state = queue.driven(advance, s.state, queued, size, [s.parameters, error])
+            state = queue.driven(advance, s.state, queued, before.size, [s.parameters, error])
             for name, function in outputs_ahead.items():
-                time = cycles * period
-                values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, time)
+                values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, cycles * period)
             return {"time_ahead": s.time + self.inputs, "state_ahead": state, **values}
 
-        return Block("predict", Layout(reads), Layout(writes), step, Layout(own), opaque=True)
+        memory = Layout((*queue.memory("sent", before.elements, tuple(before.start_vector())), *own))
+        return Block("predict", Layout(reads), Layout(writes), step, memory, opaque=True)
+
+
+def _along_desired(plant: Plant, period: float) -> ca.Function:
+    """Function (state, desired responses, parameters, forcing) -> state one cycle later, where the plant does what is desired."""
+    x, u, p = plant.symbols()
+    d, w = ca.SX.sym("d", len(plant.controlled_names)), ca.SX.sym("w", len(plant.names))
+    seen = plant.equations.output(x, 0 * u, p, 0 * w)
+    elements, later = plant.output.elements, dict[str, Expression]()
+    for k, name in enumerate(plant.controlled_names):
+        chain = sorted((e for e in elements if e.rstrip("'") == name), key=len)
+        values = [seen[elements.index(e)] for e in chain] + [d[k]]
+        later |= {element: sum(_terms(values[j:], period), start=ca.SX(0)) for j, element in enumerate(chain)}
+    state_next = [later[elements[place]] for place in plant.equations.known_by_outputs]
+    return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*state_next)])
 
 
 def _residual(plant: Plant, time: float, period: float) -> ca.Function:
