@@ -142,31 +142,6 @@ class ThroughModel(Checked):
             raise InvalidValue(f"{self!r}: {cycles:g} cycles of dead time, more than {MOST}")
         return Queue(cycles)
 
-    def memory(self, problem: Problem, first: np.ndarray, away: np.ndarray) -> tuple[Signal, ...]:
-        """Return references and shifts on their way, newest first, and the shift in force: at first the distance of the start."""
-        names, length = problem.plant.controlled_names, self.queue(problem).length
-        queued = tuple(f"{n}@{k}" for k in range(1, length + 1) for n in names)
-        return (
-            Signal("references_sent", queued, start=tuple(map(float, first)) * length),
-            Signal("shifts_sent", queued),
-            Signal("shift_in_force", names, start=tuple(map(float, away))),
-        )
-
-    def in_force(self, problem: Problem, s: Signals, wanted: Expression) -> Expression:
-        """Return the target that was in force when the output of this cycle was measured; `wanted` is the reference of now."""
-        queue = self.queue(problem)
-        return queue.delayed(queue.pushed(s.references_sent, wanted), wanted.numel()) + s.shift_in_force
-
-    def remembered(self, problem: Problem, s: Signals, wanted: Expression, shift: Expression) -> dict[str, Expression]:
-        """Return the memory one cycle later."""
-        queue, rho = self.queue(problem), self.decays(problem)
-        shifts = queue.pushed(s.shifts_sent, shift)
-        return {
-            "references_sent_next": queue.pushed(s.references_sent, wanted),
-            "shifts_sent_next": shifts,
-            "shift_in_force_next": rho * s.shift_in_force + (1 - rho) * queue.delayed(shifts, shift.numel()),
-        }
-
 
 _RENAMED = {"reference": "target", "error": "target_error"}  # what the inner controller calls these
 _COMMANDS = {"_unclipped_last": "command_unclipped", "_command_last": "command"}
@@ -244,20 +219,28 @@ class Cascade(Controller):
         seen, places = plant.output, [plant.output.elements.index(n) for n in names]
         begun = problem.start_output[places]
         first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()[places]
+        away = tuple(map(float, begun - first))
         own, plain = self.deformation.memory(names), pairing is not None and pairing.plain
-        last = (
+        queue, rho = (pairing.queue(problem), pairing.decays(problem)) if pairing else (Queue(0.0), ca.DM())
+        last: tuple[Signal, ...] = (
             # The plain form begins at the target in force from its first cycle on, and moves it once samples count.
-            Signal("shift_last", names, start=tuple(map(float, begun - first)) if plain else ()),
+            Signal("shift_last", names, start=away if plain else ()),
             Signal("target_last", names, start=tuple(map(float, begun))),
             scalar("shift_cycles"),
         )
-        memory = Layout((*last, *(pairing.memory(problem, first, begun - first) if pairing else ()))) + own
+        if pairing:
+            last += queue.memory("references_sent", names, tuple(map(float, first)))
+            last += queue.memory("shifts_sent", names, (0.0,) * len(names))
+            last += (Signal("shift_in_force", names, start=away),)
         response = plant.equations.controlled_response
 
         def step(s: Signals) -> dict[str, Expression]:
             wanted, output, before = s.reference[places], getattr(s, seen.name)[places], s.shift_last
-            in_force = pairing.in_force(problem, s, wanted) if pairing else s.target_last
-            undeformed = in_force - (s.shift_in_force if plain else before) if pairing else wanted
+            in_force, undeformed, later = s.target_last, wanted, dict[str, Expression]()
+            if pairing:
+                target, later = queue.arrived(s, "references_sent", wanted)
+                in_force = target + s.shift_in_force
+                undeformed = in_force - (s.shift_in_force if plain else before)
             remembered = {m: getattr(s, m) for m in own.names}
             request, after = self.deformation.step(in_force, output, undeformed, remembered)
             change = request - undeformed
@@ -266,18 +249,22 @@ class Cascade(Controller):
             onwards = ca.logic_not(ca.dot(change - before, beyond - sent) < 0)  # NaN is no way back
             grows = ca.logic_and(ca.logic_and(s.clipped_last > 0.5, onwards), ca.fabs(change) > ca.fabs(before))
             shift = ca.if_else(running, ca.if_else(grows, before, change), before)
+            if pairing:
+                arrived, shifts = queue.arrived(s, "shifts_sent", shift)
+                later |= shifts | {"shift_in_force_next": rho * s.shift_in_force + (1 - rho) * arrived}
             return {
                 **dict.fromkeys((SHIFT, "shift", "shift_last_next"), shift),
                 "target_last_next": wanted + shift,
                 "shift_cycles_next": ca.fmin(s.shift_cycles + 1, built.warm_up),
-                **(pairing.remembered(problem, s, wanted, shift) if pairing else {}),
+                **later,
                 **{f"{m}_next": ca.if_else(running, after[m], remembered[m]) for m in own.names},
             }
 
         commands = (like(plant.input, name) for name in _COMMANDS)
         measured = (*measured_signals(plant), plant.parameter)
         reads = Layout((Signal("reference", seen.elements), *measured, scalar("clipped_last"), *commands))
-        return Block("shift", reads, Layout((_shift_signal(plant, SHIFT), _shift_signal(plant, "shift"))), step, memory)
+        writes = Layout((_shift_signal(plant, SHIFT), _shift_signal(plant, "shift")))
+        return Block("shift", reads, writes, step, Layout(last) + own)
 
 
 # What is left is the dead time of the problem.
