@@ -2,15 +2,15 @@
 
 from .controller import check_controller as check_controller
 from .deformation import check_deformation as check_deformation
-from .horizons import compiled as compiled
-from .horizons import posed as posed
 from .laws import FAMILIES as FAMILIES
 from .laws import Example as Example
-from .laws import check_live as check_live
 from .laws import examples as examples
 from .laws import member_classes as member_classes
+from .live import check_live as check_live
 from .loops import two_masses as two_masses
 from .observer import check_observer as check_observer
 from .optimiser import check_optimiser as check_optimiser
+from .optimiser import compiled as compiled
+from .optimiser import posed as posed
 from .plant import check_plant as check_plant
 from .tracking import check_tracking as check_tracking

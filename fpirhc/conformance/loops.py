@@ -12,19 +12,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import build, checked
+from fpirhc.controllers.built import build
 from fpirhc.controllers.composed import compose_controller
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.plant import Output, Parameter, Plant
-from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import simulate
-from fpirhc.simulation.stepper import Stepper
-from fpirhc.simulation.trials import without_warning
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.task.exogenous import really_known
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
@@ -32,21 +27,16 @@ from fpirhc.task.reference import Trajectory
 Array = npt.NDArray[Any]
 
 REPLAYED = 400  # cycles of a run, at most, that are given to a controller again
+_INPUTS = {"Fa": "N", "Fb": "N"}
 
 
 def two_masses() -> Problem:
     """Return two masses between springs with a model that is wrong in mass and stiffness, for 2 s."""
     plant = Plant(
         coordinates={"a": "m", "b": "m"},
-        inputs={"Fa": "N", "Fb": "N"},
-        parameters={
-            "m": Parameter(approximate=1.4, exact=1.0, unit="kg"),
-            "k": Parameter(approximate=2.0, exact=3.0, unit="N/m"),
-        },
-        response=lambda q, v, u, p: {
-            "a": (u.Fa - p.k * (2 * q.a - q.b) - 0.2 * v.a) / p.m,
-            "b": (u.Fb - p.k * (2 * q.b - q.a) - 0.2 * v.b) / p.m,
-        },
+        inputs=_INPUTS,
+        parameters=_parameters(mass=1.4, stiffness=2.0),
+        response=lambda q, v, u, p: dict(zip("ab", _pushed(q.a, q.b, v.a, v.b, u, p), strict=True)),
     )
     weights = {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}
     return Problem(
@@ -61,132 +51,31 @@ def two_masses() -> Problem:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """A controller on a problem."""
-
-    controller: Controller
-    problem: Problem
-    seed: int  # of the noise
-    left: float  # share of the first error that may be left with the exact model
-    compiled: bool  # whether compiled C is compared too
-
-    @cached_property
-    def run(self) -> Run:
-        """The closed loop with the wrong model, in CasADi's virtual machine."""
-        return self.simulated(self.problem)
-
-    @cached_property
-    def replay(self) -> Replay:
-        """The controller, given the motion of `run`."""
-        return Replay(self.problem, self.controller, self.run)
-
-    @cached_property
-    def exact(self) -> Problem:
-        """The problem with an exact model, ideal sensors and no disturbance."""
-        plant, signals = self.problem.plant, really_known(self.problem.signals)
-        exact = {name: replace(p, approximate=p.exact) for name, p in plant.parameters.items()}
-        known = replace(plant, parameters=exact)
-        return replace(self.problem, plant=known, disturbances={}, sensing=Sensing(), signals=signals)
-
-    def simulated(self, problem: Problem) -> Run:
-        """A run of the controller, in CasADi's virtual machine."""
-        return simulate(problem, self.controller, seed=self.seed, compiled=False)
-
-    @cached_property
-    @without_warning()
-    def stepper(self) -> Stepper:
-        """The controller alone, in CasADi's virtual machine."""
-        return Stepper(self.problem, checked(self.problem, self.controller), compiled=False, bounded=False)
+def _parameters(mass: float, stiffness: float) -> dict[str, Parameter]:
+    return {"m": Parameter(mass, 1.0, "kg"), "k": Parameter(stiffness, 3.0, "N/m")}
 
 
-@dataclass(frozen=True, eq=False)
-class Cycle:
-    """What a controller says in one cycle: its signals by name, and the memory before the next one."""
-
-    signals: dict[str, Array]
-    memory: Array
-
-    def __getitem__(self, name: str) -> Array:
-        return self.signals[name]
+def _pushed(a: Any, b: Any, va: Any, vb: Any, u: Any, p: Any) -> tuple[Any, Any]:
+    return (u.Fa - p.k * (2 * a - b) - 0.2 * va) / p.m, (u.Fb - p.k * (2 * b - a) - 0.2 * vb) / p.m
 
 
-@dataclass(frozen=True, eq=False)
-class Replay:
-    """A controller, without a gate before it, that is given the motion of a recorded run."""
+def by_states() -> Problem:
+    """Return the two masses, exactly known, by states in another order and sign, with a and b as outputs; nothing is planned."""
 
-    problem: Problem  # that the controller is composed for
-    controller: Controller
-    run: Run  # whose motion it is given
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        of_a, of_b = _pushed(-x.a3, -x.b1, -x.a2, -x.b0, u, p)
+        return {"b0": -of_b, "b1": x.b0, "a2": -of_a, "a3": x.a2}
 
-    def cycles(self) -> Iterator[Cycle]:
-        """Yield the first cycles of the run, each from the memory of the one before."""
-        memory = self.memory
-        for k in range(min(self.run.cycles, REPLAYED)):
-            cycle = self.cycle(k, memory)
-            memory = cycle.memory
-            yield cycle
-
-    @property
-    def memory(self) -> Array:
-        """Before the first cycle."""
-        return self._composite.memory.start()
-
-    @cached_property
-    def commands(self) -> Array:
-        """The commands of the first cycles, a row each."""
-        return np.array([cycle["command"] for cycle in self.cycles()])
-
-    def cycle(self, k: int, memory: Array, **instead: Array) -> Cycle:
-        """The cycle k of the run from a memory, with other values of what is read where they are given by name."""
-        model = self.controller.plant_model(self.problem)
-        seen = {"time": self.run.time[k], "parameters": model.parameters(model.plant), **instead}
-        read = [seen[n] if n in seen else self.run[n][k] for n in self._composite.reads.names]
-        after, trace, _ = self._evaluator(memory, *read)
-        said = self._composite.trace
-        return Cycle({name: trace[said.slice(name)].copy() for name in said.names}, after.copy())
-
-    @cached_property
-    def _composite(self) -> Composite:
-        return compose_controller(build(self.problem, self.controller))
-
-    @cached_property
-    def _evaluator(self) -> Evaluator:
-        return Evaluator(self._composite.function)
-
-
-def spelled_by_states(problem: Problem) -> Problem | None:
-    """Return a problem with an exact model whose plant is given by states in another order and sign, with outputs in their place.
-
-    Horizon and cost are left out. None for a plant that has outputs, moves in steps, or has limits of its states.
-    """
-    plant = problem.plant
-    own = bool(problem.limits.states) or problem.signals or problem.reality is not None
-    if plant.outputs or plant.step is not None or own:
-        return None
-    elements, (x, u, p) = plant.state.elements, plant.symbols()
-    names = {e: f"z{k}" for k, e in enumerate(reversed(elements))}
-    units = dict(zip(elements, plant.state.units, strict=True))
-    rates = ca.Function("rates", [x, u, p], [plant.equations.forced_rate(x, u, p, ca.DM.zeros(len(plant.names)))])
-
-    def moved(z: Any, inputs: Any, values: Any) -> dict[str, Any]:
-        numbers = (
-            ca.vertcat(*(one[n] for n in some)) for one, some in ((inputs, plant.inputs), (values, plant.parameters))
-        )
-        slopes = rates(ca.vertcat(*(-z[names[e]] for e in elements)), *numbers)
-        return {names[e]: -slopes[k] for k, e in enumerate(elements)}
-
-    other = Plant.of_states(
-        states={names[e]: units[e] for e in reversed(elements)},
-        inputs=plant.inputs,
-        parameters={n: replace(q, approximate=q.exact) for n, q in plant.parameters.items()},
-        rates=moved,
-        outputs={n: Output(units[n], lambda z, _, n=n: -z[names[n]]) for n in plant.names},
-        controlled=plant.controlled,
-        time_unit=plant.time_unit,
+    plant = Plant.of_states(
+        states={"b0": "m/s", "b1": "m", "a2": "m/s", "a3": "m"},
+        inputs=_INPUTS,
+        parameters=_parameters(mass=1.0, stiffness=3.0),
+        rates=rates,
+        outputs={"a": Output("m", lambda x, _: -x.a3), "b": Output("m", lambda x, _: -x.b1)},
     )
-    start = {names[e]: -float(v) for e, v in zip(elements, problem.start_state, strict=True)}
-    return replace(problem, plant=other, start=start, horizon=None, cost=None, sensing=Sensing(), disturbances={})
+    return replace(
+        two_masses(), plant=plant, start={"b0": 0.0, "b1": 0.1, "a2": 0.0, "a3": -0.4}, horizon=None, cost=None
+    )
 
 
 def coarse_steps() -> Problem:
@@ -208,3 +97,62 @@ def coarse_steps() -> Problem:
         horizon=Horizon(stages=12, step=step),
         cost=Quadratic(states={"a": 1.0, "b": 1.0}, deviation={"Fa": 1.0, "Fb": 1.0}),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    """What a controller says in one cycle: its signals by name, and the memory before the next one."""
+
+    signals: dict[str, Array]
+    memory: Array
+
+    def __getitem__(self, name: str) -> Array:
+        return self.signals[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """A controller, without a gate before it, that is given the motion of a recorded run."""
+
+    problem: Problem  # that the controller is composed for
+    controller: Controller
+    run: Run  # whose motion it is given
+
+    @cached_property
+    def cycles(self) -> list[Cycle]:
+        """The first cycles of the run, each from the memory of the one before."""
+        return list(self._cycles())
+
+    def _cycles(self) -> Iterator[Cycle]:
+        memory = self.memory
+        for k in range(min(self.run.cycles, REPLAYED)):
+            cycle = self.cycle(k, memory)
+            memory = cycle.memory
+            yield cycle
+
+    @property
+    def memory(self) -> Array:
+        """Before the first cycle."""
+        return self._composite.memory.start()
+
+    @property
+    def commands(self) -> Array:
+        """The commands of the first cycles, a row each."""
+        return np.array([cycle["command"] for cycle in self.cycles])
+
+    def cycle(self, k: int, memory: Array, **instead: Array) -> Cycle:
+        """The cycle k of the run from a memory, with other values of what is read where they are given by name."""
+        model = self.controller.plant_model(self.problem)
+        seen = {"time": self.run.time[k], "parameters": model.parameters(model.plant), **instead}
+        read = [seen[n] if n in seen else self.run[n][k] for n in self._composite.reads.names]
+        after, trace, _ = self._evaluator(memory, *read)
+        said = self._composite.trace
+        return Cycle({name: trace[said.slice(name)].copy() for name in said.names}, after.copy())
+
+    @cached_property
+    def _composite(self) -> Composite:
+        return compose_controller(build(self.problem, self.controller))
+
+    @cached_property
+    def _evaluator(self) -> Evaluator:
+        return Evaluator(self._composite.function)

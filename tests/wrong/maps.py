@@ -1,4 +1,4 @@
-"""Sixteen deformations that break the contract, each in one thing, and the right one that they are made from."""
+"""Deformations that break the contract, each in one thing, and the right one that they are made from."""
 
 # ruff: noqa: ARG002 - arguments are those of the contract
 
@@ -111,6 +111,26 @@ class Rests(Softsign):
 
 class GivesAnotherGain(Softsign):
     """Is asked for a gain and gives twice of it."""
+
+    def with_effective_gain(self, gain):
+        return replace(self, gain=2 * gain)
+
+
+class HidesNaN(Softsign):
+    """Limits the response that it sees, which makes a number of NaN."""
+
+    def step(self, request, response, desired, memory):
+        return super().step(request, ca.fmax(-1e3, ca.fmin(1e3, response)), desired, memory)
+
+
+class TellsHalfItsGain(Softsign):
+    """Has twice the gain that it tells, and takes one as it tells it."""
+
+    def effective_gain(self):
+        return 0.5 * self.gain
+
+    def secant_gain(self):
+        return self.gain
 
     def with_effective_gain(self, gain):
         return replace(self, gain=2 * gain)
