@@ -71,8 +71,15 @@ def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
     pump = problem(limits=fp.Limits(inputs={"u": (0.0, float("inf"))}))
     assert share(0.0, pump) == share(0.9e-9, pump) == pytest.approx(0.6)
     assert share(1.5e-9, pump) == 0.0  # a billionth of 1 N where a limit is open
-    moved = replace(run(0.0), settings={"live": [[0.0, {}], [7.0, {"limits.inputs.u.0": 0.0}]]})
-    assert fp.measure(limited, moved).at_limit == pytest.approx(0.6)  # a live limit from when it is in force
+    changes = [0.0, {}], [6.0, {"limits.inputs.u.1": 0.0}], [7.0, {"limits.inputs.u.0": 0.0, "limits.inputs.u.1": 2.0}]
+    moved = replace(run(0.0), settings={"live": [*changes]})
+    assert fp.measure(limited, moved).at_limit == pytest.approx(0.8)  # a live limit from when it is in force
+    slow = problem(
+        limits=fp.Limits(rates={"u": (-1.0, 2.0)})
+    )  # 0.1 N down and 0.2 N up a cycle, to a millionth of 0.1 N
+    moves = {-0.1 + 5e-8: 0.98, -0.1 + 2e-7: 0.0, 0.2 - 5e-8: 0.98, 0.2 - 2e-7: 0.0}  # the first measured one begins
+    for move, stands in moves.items():
+        assert fp.measure(slow, run(0.0, command=move * np.arange(CYCLES))).at_limit == pytest.approx(stands)
 
 
 def test_total_variation_is_movement_per_second():
@@ -81,6 +88,7 @@ def test_total_variation_is_movement_per_second():
     metrics = fp.measure(problem(), run(0.0, command=command))
     assert metrics.total_variation["u"] == pytest.approx(20.0)
     assert metrics.units["total_variation"]["u"] == "N/s"
+    assert fp.measure(problem(measure_from=9.8), run(0.0, command=command)).total_variation["u"] == pytest.approx(20.0)
     assert fp.measure(problem(), run(0.0, command=3.0)).total_variation["u"] == 0.0
 
 
@@ -259,6 +267,8 @@ def test_contraction_is_that_of_an_adapting_controller(adaptive):
     columns_left = [k for k, c in enumerate(result.layout.columns) if c in layout.columns]
     silent = replace(result, layout=layout, log=result.log[:, columns_left])
     gainless = replace(result, settings={k: v for k, v in result.settings.items() if k != "effective_gain"})
+    larger = replace(result, settings={**result.settings, "effective_gain": 1.5})  # |1 - 1.6 * 1.5| = 1.4
+    assert fp.measure(task, larger)["contraction.growing"][""] == 1.0
     for other in (silent, gainless):
         assert fp.measure(task, other)["contraction.predicted"] == {}
 
@@ -284,11 +294,18 @@ def test_a_metric_is_one_value():
         metrics["overshot"]
 
 
-@pytest.mark.parametrize("result", [3.0, {"y": "three"}, "three"])
-def test_a_function_that_returns_something_else_is_refused(result):
+@pytest.mark.parametrize(
+    ("by", "result", "message"),
+    [
+        ("coordinate", 3.0, "must return a mapping with a number for every coordinate, got float"),
+        (None, {"y": 3.0}, "must return one number, got dict"),
+        ("coordinate", {"y": "three"}, "expected numbers, got str"),
+    ],
+)
+def test_a_function_that_returns_something_else_is_refused(by, result, message):
     """By coordinate means a mapping of numbers."""
-    metric = fp.Metric("mine", lambda problem, run: result, by="coordinate")
-    with pytest.raises(InvalidValue, match="metric 'mine'"):
+    metric = fp.Metric("mine", lambda problem, run: result, by=by)
+    with pytest.raises(InvalidValue, match=f"metric 'mine': .*{message}"):
         fp.measure(problem(), run(0.0), [metric])
 
 
@@ -303,7 +320,7 @@ COMMAND = np.where(np.arange(CYCLES) < 50, 10.0, np.where(np.arange(CYCLES) % 2,
 @pytest.mark.parametrize(
     ("figure", "value", "unit", "better"),
     [
-        (figures.InBand("command.u", 2.0, 3.0), 0.5, "1", "larger"),
+        (figures.InBand("command.u", -4.0, 3.0), 1.0, "1", "larger"),
         (figures.TimeOver("command.u", 2.9), 2.5, "s", "smaller"),
         (figures.TimeOver("command.u", 3.0), 0.0, "s", "smaller"),
         (figures.Total("command.u"), -2.5, "N s", "smaller"),

@@ -20,13 +20,9 @@ from fpirhc.contracts import Block, Controller, Deformation, Layout, closing_blo
 
 PERIOD, CYCLES, LIMIT = 1e-2, 400, 10.0
 ADAPTS = fp.ModelReferenced(fp.Affine(gain=-0.5))
-SHAPES = {
-    "constant": lambda e, t: e,
-    "growing": lambda e, t: e * ca.exp(2 * t) / 900,  # rms e from .5 s on
-    "late": lambda e, t: e * ca.fmax(1 - 0.1 * t, 0.009 * ca.exp(2 * t)),  # not in the second quarter
-}
 SENT = {
     "ramp": lambda size, t: size * t / (PERIOD * CYCLES),
+    "steady": lambda size, t: 1 + size * t,
     "zigzag": lambda size, t: size * ca.cos(math.pi * t / PERIOD),
     "full": lambda size, t: LIMIT * ca.if_else(t < size * PERIOD * CYCLES, 1.0, 0.5),
 }
@@ -34,11 +30,11 @@ SENT = {
 
 @dataclass(frozen=True)
 class Facts:
-    """Errors of y and z, their shape, and what a third input is sent; of a run that ends, from when on it has no number."""
+    """Errors of y and z, by quarters, and what a third input is sent; of a run that ends, from when on it has no number."""
 
     y: float = 0.5
     z: float = 0.5
-    shape: str = "constant"
+    quarters: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     sends: str = "ramp"
     size: float = 1.0
     ends: float = math.inf
@@ -58,9 +54,10 @@ class Played(Controller):
         writes = Layout((response("nominal"), response("desired")))
 
         def step(s):
+            *first, last = map(ca.SX, facts.quarters)
             then = s.time + PERIOD
-            shape = SHAPES[facts.shape]
-            wanted = ca.vertcat(ca.sin(then) - shape(facts.y, then), ca.cos(then) - shape(facts.z, then))
+            size = ca.conditional(ca.floor((then + 1e-9) / (PERIOD * CYCLES / 4)), first, last)
+            wanted = ca.vertcat(ca.sin(then), ca.cos(then)) - size * ca.vertcat(facts.y, facts.z)
             sent = SENT[facts.sends](facts.size, s.time)
             rates = ca.vertcat((wanted - s.state[:2]) / PERIOD, sent) + ca.if_else(s.time < facts.ends, 0.0, 1e200)
             return {"nominal": rates, "desired": rates}
@@ -92,13 +89,13 @@ def problem() -> fp.Problem:
     )
 
 
-def compared(cases: dict[str, tuple[Facts, Facts]], **more: Any) -> Any:
+def compared(cases: dict[str, tuple[Facts, Facts]], changes: dict[str, Any] | None = None, **more: Any) -> Any:
     """The comparison of pairs 'NAME' and 'NAME+FPI'."""
     controllers: dict[str, Controller] = {}
     for name, facts in cases.items():
         controllers[name] = Played(name, *facts)
         controllers[f"{name}+FPI"] = Played(name, *facts, ADAPTS)
-    return fp.compare(tasks.made(problem(), controllers, **more), seed=0, compiled=False)
+    return fp.compare(tasks.made(replace(problem(), **(changes or {})), controllers, **more), seed=0, compiled=False)
 
 
 def findings(comparison: Any) -> dict[str, Any]:
@@ -132,25 +129,29 @@ def test_outcomes_and_ratios():
         assert ratios is None or dict(found[name].ratios) == pytest.approx(ratios, rel=1e-3)
 
 
-# What raises a flag and what nearly does, words of its sentence, and the outcome.
-FLAGS: dict[str, tuple[Facts, Facts, Facts, str]] = {
-    "left alone": (Facts(1.6, 1.9), Facts(1.3, 1.6), Facts(0.6, 1.6), "times that of the plant whose inputs are held"),
-    "growth": (Facts(), Facts(0.3, shape="growing"), Facts(0.04, 0.04, "late"), "as in an unstable loop"),
-    "limit": (Facts(), Facts(0.1, sends="full", size=0.4), Facts(0.1), "stands at a limit"),
-    "chatter": (Facts(), Facts(0.1, sends="zigzag"), Facts(0.1), "chatters"),
+GROWTH = lambda *quarters: (Facts(0.1, 0.1, quarters), Facts(0.05, 0.05, quarters))  # noqa: E731
+# Facts, the outcome, and words of the flag; 'none' has none.
+FLAGS: dict[str, tuple[Facts, Facts, str, str]] = {
+    "left alone": (Facts(1.6, 1.9), Facts(1.3, 1.6), "doubtful", "times that of the plant whose inputs are held"),
+    "one better than left alone": (Facts(1.6, 1.9), Facts(0.6, 1.6), "better", "none"),
+    "growth": (*GROWTH(1.0, 1.9, 4.2, 8.5), "doubtful", "as in an unstable loop"),
+    "growth begins late": (*GROWTH(1.0, 0.95, 4.0, 9.0), "better", "none"),
+    "growth pauses": (*GROWTH(1.0, 3.0, 3.6, 10.8), "better", "none"),
+    "growth slows": (*GROWTH(1.0, 4.0, 8.0, 16.0), "better", "none"),
+    "limit": (Facts(), Facts(0.1, sends="full", size=0.4), "doubtful", "stands at a limit"),
+    "chatter": (Facts(), Facts(0.1, sends="zigzag", size=0.0131), "doubtful", "chatters"),
+    "moves once, far": (Facts(size=0.1), Facts(0.1, size=1.2), "better", "variation of its command is 12 times"),
+    "moves twice": (Facts(), Facts(0.1, size=2.2), "better", "variation of its command is 2.2 times"),
+    "moves a bit more": (Facts(), Facts(0.1, size=1.9), "better", "none"),
+    "hardly moves": (Facts(sends="steady", size=0.0), Facts(0.1, sends="steady", size=1e-7), "better", "none"),
 }
 
 
 def test_flags_turn_a_smaller_error_into_a_doubtful_one():
-    """And only where they are raised, as they alone are listed; a command that moves more is a remark."""
-    raised = findings(compared({name: (plain, one) for name, (plain, one, *_) in FLAGS.items()}))
-    calm = findings(compared({name: (plain, near) for name, (plain, _, near, _) in FLAGS.items()}))
-    assert {n: str(one.outcome) for n, one in raised.items()} == dict.fromkeys(FLAGS, "doubtful")
-    assert {n: str(one.outcome) for n, one in calm.items()} == dict.fromkeys(FLAGS, "better")
-    assert [n for n, (*_, words) in FLAGS.items() if words not in raised[n].text or words in calm[n].text] == []
-    assert {one.flags for one in calm.values()} == {"none"}
-    [moved] = findings(compared({"x": (Facts(), Facts(0.1, size=2.2))})).values()
-    assert (str(moved.outcome), "variation of its command is 2.2 times" in moved.text) == ("better", True)
+    """And only where they are raised, as they alone are listed; a command that moves more, and not to and fro, is a remark."""
+    found = findings(compared({name: row[:2] for name, row in FLAGS.items()}))
+    assert {n: str(one.outcome) for n, one in found.items()} == {n: row[2] for n, row in FLAGS.items()}
+    assert [(n, found[n].flags) for n, (*_, words) in FLAGS.items() if words not in found[n].flags] == []
 
 
 def test_what_counts_and_what_comes_first():
@@ -163,6 +164,8 @@ def test_what_counts_and_what_comes_first():
     assert [str(f.outcome) for f in found[:2]] == ["no difference", "better"]
     [share] = [s for f in found for s in re.findall(r"^The smallest rms error is that of B\+FPI: (\S+) % of", f.text)]
     assert float(share) == pytest.approx(100 * math.sqrt(((0.2 / 1.757) ** 2 + (0.2 / 2) ** 2) / 2), rel=0.01)
+    [unmeasured] = findings(compared({"A": cases["A"]}, {"measure_from": PERIOD * (CYCLES - 0.4)})).values()
+    assert unmeasured.text == "A+FPI and A cannot be compared: an error is no number."
     broken = fp.Metric("mine", lambda problem, run: 1 / 0)
     [told] = compared({"A": cases["A"]}, metrics=[*tasks.two_mass.metrics, broken])["A"].metrics.broken.values()
     assert told.startswith("metric 'mine' could not be computed (ZeroDivisionError: division by zero)")
