@@ -4,7 +4,7 @@ from typing import Any
 
 import casadi as ca
 import pytest
-from helpers import reviewed, tasks
+from helpers import reviewed
 
 import fpirhc as fp
 
@@ -62,12 +62,3 @@ def test_a_believed_lag_is_a_part_of_the_right_model(reality):
 def test_a_believed_dead_time_is_a_part_of_the_right_model_too():
     """Where the problem states none; a dead time that it states is a fact."""
     assert asked(task(), fp.ModelReferenced(MAP, cycles=5.0, measurement=2.0)).verdict == "yes"
-
-
-def test_a_comparison_asks_the_same():
-    adapting = fp.ComputedTorque(LAW, fp.ModelReferenced(MAP, lag=LAG))
-    pair = {"CTC": fp.ComputedTorque(LAW), "CTC+FPI": adapting}
-    made = tasks.made(task(reality=lagging(), duration=2.0), pair)
-    null = fp.compare(made, seed=0, compiled=False)["CTC+FPI"].null
-    assert null.passes
-    assert null.adapted["y"] == pytest.approx(null.without["y"], rel=1e-3)

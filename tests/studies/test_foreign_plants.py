@@ -36,9 +36,7 @@ class ForeignPlant:
     problem: fp.Problem
     rate: float
     gain: float = -1.0
-    chain: Chain | None = (
-        None  # (state, inputs, parameters) -> controlled outputs with their derivatives; None: coordinates
-    )
+    chain: Chain | None = None  # (state, inputs, parameters) -> outputs with their derivatives; None: coordinates
 
 
 def known(**values: tuple[float, float, str]) -> dict[str, fp.Parameter]:
