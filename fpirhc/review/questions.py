@@ -64,6 +64,13 @@ class Question:
     change: str  # what to do where the answer is not good, with what the loop has for it
     of: str = "controller"  # or 'problem', which asks the loop of the first controller, or 'adaptive'
 
+    def asked(self, case: Case) -> Fact | None:
+        """Return the answer; a run of the model in place of a plant outside can tell what fails, and not what works there."""
+        fact, fails = self.ask(case), self.of == "controller" and Verdict.NO
+        if fact and case.outside and self.key not in OF_MODEL and fact.verdict != fails:
+            raise NotAsked("Run on the model, not on your machine: fpirhc probe.")
+        return fact
+
 
 def graded(value: float, good: float, bad: float) -> Verdict:
     """Return yes up to `good`, no from `bad` on, caution between."""
@@ -264,9 +271,8 @@ def _inner(case: Case) -> Fact | None:
     rate = 0.0 if abs(rate) * problem.duration < ROUNDING else rate
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
     numbers = {"rate_with_outputs_held": rate, **(_times(rate) if rate else {})}
-    if rate * problem.duration <= math.log(2):
-        return Fact(Verdict.YES, numbers)
-    return Fact(held, {**numbers, "left": left})
+    still = rate * problem.duration <= math.log(2)
+    return Fact(Verdict.YES, numbers) if still else Fact(held, {**numbers, "left": left})
 
 
 def _noise(case: Case) -> Fact | None:
@@ -369,6 +375,8 @@ def gain_by_run(case: Case) -> Fact:
     busy, tries, plain = _busy(case), _tries(case), case.plain
     before, alone, now, error = plain.moves(plain.start), plain.share(plain.counted), *tries[TODAY][1::-1]
     good, fine = tries[TODAY].good, [way for way, one in tries.items() if one.good]
+    if good and np.ptp([alone, *(one.error for one in tries.values())]) <= ROUNDING * error:
+        raise NotAsked("Every gain has the error of none: the run has nothing that adaptation corrects.")
     most = error * (LITTLE if good or plain.lost else 1.0)
     spare = lambda way: good and way[0] < 1  # noqa: E731  its reserve is worth it, unless it costs too much
     pays = lambda way: tries[way].error < alone and (spare(way) or busy or tries[way].error <= most)  # noqa: E731
@@ -458,9 +466,9 @@ def _model(case: Case) -> Fact:
 
 def _pays(case: Case) -> Fact:
     plain, own = case.plain.share(case.plain.nominal), case.bench.share(case.bench.nominal)
-    if case.outside or min(plain, own) > BAD:
-        why = "The plant is outside: ask fpirhc compare." if case.outside else "Neither follows: mend that first."
-        return Fact(Verdict.UNKNOWN, {"share_without": plain, "share_with": own}, change=why)
+    if min(plain, own) > BAD:
+        shares = {"share_without": plain, "share_with": own}
+        return Fact(Verdict.UNKNOWN, shares, change="Neither follows: mend that first.")
     name, numbers, harms = _added(case, case.plain.errors(case.plain.nominal), case.bench.errors(case.bench.nominal))
     numbers["divided_by"] = plain / max(own, 1e-300)
     verdict = Verdict.YES if own < max(plain, SLIGHT) else Verdict.CAUTION  # a small one is nothing to mend
@@ -527,4 +535,5 @@ QUESTIONS = (
              "adaptation| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "
              "({counted})| {ratio}", "Leave it out, or compare gains: fpirhc study --over deformation.gain=...", "adaptive"),
 )  # fmt: skip
+OF_MODEL = "turns", "posed", "ranges", "model"  # which ask the file or the model, and no plant outside
 ROOTS = ("turns", "posed", "plans", "gain")  # whose no is the cause of the others: their sentence stands there too

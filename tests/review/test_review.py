@@ -150,13 +150,6 @@ def test_numbers_have_units_and_spans():
     assert found["model"].evidence.startswith("model as the plant, without noise and disturbances: rms error of q")
 
 
-def test_an_optimiser_says_whether_it_has_iterations():
-    """Two settings bound the work of the fixed point; one bounds IPOPT's."""
-    more = fp.FixedPoint(iterations=12, tolerance=1e-3, most_iterations=400)
-    assert fp.FixedPoint(iterations=3, tolerance=1e-3).longer(4) == more
-    assert fp.Ipopt(tolerance=1e-3).longer(2) == fp.Ipopt(tolerance=1e-3, iterations=400)
-
-
 FILE = """
 import casadi as ca
 import fpirhc as fp

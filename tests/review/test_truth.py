@@ -310,7 +310,7 @@ def test_a_command_that_is_later_by_more_than_is_borne_is_lost_in_a_run():
 
 
 def test_a_plant_outside_is_asked_by_its_model():
-    """What pays on somebody else's body is for a comparison; all that the model can tell is told."""
+    """What fails on the model is told, and what works there is unknown of the body, without a gain to take."""
 
     class Body:
         def reset(self, _seed: int) -> list[float]:
@@ -326,9 +326,17 @@ def test_a_plant_outside_is_asked_by_its_model():
     for sensors, free in ((dict(list(ranges.items())[:1]), "x', x''"), (ranges, "")):
         told = fp.review(replace(problem, sensing=fp.Sensing(sensors)), adapted, mismatch=0.0, seed=0).answers
         [asked] = [a for a in told["problem"] if a.key == "ranges"]
-        verdict = "caution" if free else "yes"
-        assert (asked.verdict, asked.of, "Sensor(range=" in asked.change) == (verdict, free, bool(free))
-    found = {a.key: a for a in told["CTC+FPI"]}
-    assert found["pays"].verdict == "unknown"
-    assert found["pays"].change == "The plant is outside: ask fpirhc compare."
-    assert found["returns"].verdict == "yes"
+        assert (asked.verdict, asked.of, "range=" in asked.change) == ("caution" if free else "yes", free, bool(free))
+    verdicts = {a.key: str(a.verdict) for some in told.values() for a in some}
+    assert {k: v for k, v in verdicts.items() if v != "unknown"} == dict.fromkeys(("posed", "ranges", "model"), "yes")
+    unknown = {(a.change, len(a.numbers)) for a in told["CTC+FPI"] if a.verdict == "unknown"}
+    assert unknown == {("Run on the model, not on your machine: fpirhc probe.", 0)}
+    away = replace(problem, start={"x": 0.0, "x'": 5.0})
+    assert reviewed.answers(away, fp.ComputedTorque(fp.Exponential(1e-3)))["follows"].verdict == "no"
+
+
+def test_a_gain_that_corrects_nothing_is_not_tested():
+    """Where the model is right every gain has the same error."""
+    law = fp.ComputedTorque(fp.Exponential(6.0), fp.ModelReferenced(fp.Affine(-0.8)))
+    told = reviewed.answers(reviewed.mass(plant=reviewed.heavy(1.0, 1.0)), law)["gain"]
+    assert (told.verdict, told.change[:10], told.numbers) == ("unknown", "Every gain", {})
