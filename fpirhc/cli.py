@@ -296,10 +296,10 @@ def study(
     The first controller is the one that the others are compared with. study.csv has every run and its parameters; the same
     command goes on after an interruption.
     """
-    if sum(map(bool, (cases, draws, over, limits))) != 1:
-        raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
+    if sum(map(bool, (cases, draws, over, limits))) != 1:
+        raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
     if limits and (headline or (processes or 1) > 1 or cluster):
         raise typer.BadParameter(
             "--limits searches by the error, run after run: leave out --headline, --processes, --cluster"

@@ -144,13 +144,16 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     if not np.isfinite(jacobian).all() or np.abs(np.linalg.eigvals(weighted)).max() <= _NOTHING:
         return
     spectrum, delay = Spectrum(np.linalg.eigvals(weighted)), problem.response_delay
-    limit = sum(linear_limit(spectrum.eigenvalues))
+    limit, seen = sum(linear_limit(spectrum.eigenvalues)), _weights_of_estimators(problem)
     if limit * gain <= 0:
-        report = assess_gain(deformation, spectrum, delay)
+        report, remedy = assess_gain(deformation, spectrum, delay), ""
+        if seen is not None and deformation.form.steady:
+            name, value = own_gain(deformation)
+            largest = largest_gain(deformation.with_effective_gain(-gain), jacobian, seen)
+            remedy = f"use a {'negative' if value > 0 else 'positive'} {name}, 0 < |{name}| < {abs(largest / gain * value):.3g}"
         turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
         why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
-        raise NotContractive(f"{report.fault}{why}", report.remedy)
-    seen = _weights_of_estimators(problem)
+        raise NotContractive(f"{report.fault}{why}", remedy or report.remedy)
     if not deformation.form.steady or (seen is None and abs(gain) < abs(limit)):
         return
     weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)

@@ -277,8 +277,9 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0)
         none = (0.0, 0.0)
         return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error), error.fault, error.remedy)
     scale, what, fault = value / gain, with_its_gain(deformation), ""
-    admissible = _admissible(name, scale, linear, sector, late)
-    text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle"
+    admissible = _admissible(name, scale, linear, sector)
+    behind = f", without the response's delay of {late:.4g} cycles" if late else ""
+    text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle{behind}"
     if not sector[0] < gain < sector[1]:
         text += (
             ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
@@ -288,18 +289,17 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0)
         fault = f"{what} has the wrong sign, so every cycle enlarges the error"
     elif abs(gain) >= abs(sum(linear)):
         fault = f"{what} is too large: errors grow by the factor {predicted:.3g} per cycle"
-    remedy = f"use {admissible}" if fault else ""
+    remedy = f"use {admissible}{behind}" if fault else ""
     text = f"{fault}; {remedy}" if fault else text
     return ContractionReport(predicted, gain, (name, scale), linear, sector, text, fault, remedy)
 
 
-def _admissible(name: str, scale: float, linear: tuple[float, float], sector: tuple[float, float], late: float) -> str:
+def _admissible(name: str, scale: float, linear: tuple[float, float], sector: tuple[float, float]) -> str:
     ends = [abs(scale * sum(limit)) for limit in (linear, sector)]  # one end of a limit is zero
     bounds = f"0 < |{name}| < {ends[0]:.3g}"
     if not np.isclose(ends[0], ends[1]):
         bounds += f", and below {ends[1]:.3g} to converge from errors of any size"
-    behind = f", without the response's delay of {late:.4g} cycles" if late else ""
-    return f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, {bounds}{behind}"
+    return f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, {bounds}"
 
 
 _WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the transient of a useful gain is shorter

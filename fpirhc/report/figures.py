@@ -143,5 +143,5 @@ def _draw_factor(
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
     caption_axes(axis, literal(gain), "max|1 - a lambda|")
-    axis.set_title("Contraction per cycle where errors count: o predicted, x measured", fontsize=10, y=1.0)
+    axis.set_title("Contraction of the iteration alone: o predicted, x measured", fontsize=10, y=1.0)
     draw_legend(axis)

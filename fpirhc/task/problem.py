@@ -510,6 +510,7 @@ def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Boun
 
 
 _GAINS: Latest[ca.Function] = Latest(4)
+_SHOWN = 200  # instants at which a reference is compared with the ranges of sensors
 
 
 def _check_reference(problem: Problem) -> None:
@@ -522,6 +523,17 @@ def _check_reference(problem: Problem) -> None:
         if wrong:
             where = f"reference: at t = {t:g} {problem.time_unit}"
             raise InvalidProblem(f"{where} {', '.join(wrong)}; give a motion that has these values")
+    shown = {n: s.range for n, s in problem.sensing.sensors.items() if s.range is not None and n in plant.output.elements}
+    if not shown:
+        return
+    followed = np.asarray(function.map(_SHOWN)(np.linspace(0.0, problem.duration, _SHOWN)[None, :])[0].full())
+    for name, (low, high) in shown.items():
+        row = followed[plant.output.elements.index(name)]
+        if row.min() < low or row.max() > high:
+            raise InvalidProblem(
+                f"sensing: the reference of '{name}' goes from {row.min():.3g} to {row.max():.3g}, but its sensor shows {low:g} to "
+                f"{high:g}, and takes the rest for faults; widen Sensor(range=...), or keep the reference within it"
+            )
 
 
 def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = ("approximate", "exact")) -> None:

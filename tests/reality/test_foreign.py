@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers import tasks
 from helpers.drives import CONTROLLERS, MEASURES, PAIRS, SENSING, Wrapped, lagged, run, task
 
 import fpirhc as fp
@@ -204,6 +205,15 @@ def test_contraction_is_identified_where_the_response_is_measured():
     controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.5))
     result = run(outside(task(start={"y": 0.3})), controller)
     assert np.allclose(result["contraction"], 1 - controller.deformation.effective_gain() * 2.0, atol=0.02)
+
+
+def test_nobody_has_the_exact_model_of_a_plant_outside():
+    """Parameters that are equal in the file say nothing of the plant: the row without adaptation is no bound of the others."""
+    laws = {"law": fp.ComputedTorque(fp.Exponential(rate=6.0)), "fast": fp.ComputedTorque(fp.Exponential(rate=9.0))}
+    known = task(start={"y": 0.3})
+    known = outside(known.with_exact(known.plant.approximate))
+    found = fp.compare(tasks.made(known, laws), seed=0, compiled=False)
+    assert [e.exact for e in found.entries] == [False, False]
 
 
 def test_a_gain_that_changes_during_a_run_acts_from_that_cycle_on():

@@ -46,9 +46,9 @@ def test_report_is_self_contained_and_small(written):
     assert not re.search(r"""(src|href)\s*=\s*['"](?!data:)""", whole)
     assert "@import" not in whole
     assert [p.name for p in written.parent.iterdir()] == ["report.html"]
-    pictures = re.findall(r"alt='(Contraction per cycle.*?|The response error in the first .*?)[:']", whole)
+    pictures = re.findall(r"alt='(Contraction of .*?|The response error in the first .*?)[:']", whole)
     assert pictures == [
-        "Contraction per cycle where errors count",
+        "Contraction of the iteration alone",
         "The response error in the first 150 cycles, 0.15 s",
     ]
     assert "0.15 s: |realised - desired| [m/s^2]'" in whole

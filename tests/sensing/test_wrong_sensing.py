@@ -43,6 +43,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     "quantum": (lambda: fp.Sensor(quantum=0.0), "Sensor.quantum: expected a finite number above 0"),
     "two mistakes": (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "dropout: expected a number from 0 to below 1"),
     "range": (lambda: fp.Sensor(range=(1.0, 0.0)), "lower < upper"),
+    "range of what is followed": (
+        lambda: task(sensors={"y": fp.Sensor(range=(0.5, 0.9))}),
+        "the reference of 'y' goes from 0 to 0, but its sensor shows 0.5 to 0.9",
+    ),
     "even window": (lambda: FIT(window=10, degree=2), "use 9 or 11"),
     "even and short window": (lambda: FIT(window=4, degree=9), "whose centre is a sample; use 11"),
     "short window": (lambda: FIT(window=3, degree=3), "at least 5"),

@@ -288,14 +288,15 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
         return None
     spectrum, late = sampled_spectrum(problem, run), problem.response_delay
     predicted, growing, measured = (metrics[f"contraction.{n}"][""] for n in ("predicted", "growing", "measured"))
+    growing = 0.0 if late else growing  # behind a delay the iteration is another one, which was asked before the run
     return Contraction(predicted, growing, measured, assess_gain(controller.deformation, spectrum, late), spectrum)
 
 
 def _has_exact_model(problem: Problem, controller: Controller) -> bool:
-    """Whether it is the bound of a controller with a wrong model: exact parameters, nothing adapted, nothing learned."""
+    """Whether it is the bound of a controller with a wrong model: parameters known as exact, nothing adapted, nothing learned."""
     model, real = controller.plant_model(problem), problem.real_plant
     wrong = problem.reality is not None or not np.array_equal(model.plant.approximate, model.plant.exact)
-    fixed = not controller.deformation.adapts and not controller.learns
+    fixed = not controller.deformation.adapts and not controller.learns and problem.equations_known
     return bool(wrong and fixed and model.plant is real and np.array_equal(model.parameters(model.plant), real.exact))
 
 

@@ -98,9 +98,7 @@ class Yardstick:
 
     scales: Mapping[str, float]  # the ranges
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
-    resting: Mapping[
-        str, float
-    ]  # of one that rests the set-point's size, or that of the movement left alone under disturbances
+    resting: Mapping[str, float]  # of what rests the set-point's size, or that of the movement left alone under disturbances
     span: str  # of time in which errors count
 
     @staticmethod
@@ -147,8 +145,12 @@ def _unsolved(pair: Pair) -> float:
     return pair.adaptive.metrics.statuses.get(Status.NOT_CONVERGED.name, 0) / max(1, pair.adaptive.run.cycles)
 
 
-def _at_limit(pair: Pair) -> float:
-    return float(pair.adaptive.metrics.values.get("at_limit", {}).get("", 0.0))
+def _at_limit(entry: Entry) -> float:
+    return float(entry.metrics.values.get("at_limit", {}).get("", 0.0))
+
+
+def _saturates(pair: Pair) -> float:
+    return _at_limit(pair.adaptive)
 
 
 def _moved(pair: Pair) -> dict[str, float]:
@@ -186,7 +188,7 @@ class Flag:
 
     measure: Callable[[Pair], float]
     least: float  # value from which it is raised
-    text: str  # with the {value}
+    text: str  # with the {value}, and the share of cycles at a limit {before}
     doubts: bool = False  # whether it turns a smaller error into a doubtful one
 
 
@@ -195,7 +197,7 @@ FLAGS = (
     Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
     Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
-    Flag(_at_limit, 0.2, "its command stands at a limit in {value:%} of the cycles: no adaptation can act there", True),
+    Flag(_saturates, 0.2, "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
     Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation: it chatters", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
@@ -205,8 +207,8 @@ FLAGS = (
 
 def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
-    every = [(flag, flag.measure(pair)) for flag in FLAGS]
-    raised = [(f, in_words(f.text, {"value": v}, {})) for f, v in every if v > f.least]
+    every, before = [(flag, flag.measure(pair)) for flag in FLAGS], _at_limit(pair.plain)
+    raised = [(f, in_words(f.text, {"value": v, "before": before}, {})) for f, v in every if v > f.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
     return [one for one in raised if not (chatter and one[0].measure is _moves)]
 
