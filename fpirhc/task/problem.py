@@ -523,7 +523,9 @@ def _check_reference(problem: Problem) -> None:
         if wrong:
             where = f"reference: at t = {t:g} {problem.time_unit}"
             raise InvalidProblem(f"{where} {', '.join(wrong)}; give a motion that has these values")
-    shown = {n: s.range for n, s in problem.sensing.sensors.items() if s.range is not None and n in plant.output.elements}
+    shown = {
+        n: s.range for n, s in problem.sensing.sensors.items() if s.range is not None and n in plant.output.elements
+    }
     if not shown:
         return
     followed = np.asarray(function.map(_SHOWN)(np.linspace(0.0, problem.duration, _SHOWN)[None, :])[0].full())

@@ -47,10 +47,7 @@ def test_report_is_self_contained_and_small(written):
     assert "@import" not in whole
     assert [p.name for p in written.parent.iterdir()] == ["report.html"]
     pictures = re.findall(r"alt='(Contraction of .*?|The response error in the first .*?)[:']", whole)
-    assert pictures == [
-        "Contraction of the iteration alone",
-        "The response error in the first 150 cycles, 0.15 s",
-    ]
+    assert pictures == ["Contraction of the iteration alone", "The response error in the first 150 cycles, 0.15 s"]
     assert "0.15 s: |realised - desired| [m/s^2]'" in whole
     marks = ("id='verdict'", "<h2>Signals over time", "<table>", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
     places = [whole.index(mark) for mark in marks]

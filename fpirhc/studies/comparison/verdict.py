@@ -98,7 +98,9 @@ class Yardstick:
 
     scales: Mapping[str, float]  # the ranges
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
-    resting: Mapping[str, float]  # of what rests the set-point's size, or that of the movement left alone under disturbances
+    resting: Mapping[
+        str, float
+    ]  # of what rests the set-point's size, or that of the movement left alone under disturbances
     span: str  # of time in which errors count
 
     @staticmethod
