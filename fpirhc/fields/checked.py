@@ -6,38 +6,20 @@ A dataclass needs no line of its own, and a class of another distribution is che
 
 from __future__ import annotations
 
-import ast
 import inspect
-import re
 import sys
 from abc import ABCMeta
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from difflib import get_close_matches
 from functools import cache, wraps
 from importlib import import_module
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 
 import casadi as ca
 
 from fpirhc.errors import InvalidField, InvalidName, NotSupported, nearest
-from fpirhc.fields.kinds import (
-    Anything,
-    Choice,
-    Expected,
-    Number,
-    accepts,
-    call_of,
-    described,
-    expected_by,
-    shortened,
-    signature_of,
-)
+from fpirhc.fields.kinds import ANYTHING, Expected, accepts, call_of, described, expected_by
 from fpirhc.fields.user_code import users_place
-
-_WITH_UNIT = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)? ?[a-zA-Z%/^*]+\d?")  # '1 ms'
 
 
 class _CheckedWhenCalled(ABCMeta):
@@ -56,9 +38,7 @@ class _CheckedWhenCalled(ABCMeta):
     @property
     def __signature__(cls) -> inspect.Signature:
         """The arguments that a value is made with, for notebooks and editors."""
-        makes: Callable[..., object] = getattr(cls, "__init__")  # noqa: B009 -- the class's own, as in `_arguments_of`
-        _, *arguments = inspect.signature(makes).parameters.values()
-        return inspect.Signature(arguments)
+        return inspect.Signature(_parameters(cls))
 
     if not TYPE_CHECKING:
 
@@ -86,9 +66,7 @@ def missing(owner: type, name: str) -> AttributeError:
 
 def expects_whole_number(owner: type, name: str) -> bool:
     """Whether a field of a class is declared as a whole number, with or without a range."""
-    one = _arguments_of(owner).expected.get(name)
-    options = one.options if isinstance(one, Choice) else (one,)
-    return any(isinstance(option, Number) and option.whole for option in options)
+    return _arguments_of(owner).expected.get(name, ANYTHING).whole
 
 
 def unnamed_inner(value: object, contract: type) -> Iterator[str]:
@@ -110,26 +88,6 @@ def _abstract(cls: type) -> tuple[str, ...]:
     return tuple(f"{cls.__name__} has no {name}(...), which its contract {owners[name]} asks for" for name in missing)
 
 
-@cache
-def _arguments_of(owner: type) -> _Arguments:
-    makes: Callable[..., object] = getattr(owner, "__init__")  # noqa: B009 -- the class's own, whatever its call does
-    parameters = tuple(inspect.signature(makes).parameters.values())[1:]
-    return _read_arguments(owner, "field", parameters, lambda one: _expected(owner, one))
-
-
-def _expected(owner: type, parameter: inspect.Parameter) -> Expected:
-    """What the annotation of a field expects, or else that of the argument; each is read in the module that wrote it."""
-    for base in owner.__mro__:
-        annotations = inspect.get_annotations(base)
-        if parameter.name in annotations:
-            return _read(annotations[parameter.name], base)
-    return _read(parameter.annotation, owner)
-
-
-def _read(annotation: object, owner: type) -> Expected:
-    return _read_annotation(annotation, vars(sys.modules.get(owner.__module__, sys)), vars(owner))
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 Value = TypeVar("Value")
@@ -143,7 +101,7 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def checked(*arguments: P.args, **named: P.kwargs) -> R:
-        mistakes = tuple(checks_of(function).mistakes(arguments, named))
+        mistakes = tuple(_arguments_of(function).mistakes(arguments, named))
         if mistakes:
             raise InvalidField(mistakes, users_place())
         return function(*arguments, **named)
@@ -151,18 +109,9 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
     return checked
 
 
-@cache
-def checks_of(function: Callable[..., object]) -> _Arguments:
-    """Return what is checked of a function's arguments; they are read at its first call, when every module is loaded."""
-    names = getattr(inspect.unwrap(function), "__globals__", {})
-    parameters = tuple(inspect.signature(function).parameters.values())
-    return _read_arguments(function, "argument", parameters, lambda one: _read_annotation(one.annotation, names, {}))
-
-
 @dataclass(frozen=True)
 class _Arguments:
     owner: type | Callable[..., object]  # what is called
-    noun: str  # what an argument of it is called, "field" or "argument"
     positional: tuple[str, ...]  # names of those that may be given by their place
     required: tuple[str, ...]  # names of those without a default
     expected: Mapping[str, Expected]  # what is expected of each, by name
@@ -170,79 +119,72 @@ class _Arguments:
 
     def mistakes(self, arguments: Sequence[object], named: Mapping[str, object]) -> Iterator[str]:
         """Yield every mistake of a call."""
-        values = dict(zip(self.positional, arguments, strict=False))
-        yield from self._wrong_names(arguments, values, named)
-        every = {**values, **named}
+        every = {**dict(zip(self.positional, arguments, strict=False)), **named}
+        yield from self._wrong_names(arguments, named)
         wrong = [n for n, value in every.items() if n in self.expected and not accepts(self.expected[n], value)]
         if not wrong:
             return
-        if self._swapped(wrong, every):
-            name, (one, other) = self.owner.__name__, wrong
-            yield f"{name}: the values of '{one}' and '{other}' are swapped; write {name}({one}=..., {other}=...)"
+        name, (one, *others) = self.owner.__name__, wrong
+        if len(others) == 1 and all(accepts(self.expected[a], every[b]) for a, b in (wrong, wrong[::-1])):
+            yield f"{name}: the values of '{one}' and '{others[0]}' are swapped; write {name}({one}=..., {others[0]}=...)"
             return
-        for name in wrong:
-            yield from mistakes_in(self.expected[name], f"{self.owner.__name__}.{name}", every[name])
+        for field in wrong:
+            yield from mistakes_in(self.expected[field], f"{name}.{field}", every[field])
 
-    def _swapped(self, wrong: Sequence[str], values: Mapping[str, object]) -> bool:
-        """Whether two values are wrong, and each is what is expected of the other."""
-        if len(wrong) != 2:
-            return False
-        one, other = wrong
-        return accepts(self.expected[one], values[other]) and accepts(self.expected[other], values[one])
-
-    def _wrong_names(
-        self, arguments: Sequence[object], values: Mapping[str, object], named: Mapping[str, object]
-    ) -> Iterator[str]:
-        name = self.owner.__name__
+    def _wrong_names(self, arguments: Sequence[object], named: Mapping[str, object]) -> Iterator[str]:
+        name, by_place = self.owner.__name__, self.positional[: len(arguments)]
         for key in named:
-            if key in values:
+            if key in by_place:
                 yield f"{name}: '{key}' is given twice, by its place and by its name"
             elif key not in self.expected and not self.open:
-                yield f"{name} has no {self.noun} '{key}'.{nearest(key, self.expected)}"
+                noun = "field" if isinstance(self.owner, type) else "argument"
+                yield f"{name} has no {noun} '{key}'.{nearest(key, self.expected)}"
         if len(arguments) > len(self.positional) and not self.open:
             extra = described(arguments[len(self.positional)])
             yield f"{name} takes {len(self.positional)} values without a name, got {len(arguments)}; {extra} is too many"
-        missing = [key for key in self.required if key not in values and key not in named]
-        if missing:
+        if missing := [key for key in self.required if key not in by_place and key not in named]:
             yield f"{name} needs {', '.join(missing)}; write {call_of(self.owner)}"
 
 
-def _read_arguments(
-    owner: type | Callable[..., object],
-    noun: str,
-    parameters: Sequence[inspect.Parameter],
-    expected: Callable[[inspect.Parameter], Expected],
-) -> _Arguments:
-    """Return the arguments of a call with these parameters; `expected` reads the annotation of one."""
+def _parameters(owner: type | Callable[..., object]) -> list[inspect.Parameter]:
+    makes: Any = getattr(owner, "__init__") if isinstance(owner, type) else owner  # noqa: B009 -- not that of the metaclass
+    return list(inspect.signature(makes).parameters.values())[isinstance(owner, type) :]
+
+
+@cache
+def _arguments_of(owner: type | Callable[..., object]) -> _Arguments:
+    """What is checked of the arguments of a class or a function; they are read at its first call, when every module is loaded."""
+    parameters = _parameters(owner)
     ours = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     return _Arguments(
         owner,
-        noun,
         tuple(p.name for p in ours if p.kind is not p.KEYWORD_ONLY),
         tuple(p.name for p in ours if p.default is p.empty),
-        {p.name: expected(p) for p in ours},
+        {p.name: _expected(owner, p) for p in ours},
         open=len(ours) < len(parameters),
     )
 
 
-def _read_annotation(annotation: object, names: Mapping[str, object], own: Mapping[str, object]) -> Expected:
-    """Return what an annotation expects, read with the names of its module and of its class."""
+def _expected(owner: Any, parameter: inspect.Parameter) -> Expected:
+    """What the annotation of a field expects, or else that of the argument; each is read in the module that wrote it."""
+    annotation, names, own = parameter.annotation, getattr(inspect.unwrap(owner), "__globals__", {}), {}
+    if isinstance(owner, type):
+        base = next((b for b in owner.__mro__ if parameter.name in inspect.get_annotations(b)), owner)
+        annotation = inspect.get_annotations(base).get(parameter.name, annotation)
+        names, own = vars(sys.modules.get(base.__module__, sys)), dict(vars(base))
     if isinstance(annotation, str):
         try:
-            annotation = eval(annotation, dict(names), dict(own))
+            annotation = eval(annotation, dict(names), own)
         except Exception:  # noqa: BLE001 -- a name for type checkers only: such an argument is not checked
-            return Anything()
-    if annotation is inspect.Parameter.empty or get_origin(annotation) is ClassVar:
-        return Anything()
-    return expected_by(annotation)
+            return ANYTHING
+    unknown = annotation is inspect.Parameter.empty or get_origin(annotation) is ClassVar
+    return ANYTHING if unknown else expected_by(annotation)
 
 
 def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
     """Yield what is wrong with a value and its parts; `where` names it."""
     if not expected.fits(value):
-        comma = isinstance(value, tuple) and len(value) == 1 and accepts(expected, value[0])
-        mend = "a comma behind the value makes a tuple of it; remove the comma" if comma else ""
-        mend = mend or expected.completed(value) or _mended(expected, value)
+        mend = expected.written(value) or _mended(expected, value)
         yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
         return
     for place, inner, part in expected.parts(value):
@@ -250,100 +192,31 @@ def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
 
 
 def _mended(expected: Expected, value: object) -> str:
-    """Return what to write instead; empty where nothing is near."""
-    contract = expected.contract()
+    """Return what to write instead: a part of the value, or a member of what is expected; empty where nothing is near."""
     if isinstance(value, type):
-        return f"write {call_of(value)}" if contract is not None and issubclass(value, contract) else ""
-    if isinstance(value, str):
-        return _mended_text(expected, value, contract)
+        return f"write {call_of(value)}" if issubclass(value, expected.classes) else ""
     if isinstance(value, ca.SX | ca.MX):
         return "a setting is a number" if expected.fits(1) or expected.fits(0.5) else ""
-    if isinstance(value, int | float) and expected.fits((-abs(value), abs(value))) and not expected.fits([value]):
-        return f"write both ends, such as {(-abs(value), abs(value))}"
-    if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 and expected.fits(int(value)):
-        return f"write {int(value)}"
-    return _made_of(expected, value, contract)
+    parts = {f.name: getattr(value, f.name) for f in fields(value)} if is_dataclass(value) else {}
+    if near := [name for name, part in parts.items() if part is not None and expected.fits(part)]:
+        return f"give its .{near[0]}"
+    return " or ".join(text for one in expected.classes if (text := _member(one, value)))
 
 
-def _made_of(expected: Expected, value: object, contract: type | None) -> str:
-    """How what is expected is made of a value that holds it, or that it should hold."""
-    if contract is None and isinstance(value, Mapping) and value and all(accepts(expected, v) for v in value.values()):
-        return f"it is one for all, without a name: write {shortened(next(iter(value.values())))}"
-    if isinstance(value, int | float | Mapping) and expected.fits(lambda t: t):
-        return f"write lambda t: {shortened(value)}"
-    if contract is None:
+def _member(one: type, value: object) -> str:
+    """How a value of a public class is written, or which members a contract has; empty for classes of others."""
+    package = import_module(__name__.partition(".")[0])
+    if one.__module__.partition(".")[0] != package.__name__:
         return ""
-    if inspect.isroutine(value) and signature_of(value) == "()":
-        return "call it and give its result"
-    members = [text for one in expected.contracts() if (text := _member(one))]
-    return _part_that_fits(expected, value) or " or ".join(
-        [*members[:1], *(m.removeprefix("write ") for m in members[1:])]
-    )
-
-
-def _mended_text(expected: Expected, text: str, contract: type | None) -> str:
-    for number in (int, float):
-        try:
-            if expected.fits(number(text)):
-                return f"write {text} without quotes"
-        except ValueError:
-            continue
-    if contract is None:
-        alone = _WITH_UNIT.fullmatch(text) and expected.fits(0.1)
-        return "write the number alone, in the unit that is expected" if alone else ""
-    if issubclass(contract, Path):
-        return f"write pathlib.Path({text!r})"
-    loaded = getattr(contract, "_LOADED", "").format(repr(text))
-    members = {_plain(name): member for name, member in _public(contract) if member is not contract or not loaded}
-    close = get_close_matches(_plain(text), members, n=1, cutoff=0.5)
-    if close:
-        return f"write fp.{call_of(members[close[0]])}"
-    return f"write {loaded}" if loaded else _member(contract)
-
-
-def _member(contract: type) -> str:
-    """How a value of a public class is written, or which members a contract has; empty for classes of Python."""
-    if inspect.isabstract(contract):
-        return f"one of {', '.join(sorted(name for name, _ in _public(contract)))}"
-    home, own = (name.partition(".")[0] for name in (contract.__module__, __name__))
-    if home != own or contract.__name__ not in import_module(own).__all__:
-        return ""
-    _, *first = inspect.signature(getattr(contract, "__init__")).parameters  # noqa: B009
-    return f"write fp.{call_of(contract)}".replace("()", f"({first[0]}=...)" if first else "()")
-
-
-def _part_that_fits(expected: Expected, value: object) -> str:
-    """Which part of the value is what is expected, such as the problem of a loaded file."""
-    if isinstance(value, Mapping):
-        return next((f"give one of its entries, such as [{k!r}]" for k, v in value.items() if expected.fits(v)), "")
-    names = [f.name for f in fields(value)] if is_dataclass(value) and not isinstance(value, type) else []
-    parts = {name: getattr(value, name) for name in names}
-    return next((f"give its .{name}" for name, part in parts.items() if part is not None and expected.fits(part)), "")
-
-
-def _public(contract: type) -> Iterator[tuple[str, type]]:
-    """Public members of a contract, those of its part of the package; only a mistake pays for importing them."""
-    top, *part = contract.__module__.split(".")[:2]
-    package = import_module(top)
-    for name in _declared_in(package, ".".join(part)):
-        member = getattr(package, name, None)
-        if isinstance(member, type) and issubclass(member, contract) and not inspect.isabstract(member):
-            yield name, member
-
-
-def _declared_in(package: ModuleType, part: str) -> list[str]:
-    """Public names that the stub of a package imports from one part of it; all public names without a stub."""
-    file = getattr(package, "__file__", None)  # Python's own classes are in no file
-    stub = Path(file).with_suffix(".pyi") if file else None
-    if stub is None or not stub.is_file():
-        return list(getattr(package, "__all__", ()))
-    lines = (one for one in ast.parse(stub.read_text(encoding="utf-8")).body if isinstance(one, ast.ImportFrom))
-    of_part = (one for one in lines if (one.module or "").partition(".")[0] == part)
-    return [alias.asname or alias.name for one in of_part for alias in one.names]
-
-
-def _plain(name: str) -> str:
-    return "".join(c for c in name.lower() if c.isalnum())
+    if isinstance(value, str) and hasattr(one, "_LOADED"):
+        return f"write {one._LOADED.format(repr(value))}"
+    if not inspect.isabstract(one):
+        _, *first = inspect.signature(getattr(one, "__init__")).parameters  # noqa: B009
+        written = call_of(one).replace("()", f"({first[0]}=...)" if first else "()")
+        return f"write fp.{written}" if one.__name__ in package.__all__ else ""
+    public = {name: getattr(package, name, None) for name in package.__all__}  # only a mistake pays for importing them
+    members = [n for n, m in public.items() if isinstance(m, type) and issubclass(m, one) and not inspect.isabstract(m)]
+    return f"one of {', '.join(sorted(members))}"
 
 
 def replaced(value: Value, field: str, content: object) -> Value | None:
@@ -383,16 +256,9 @@ class ByName(dict[str, Value]):
 
 
 class Fixed(ByName[Value]):
-    """A dictionary in a field of a frozen value.
-
-    What follows from the value is computed once, so a change in place would be shown and have no effect.
-
-    Raises:
-        NotSupported: a change in place.
-    """
+    """A dictionary in a field of a frozen value, from which more was computed: a change in place would have no effect."""
 
     def _stays(self, *_: object, **__: object) -> NoReturn:
-        """Raise NotSupported: nothing changes in place."""
         raise NotSupported(
             f"{self._where} cannot be changed in place, where it would have no effect; make another value with "
             f"dataclasses.replace(...) and a copy, {{**{self._where.rpartition('.')[2]}, name: value}}"

@@ -57,10 +57,10 @@ def one(file: str, old: str, new: str, *said: str) -> Wrong:
 WRONG_PENDULUM = """
 a number with its unit
   period=1e-2 -> period="10 ms"
-    Problem.period: expected a number ... write the number alone, in the unit that is expected
+    Problem.period: expected a number from 1e-12 to 1e12 in the plant's unit of time, got the text '10 ms'
 one end of a limit
   "torque": (-15.0, 15.0) -> "torque": 15.0
-    Limits.inputs['torque']: expected (a number, a number), got 15.0; write both ends, such as (-15.0, 15.0)
+    Limits.inputs['torque']: expected (a number, a number), got 15.0
 a derivative in the reference
   {"angle": 0.8 * ca.sin(2 * t)} -> {"angle": 0.8 * ca.sin(2 * t), "angle'": 1.6 * ca.cos(2 * t)}
     'angle'' is taken from 'angle' by differentiation; leave it out
@@ -125,7 +125,7 @@ cost of an unknown member
     line 31): a View has no 'x' ... Valid: state, reference, input
 reference without a function
   fp.Trajectory(lambda t: {"angle": 0.8 * ca.sin(2 * t)}) -> fp.Trajectory({"angle": 0.8})
-    mine.py, line 25 ... expected a function of 1 argument ... write lambda t: {'angle': 0.8}
+    mine.py, line 25 ... expected a function of 1 argument, got {'angle': 0.8}
 reference that is not finite
   0.8 * ca.sin(2 * t) -> ca.sqrt(t)
     mine.py, line 23 ... reference: at t = 0 s angle' is inf, angle'' is -inf ... give a motion that has these values

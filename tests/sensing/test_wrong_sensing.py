@@ -50,7 +50,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "even window": (lambda: FIT(window=10, degree=2), "use 9 or 11"),
     "even and short window": (lambda: FIT(window=4, degree=9), "whose centre is a sample; use 11"),
     "short window": (lambda: FIT(window=3, degree=3), "at least 5"),
-    "window of a float": (lambda: FIT(window=5.0, degree=2), "expected a whole number from 1 to 1001, got 5.0; write 5"),  # type: ignore[arg-type]
+    "window of a float": (lambda: FIT(window=5.0, degree=2), "expected a whole number from 1 to 1001, got 5.0"),  # type: ignore[arg-type]
     "low degree": (lambda: task(estimator=FIT(5, 1)), "use a degree of at least 2"),
     "time constant": (lambda: fp.LowPassDifference(time_constant=0.0), "VelocityDifference()"),
     "pole": (lambda: fp.Filtered(MAP, pole=1.0), "pole: expected a number from 0 to below 1, got 1.0"),
