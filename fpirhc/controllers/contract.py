@@ -224,7 +224,7 @@ class PairedAtOnce(Undeformed, ABC):
     """Contract: a controller that takes a response for that of the last command, also behind dead time."""
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
-        age = problem.dead_time.measurement + max(problem.dead_time.inputs.values(), default=0.0)
+        age = problem.dead_time.longest
         text = f"{type(self).__name__} takes a response for that of the last command, and it is that of a command {age:.3g} "
         return (f"{text}{problem.time_unit} older: dead time is not compensated",) if age else ()
 
@@ -266,7 +266,7 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
     of_problem = [f.name for f in fields(deformation) if f.metadata.get("of_problem")]
     left_open = [name for name in of_problem if getattr(deformation, name) is None]
     square = len(inputs) == len(problem.plant.controlled_names)
-    each = {n: square and len(inputs) > 1 and len({*known[n]}) > 1 for n in left_open}
+    each = {n: square and len({*known[n]}) > 1 for n in left_open}
     values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in left_open}
     return replace(deformation, **values) if values else deformation
 

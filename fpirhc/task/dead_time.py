@@ -87,6 +87,11 @@ class DeadTime(Checked):
         return replace(self, inputs=inputs, measurement=measurement)
 
     @property
+    def longest(self) -> float:
+        """From a command of the slowest input to its measured response."""
+        return max(self.inputs.values(), default=0.0) + self.measurement
+
+    @property
     def queued(self) -> tuple[str, ...]:
         """Names of the inputs that wait in a queue, and "measurement" where measurements do."""
         late = {**self.inputs, MEASUREMENT: self.measurement}

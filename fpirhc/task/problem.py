@@ -406,8 +406,7 @@ class Problem(Checked):
 
         It is the sum of dead time and estimator, for the slowest input and coordinate.
         """
-        waiting = max(self.dead_time.inputs.values(), default=0.0) + self.dead_time.measurement
-        return waiting / self.period + self.sensing.delay(self.plant, self.period)
+        return self.dead_time.longest / self.period + self.sensing.delay(self.plant, self.period)
 
     @property
     def answers_late(self) -> bool:

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers.iteration import affine
-from helpers.plants import simulated
+from helpers.plants import chain, simulated
 
 import fpirhc as fp
 from fpirhc.errors import InvalidValue
@@ -159,6 +159,26 @@ def test_the_scale_of_a_plan_covers_a_jump_between_the_limits(wrap, masses_known
     maps = [fp.Sigmoid(gain=-0.5, **s) for s in ({}, {"scale": scale}, {"scale": 1.2 * scale})]
     chosen, own, other = (simulated(problem, wrap(replace(PLAN, deformation=m)))["command"] for m in maps)
     assert np.abs(chosen - own).max() < 0.1 * np.abs(other - own).max()
+
+
+BACK = {
+    (1, False): 0.0,
+    (1, True): 1.5 * 1 / 2,
+    (2, False): 1.5 * 1 / 2,
+    (2, True): 1.25 * 9 / 8,
+}  # by order and integral
+
+
+@pytest.mark.parametrize(("order", "integral"), BACK)
+def test_the_scale_covers_what_brings_the_loop_back(order, integral):
+    """From the 500 m/s^n that the reference needs of the model, by sin^N tan(theta) of the N poles of the law, and a spare."""
+    path = fp.Trajectory(lambda t: {"y": 500 * t**order / order})
+    problem = fp.Problem(chain(order), path, {"y": -300.0}, period=PERIOD, duration=1.0)
+    scale = max(1.0, BACK[order, integral] * RATE * PERIOD * 500 / fp.Sigmoid(gain=-0.5, scale=1.0).largest_step())
+    maps = [fp.Sigmoid(gain=-0.5, **s) for s in ({}, {"scale": scale}, {"scale": 1.02 * scale})]
+    law = fp.Exponential(RATE, integral=integral)
+    chosen, own, other = (simulated(problem, fp.ComputedTorque(law, m))["command"] for m in maps)
+    assert np.abs(chosen - own).max() < 0.3 * np.abs(other - own).max()
 
 
 def test_a_plan_without_limits_needs_a_scale():

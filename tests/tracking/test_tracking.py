@@ -26,6 +26,7 @@ def _run(order, tracking, *, start, period=1e-3, duration=3.0, limits=None):
 def test_gains_are_binomials(order, gains):
     """(d/dt + 6)^(n+1) e_int expanded."""
     assert fp.Exponential(rate=6.0).gains(order) == pytest.approx(gains)
+    assert fp.ShiftPolynomial([0.94] * (order + 1), step=0.01).gains(order) == pytest.approx(gains)
 
 
 def test_bumpless_start_asks_for_the_nominal_response():

@@ -134,9 +134,7 @@ _EARLIER = "_target_earlier"
 def _earlier_targets(built: Built) -> Block:
     """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
     plant, period, pairs = built.plant, built.period, built.pairs
-    late = built.pairs.dead_time
-    whole = late.measurement + max(late.inputs.values(), default=0.0)
-    queue = Queue(2 * whole / period + built.problem.sensing.delay(plant, period))
+    queue = Queue(2 * built.pairs.dead_time.longest / period + built.problem.sensing.delay(plant, period))
     target, time = like(plant.output, "_target"), time_signal(plant)
     first = np.asarray(built.problem.reference.function(plant)(0.0)[0].full()).ravel()
     memory = queue.memory("targets", target.elements, tuple(map(float, first)))

@@ -136,8 +136,7 @@ class ThroughModel(Checked):
         Raises:
             InvalidValue: more than 1000 cycles.
         """
-        late = max((0.0, *problem.dead_time.inputs.values())) + problem.dead_time.measurement
-        cycles = (late if self.dead_time is None else self.dead_time) / problem.period
+        cycles = (problem.dead_time.longest if self.dead_time is None else self.dead_time) / problem.period
         if cycles > MOST:
             raise InvalidValue(f"{self!r}: {cycles:g} cycles of dead time, more than {MOST}")
         return Queue(cycles)

@@ -116,7 +116,7 @@ def examples(inner: Deformation) -> tuple[Deformation, ...]:
 
 
 def _growing_in_a_row(
-    count: Expression, error: Expression, before: Expression, slow: float = 1.0, fast: float | Expression = 1.0
+    count: Expression, error: Expression, before: Expression, slow: float, fast: Expression
 ) -> Expression:
     """How many errors in a row alternated in sign and grew; zero when the newest did not.
 
