@@ -68,12 +68,3 @@ def test_a_checked_function_is_still_that_function():
     assert pickle.loads(pickle.dumps(fp.simulate)) is fp.simulate
     assert list(inspect.signature(fp.simulate).parameters)[:2] == ["problem", "controller"]
     assert (fp.simulate.__doc__ or "").startswith("Run the closed loop")
-
-
-def test_signatures_of_classes_show_their_arguments():
-    """Notebooks and editors ask for them; the check of the arguments does not hide them."""
-    assert list(inspect.signature(fp.Affine).parameters) == ["gain", "weights"]
-    increment = inspect.signature(fp.Increment).parameters
-    assert list(increment) == ["map", "cycles", "uncertainty", "pole"]
-    assert increment["cycles"].default is inspect.Parameter.empty
-    assert increment["pole"].default is None

@@ -58,12 +58,6 @@ def test_ipopt_prints_nothing(capfd):
     assert capfd.readouterr().out == ""
 
 
-def test_no_adaptation_is_no_frozen_request():
-    """A gain of zero would keep the last request for ever; Identity passes on what is desired."""
-    request, response, desired = (ca.SX([v]) for v in (1.0, 2.0, 3.0))
-    assert float(ca.DM(fp.Identity().step(request, response, desired, {})[0])) == 3.0
-
-
 def test_a_power_has_no_finite_derivatives_at_its_kink():
     """CasADi's derivatives of sign(e) |e|^1.5 at zero are NaN or infinite; signed_power is rounded off and has finite ones."""
     e = ca.SX.sym("e")

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import fpirhc as fp
 from fpirhc.contracts import Layout, Signal, scalar
-from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue, ProblemFileError
+from fpirhc.errors import InvalidProblem, InvalidValue, ProblemFileError
 
 
 def spring(time=1.0):
@@ -92,11 +92,6 @@ def test_a_raster_counts_passages_upwards(runs):
     above, figure = made_run(np.array([2.0, 0, 2, 2, 1, 3])), Figure()
     fp.Raster("r", signal="state.q", threshold=1.0).draw(figure, {"above": above})
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["above (2)"]
-
-
-def test_an_unknown_signal_is_named(runs):
-    with pytest.raises(InvalidName, match=r"'state\.p'.*state\.q"):
-        fp.Portrait("p", x="state.p", y="state.q").draw(Figure(), runs)
 
 
 FILE = line_text("period=5e-3, duration=0.1", more="pictures = (%s,)\n")
