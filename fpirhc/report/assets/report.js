@@ -89,7 +89,7 @@ function draw({ box, spec }) {
       label: s.name,
       stroke: colors[s.name] || RESPONSES[s.name] || ink,
       width: 1.2,
-      dash: { reference: [5, 4], "set-point": [1, 3] }[s.name],
+      dash: { reference: [5, 4], "set-point": [1, 3], deformed: [6, 3] }[s.name],
       // A map has no motion between two cycles: its signals hold from one to the next.
       ...(DATA.steps ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}),
       value: (_, v) => (v === null || v === undefined ? "" : v.toPrecision(4)),
