@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -18,13 +18,13 @@ import numpy as np
 
 from fpirhc.controllers.built import Built, build, checked
 from fpirhc.controllers.contract import Controller, resolved
-from fpirhc.errors import FpirhcError, InvalidField, InvalidName, InvalidValue, NotSupported, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.checked import expects_whole_number
-from fpirhc.fields.kinds import described, finite_number, named_entries, real_number
+from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
-from fpirhc.symbolic.open import ANEW, SETTINGS, Opened, not_live
+from fpirhc.symbolic.open import ANEW, Opened, not_live
 from fpirhc.symbolic.paths import Copy, changed_at, content_at, copied, entry, mapped, names_in, paths_to, validated
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -147,7 +147,15 @@ class LiveSettings:
         """Return numbers by path, with the ends of intervals one by one."""
         values: dict[str, float] = {}
         for path, value in numbers.items():
-            for name, part in self._parts(path, value):
+            names = [path] if path in self.paths else [f"{path}.0", f"{path}.1"]
+            if not {*names} & {*self.paths}:
+                raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
+            parts = list(value) if isinstance(value, list | tuple | np.ndarray) and len(names) > 1 else [value]
+            if len(parts) != len(names):
+                raise InvalidValue(
+                    f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}"
+                )
+            for name, part in zip(names, parts, strict=True):
                 number = real_number(part)
                 if number is None or math.isnan(number):
                     raise InvalidValue(f"setting '{name}': expected a number, got {described(part)}")
@@ -156,20 +164,6 @@ class LiveSettings:
                 elif number != self._content(name):
                     raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
         return values
-
-    def _parts(self, path: str, value: object) -> Iterator[tuple[str, object]]:
-        """A number, or the ends of an interval of which some are live."""
-        ends = f"{path}.0", f"{path}.1"
-        if path in self.paths:
-            yield path, value
-        elif not {*ends} & {*self.paths}:
-            raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
-        elif not isinstance(value, Sequence | np.ndarray) or isinstance(value, str) or len(value) != 2:
-            raise InvalidValue(
-                f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}"
-            )
-        else:
-            yield from zip(ends, value, strict=True)
 
     def _with(self, contents: Mapping[str, object], copy: Copy) -> tuple[Problem, Controller]:
         """Problem and controller with other contents, by path."""
@@ -239,60 +233,3 @@ def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Con
     raise InvalidName(
         f"setting '{path}': neither the controller nor the problem's {', '.join(OF_PROBLEM)} have '{first}'.{hint}"
     )
-
-
-Changes = Mapping[float, Numbers]  # by time, s
-
-
-@dataclass(frozen=True, eq=False)
-class InForce:
-    """The settings of one run."""
-
-    problem: Problem  # the problem with the numbers at the start
-    controller: Controller  # the controller with them
-    numbers: Mapping[str, float]  # of all live settings at the start, by path
-    # (first cycle, places in the memory, values) of every change, in the order of time
-    patches: Sequence[tuple[int, np.ndarray, np.ndarray]]
-    # what was in force when, as plain data: pairs of a time in s and {path: number}
-    record: Sequence[tuple[float, Mapping[str, float]]]
-
-
-def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
-    """Return the settings of a run, checked before it starts."""
-    named_entries("settings", settings)
-    _check_times(changes)
-    if not (live.paths or settings or changes):
-        return InForce(problem, live.controller, {}, (), ())
-    first = replace(live, problem=problem)
-    if not settings and not changes:  # a variant of the problem runs as it does without live settings
-        numbers = first.start
-        return InForce(problem, live.controller, numbers, (), [(0.0, numbers)])
-    ready, controller, numbers = first.changed(settings)
-    record: list[tuple[float, Mapping[str, float]]] = [(0.0, numbers)] if numbers else []
-    patches, settings_now = [], dict(first.flat(settings))
-    for time in sorted(changes):
-        if not 0 <= time < problem.duration:
-            raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
-        settings_now |= first.flat(changes[time])
-        values = first.changed(settings_now)[2]
-        cycle = int(np.ceil(time / problem.period - 1e-9))
-        patches.append((cycle, *patch(loop, values)))
-        record.append((cycle * problem.period, values))
-    return InForce(ready, controller, numbers, patches, record)
-
-
-def _check_times(changes: Changes) -> None:
-    """Raise for anything but numbers by time."""
-    if not isinstance(changes, Mapping):
-        raise InvalidField([f"changes: expected a mapping {{time: {{name: number}}}}, got {described(changes)}"])
-    wrong = [f"changes: the time of a change is a number, got {described(t)}" for t in changes if not finite_number(t)]
-    if wrong:
-        raise InvalidField(wrong)
-    for time, numbers in changes.items():
-        named_entries(f"changes at {time:g}", numbers)
-
-
-def patch(loop: Composite, numbers: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return places in a loop's memory, and the values that the settings have there."""
-    places = np.arange(loop.memory.size)[loop.memory.slice(SETTINGS)]
-    return places, np.array(list(numbers.values()), dtype=float)

@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import innermost, name_in_task
-from fpirhc.controllers.live_settings import Changes, InForce, LiveSettings, Numbers, in_force, live_settings
+from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -28,7 +28,7 @@ from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.sensed import cycles_per_call
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
-from fpirhc.simulation.tables import run_tables
+from fpirhc.simulation.tables import Changes, InForce, in_force, run_tables
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.layout import Layout

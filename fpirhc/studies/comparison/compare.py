@@ -14,7 +14,6 @@ from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.live_settings import Changes
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
@@ -32,6 +31,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
+from fpirhc.simulation.tables import Changes
 from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
 from fpirhc.studies.comparison.verdict import NULL, Finding, Outcome, Yardstick, findings
 from fpirhc.studies.objective import objective
