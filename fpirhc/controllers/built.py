@@ -19,7 +19,7 @@ from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
 from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
-from fpirhc.controllers.seeing import check_believed, given_states, raw_signal, seeing_blocks
+from fpirhc.controllers.seeing import against_believed, check_observed, given_states, raw_signal, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import refuse
 from fpirhc.plant.motion import followed_units
@@ -173,8 +173,9 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
         ready.planner.check_weights(problem)
     else:
         ready.check(problem)
-    refuse(_against_form(problem, ready.deformation))
-    check_believed(problem, ready)
+    refuse([*_against_form(problem, ready.deformation), *against_believed(problem, ready)])
+    if problem.sensing.observer is not None:
+        check_observed(problem)
     if ready.deforms not in ("target", "turns") and _REFUSES.get():  # their own checks judge gains
         require_converging(problem, ready.deformation)
     return ready

@@ -74,9 +74,28 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     if plant.equations.known_on_reference:
         referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
         return referenced[list(plant.equations.known_by_outputs)]
-    states, _ = nominal_run(plant, problem.reference, *nominal_start(problem))
-    places = np.minimum(np.round(times / problem.period).astype(int), states.shape[1] - 1)
-    return states[:, places]
+    return nominal_run(plant, problem.reference, *nominal_start(problem))[0][:, _cycles_of_run(problem, count)]
+
+
+def _cycles_of_run(problem: Problem, count: int) -> np.ndarray:
+    """The cycles of a nominal run nearest to evenly spaced instants."""
+    last = nominal_run(problem.plant, problem.reference, *nominal_start(problem))[0].shape[1] - 1
+    return np.minimum(np.round(np.linspace(0.0, problem.duration, count) / problem.period).astype(int), last)
+
+
+def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np.ndarray:
+    """Return inputs beside these states, shape (nu, count): of the model with some parameters, by its inverse or its nominal run.
+
+    Those before the run stand for a model with more or fewer inputs than controlled coordinates.
+    """
+    plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
+    if not plant.equations.known_on_reference:
+        return nominal_run(plant, problem.reference, *nominal_start(problem))[1][:, _cycles_of_run(problem, count)]
+    if len(plant.controlled_names) != len(plant.inputs):
+        return np.repeat(problem.inputs_before[:, None], count, axis=1)
+    wanted = nominal_motion(problem).map(count)(times[None, :])[1]
+    repeated = np.repeat(parameters[:, None], count, axis=1)
+    return np.asarray(plant.equations.inverse.map(count)(reference_states(problem, count), wanted, repeated).full())
 
 
 _SAMPLES = 100  # instants at which the reference is looked at
@@ -200,12 +219,8 @@ def request_of_plans(problem: Problem) -> RequestChange:
 
 def request_of_commands(problem: Problem, parameters: np.ndarray) -> RequestChange:
     """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
-    plant, times = problem.plant, np.linspace(0.0, problem.duration, _INSTANTS)
-    wanted = nominal_motion(problem).map(_INSTANTS)(times[None, :])[1]
-    values = plant.equations.inverse.map(_INSTANTS)(
-        reference_states(problem, _INSTANTS), wanted, np.repeat(parameters[:, None], _INSTANTS, axis=1)
-    )
-    return RequestChange(problem.period * _steepest(np.asarray(values.full()), times), sudden=False)
+    values, times = reference_inputs(problem, _INSTANTS, parameters), np.linspace(0.0, problem.duration, _INSTANTS)
+    return RequestChange(problem.period * _steepest(values, times), sudden=False)
 
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:

@@ -14,9 +14,8 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.path import believe_block, stated_path
-from fpirhc.controllers.reference_states import nominal_motion
-from fpirhc.errors import NoAnswer, refuse
-from fpirhc.horizon.nominal import nominal_run, reference_state
+from fpirhc.controllers.reference_states import reference_inputs, reference_states
+from fpirhc.errors import NoAnswer
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.plant import Plant
@@ -26,7 +25,7 @@ from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.limits import Interval
-from fpirhc.task.problem import Problem, nominal_start
+from fpirhc.task.problem import Problem
 
 
 def given_states(problem: Problem) -> tuple[Signal, ...]:
@@ -121,21 +120,9 @@ _INSTANTS = 25
 _STAYS = 1e-9  # share of the fastest pole below which an error counts as staying
 
 
-def check_believed(problem: Problem, controller: Controller) -> None:
-    """Raise if a controller cannot be given believed states, or errors of them are neither observed nor decay.
-
-    Raises:
-        NotSupported: the controller adapts to what is believed, or has a model with other parameters.
-        NoAnswer: an error that no measurement corrects stays.
-    """
-    if problem.sensing.observer is None:
-        return
-    refuse(_against(problem, controller))
-    _check_observed(problem)
-
-
 @lru_cache(maxsize=8)  # several controllers are checked on one problem
-def _check_observed(problem: Problem) -> None:
+def check_observed(problem: Problem) -> None:
+    """Raise where an error of what an observer believes is neither observed nor decays: it stays."""
     plant, observer = problem.plant, problem.sensing.observer
     assert observer is not None
     names = observer.uses(problem.sensing.measures(plant))
@@ -155,9 +142,11 @@ def _check_observed(problem: Problem) -> None:
         )
 
 
-def _against(problem: Problem, controller: Controller) -> Iterator[str]:
-    """Reasons against observed states."""
+def against_believed(problem: Problem, controller: Controller) -> Iterator[str]:
+    """Reasons against believed states: the controller adapts to what is believed, or has a model with other parameters."""
     sensing, plant = problem.sensing, problem.plant
+    if sensing.observer is None:
+        return
     lost = sensing.believed_response(plant)
     if lost and controller.deformation.adapts:
         yield (
@@ -182,7 +171,8 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
     rate = plant.equations.rate(x, u, p)
     jacobians = ca.Function("fpirhc_observed", [x, u, p], [ca.jacobian(rate, x), ca.jacobian(shown, x)])
     states, slopes, seen = [], [], []
-    for state, needed in _points(problem):
+    along = reference_states(problem, _INSTANTS), reference_inputs(problem, _INSTANTS, plant.approximate)
+    for state, needed in zip(*(rows.T for rows in along), strict=True):
         slope, part = (np.asarray(m.full()) for m in jacobians(state, needed, plant.approximate))
         if np.isfinite(slope).all() and np.isfinite(part).all():
             states.append(state)
@@ -191,20 +181,3 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
     if not slopes:
         raise NoAnswer("observed states: the model has no finite Jacobian along the reference")
     return np.array(states), slopes, seen
-
-
-def _points(problem: Problem) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """States and inputs of the model along the reference, or of a simulation where it does not give the states."""
-    plant = problem.plant
-    if plant.equations.known_on_reference:
-        reference, needed = nominal_motion(problem), problem.inputs_before
-        for t in np.linspace(0.0, problem.duration, _INSTANTS):
-            outputs, response = reference(t)
-            state = reference_state(plant, outputs)
-            if len(plant.controlled_names) == len(plant.inputs):
-                needed = np.asarray(plant.equations.inverse(state, response, plant.approximate).full())
-            yield np.asarray(state.full()).ravel(), needed.ravel()
-        return
-    states, inputs = nominal_run(problem.plant, problem.reference, *nominal_start(problem))
-    for k in np.unique(np.linspace(0, states.shape[1] - 1, _INSTANTS).astype(int)):
-        yield states[:, k], inputs[:, k]
