@@ -19,7 +19,7 @@ from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
 from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
-from fpirhc.controllers.seeing import against_believed, check_observed, given_states, raw_signal, seeing_blocks
+from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import refuse
 from fpirhc.plant.motion import followed_units
@@ -56,8 +56,7 @@ class Built:
     error: Signal  # of the judged outputs
     judged: tuple[int, ...]  # their places among the outputs
     warm_up: float  # number of the first cycle whose response may be used
-    raw: Signal | None  # the raw measurements that a step begins with; None where state and response are both measured
-    states: tuple[Signal, ...]  # the state, where it is given beside raw measurements of outputs
+    sample: tuple[Signal, ...]  # what a step is given
     planned: Problem | None  # the problem as plans have it, with their cost, margins and limits
     every: int  # control cycles from plan to plan
     opened: bool  # whether some numbers are open
@@ -134,8 +133,7 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         error=vector("error", problem.judged_names, [units[name] for name in problem.judged_names]),
         judged=tuple(plant.output.elements.index(name) for name in problem.judged_names),
         warm_up=problem.warm_up_cycles,
-        raw=raw_signal(problem),
-        states=given_states(problem),
+        sample=problem.sample,
         planned=planned,
         every=cycles_per_plan(planned.horizon, problem.period) if planned and planned.horizon else 1,
         opened=opened,

@@ -33,12 +33,9 @@ def compose_with_sensing(built: Built) -> Composite:
 
 
 def _composed(built: Built) -> Composite:
-    if built.raw is None:
-        return compose_controller(built)
-    blocks, delays = _blocks_of(built)
-    seeing, seen = built.seeing
-    reads = _reads(built, *built.states, built.raw)
-    return _informed(built, reads, [*seeing, *_measuring(built, blocks), *blocks], [*delays, *seen])
+    (blocks, delays), (seeing, seen) = _blocks_of(built), built.seeing
+    own = [*seeing, *_measuring(built, blocks), *blocks]
+    return _informed(built, _reads(built, *built.sample), own, [*delays, *seen])
 
 
 def _reads(built: Built, *seen: Signal) -> Layout:

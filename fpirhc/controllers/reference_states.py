@@ -16,12 +16,12 @@ import numpy as np
 
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.nominal import filled, nominal_run
+from fpirhc.horizon.nominal import filled
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.task.problem import Problem, nominal_start
+from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, one_rate
 
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}  # a whole turn by unit
@@ -74,13 +74,14 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     if plant.equations.known_on_reference:
         referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
         return referenced[list(plant.equations.known_by_outputs)]
-    return nominal_run(plant, problem.reference, *nominal_start(problem))[0][:, _cycles_of_run(problem, count)]
+    return _of_nominal_run(problem, count)[0]
 
 
-def _cycles_of_run(problem: Problem, count: int) -> np.ndarray:
-    """The cycles of a nominal run nearest to evenly spaced instants."""
-    last = nominal_run(problem.plant, problem.reference, *nominal_start(problem))[0].shape[1] - 1
-    return np.minimum(np.round(np.linspace(0.0, problem.duration, count) / problem.period).astype(int), last)
+def _of_nominal_run(problem: Problem, count: int) -> tuple[np.ndarray, np.ndarray]:
+    states, inputs = problem.nominal_run
+    places = np.round(np.linspace(0.0, problem.duration, count) / problem.period).astype(int)
+    places = np.minimum(places, states.shape[1] - 1)
+    return states[:, places], inputs[:, places]
 
 
 def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np.ndarray:
@@ -90,7 +91,7 @@ def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np
     """
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
     if not plant.equations.known_on_reference:
-        return nominal_run(plant, problem.reference, *nominal_start(problem))[1][:, _cycles_of_run(problem, count)]
+        return _of_nominal_run(problem, count)[1]
     if len(plant.controlled_names) != len(plant.inputs):
         return np.repeat(problem.inputs_before[:, None], count, axis=1)
     wanted = nominal_motion(problem).map(count)(times[None, :])[1]

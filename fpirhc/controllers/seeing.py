@@ -16,10 +16,9 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.path import believe_block, stated_path
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
 from fpirhc.errors import NoAnswer
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.maps import growth_of, response_age
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import members, response_names, slowest, unobservable, values_of
+from fpirhc.sensing.base import members, slowest, unobservable, values_of
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, Value
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
@@ -28,31 +27,10 @@ from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 
-def given_states(problem: Problem) -> tuple[Signal, ...]:
-    """Return the signal of the state where it is given beside raw measurements: these are of outputs, and nothing is believed."""
-    estimated = problem.sensing.estimates and problem.sensing.observer is None
-    return measured_signals(problem.plant)[:-1] if estimated else ()
-
-
-def raw_signal(problem: Problem) -> Signal | None:
-    """Return the signal of the raw measurements that a step begins with; None where state and response are both measured."""
-    if not problem.sensing.estimates:
-        return None
-    late = problem.dead_time.measurement_wait(problem.period)
-    return problem.sensing.raw(problem.plant, problem.first_shown, late)
-
-
 def sensor_ranges(problem: Problem) -> dict[str, Interval]:
     """Return the stated ranges of the sensors by column of the sample: "state.q1", "realised.q1", "output.y", "measured.q1"."""
-    plant, raw = problem.plant, raw_signal(problem)
-    signals = measured_signals(plant) if raw is None else (*given_states(problem), raw)
-    columns = [
-        (column, name) for signal in signals for column, name in zip(signal.columns, signal.elements, strict=True)
-    ]
-    if raw is None:
-        columns += zip(plant.response_signal("realised").columns, response_names(plant), strict=True)
-    sensors = problem.sensing.sensors
-    stated = {column: sensors[name].range for column, name in columns if name in sensors}
+    columns, sensors = (column for signal in problem.sample for column in signal.columns), problem.sensing.sensors
+    stated = {c: sensors[name].range for c, name in zip(columns, problem.sampled, strict=True) if name in sensors}
     return {column: ends for column, ends in stated.items() if ends is not None}
 
 
@@ -62,8 +40,8 @@ def seeing_blocks(problem: Problem) -> tuple[list[Block], list[Delay]]:
     There are none where state and response are both measured. Of a plant with outputs these are estimated, and 'state' where it is
     believed.
     """
-    raw, plant, sensing = raw_signal(problem), problem.plant, problem.sensing
-    if raw is None:
+    plant, sensing, raw = problem.plant, problem.sensing, problem.sample[-1]
+    if not sensing.estimates:
         return [], []
     start, names = problem.first_output, sensing.estimator.measures(plant)
     if sensing.observer is not None:

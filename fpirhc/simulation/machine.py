@@ -19,11 +19,10 @@ from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.composed import compose_with_sensing
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
-from fpirhc.controllers.seeing import given_states, raw_signal, sensor_ranges
+from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
 from fpirhc.errors import require
-from fpirhc.plant.chain import measured_signals, response_names
 from fpirhc.plant.motion import SECONDS
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
@@ -211,15 +210,6 @@ def composed_step(
 
     composite = live.composed(compose) if live.paths else compose(build(live.problem, ready))
     return composite, gates[-1].named(composite.memory)
-
-
-def measures(problem: Problem) -> tuple[str, ...]:
-    """Return the names of what a step is given: the state and the responses, or what the sensors show."""
-    raw, plant = raw_signal(problem), problem.plant
-    if raw is not None:
-        return (*(e for signal in given_states(problem) for e in signal.elements), *raw.elements)
-    motions = (e for signal in measured_signals(plant) for e in signal.elements)
-    return (*motions, *response_names(plant))
 
 
 def refuse_unbounded(controller: Controller) -> None:

@@ -15,12 +15,10 @@ import numpy as np
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
 from fpirhc.controllers.reference_states import given_signals
-from fpirhc.controllers.seeing import given_states, raw_signal
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.checked import ByName
 from fpirhc.fields.kinds import described, named_entries, real_number
 from fpirhc.fields.user_code import called
-from fpirhc.plant.chain import measured_signals
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
@@ -162,12 +160,10 @@ class StepArguments:
             self.setpoints = self.evaluator.arguments[places[signal.name]]
             self.setpoints[:] = signal.start_vector()
         self.memory_next, self.trace, self.command_next = self.evaluator.results
-        raw = raw_signal(problem)
-        self.estimates = raw is not None
-        beside = given_states(problem) if self.estimates else measured_signals(problem.plant)[1:]
-        self.beside = sum(signal.size for signal in beside)
-        self.output = _view(arguments[beside[0].name] if beside else NOTHING)
-        sample = ("state", "realised") if raw is None else (raw.name,)
+        self.estimates, every = problem.sensing.estimates, [signal.name for signal in problem.sample]
+        beside, sample = (every[:-1], every[-1:]) if self.estimates else (every[1:-1], [every[0], every[-1]])
+        self.output = _view(arguments[beside[0]] if beside else NOTHING)
+        self.beside = len(self.output)
         self.memory, self.time, self.state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
         self.realised = rest[0] if rest else _view(NOTHING)
         self.memory_before = arguments["memory"]

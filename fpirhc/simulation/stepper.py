@@ -20,7 +20,7 @@ from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import ByName, Checked, missing
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.clock import Clock, Deadline, missed_cycles
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, measures, refuse_unbounded
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, refuse_unbounded
 from fpirhc.simulation.replay import Bound, Replay
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
@@ -182,7 +182,7 @@ class Stepper(NumbersNow, Checked):
         backend = native(self.function, required=bool(step.settings.paths)) if compiled else None
         self.compiled = bool(backend and backend.compiled)
         self.signals: Layout = composite.trace
-        self.measures = measures(problem)  # names of the raw measurements
+        self.measures = problem.sampled  # names of the raw measurements
         self.why_failed = ""
         self._title = f"{problem.name or 'problem'}, {name_in_task(controller)}"
         self._may_fail = composite.opaque  # scalar code cannot fail

@@ -18,8 +18,8 @@ from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.nominal import Bounds, nominal_run, singular_gain
-from fpirhc.plant.chain import differentiated_signals
+from fpirhc.horizon.nominal import nominal_run, singular_gain
+from fpirhc.plant.chain import differentiated_signals, measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
@@ -28,6 +28,7 @@ from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import behind_equals, line, number, table
 from fpirhc.symbolic.evaluate import Latest
+from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
@@ -401,6 +402,29 @@ class Problem(Checked):
         return np.array([self.first_shown[e] for e in self.plant.output.elements])
 
     @property
+    def sample(self) -> tuple[Signal, ...]:
+        """What a controller's step is given: the state, outputs and the response, or raw measurements, and beside them states."""
+        plant, sensing, shown = self.plant, self.sensing, measured_signals(self.plant)
+        if not sensing.estimates:
+            return (*shown, plant.response_signal("realised"))
+        late = self.dead_time.measurement_wait(self.period)
+        return (*(shown[:-1] if sensing.observer is None else ()), sensing.raw(plant, self.first_shown, late))
+
+    @property
+    def sampled(self) -> tuple[str, ...]:
+        """Names of the quantities of a sample, entry by entry."""
+        *first, last = self.sample
+        names = last.elements if self.sensing.estimates else response_names(self.plant)
+        return (*(e for signal in first for e in signal.elements), *names)
+
+    @cached_property
+    def nominal_run(self) -> tuple[np.ndarray, np.ndarray]:
+        """States (nx, m) and inputs (nu, m) of the model that follows the reference of its outputs, by cycles."""
+        lower, upper = self.limits.input_bounds(self.plant)
+        bounds, start = (tuple(map(float, lower)), tuple(map(float, upper))), tuple(map(float, self.start_state))
+        return nominal_run(self.plant, self.reference, self.integrator, start, bounds, (self.period, self.cycles))
+
+    @property
     def response_delay(self) -> float:
         """Cycles from a request to its estimated response, beyond the one cycle of every loop: `Paired(map, cycles=...)`.
 
@@ -495,17 +519,9 @@ def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
             "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
         )
     if len(plant.inputs) == len(plant.controlled or plant.chains):
-        states, inputs = nominal_run(plant, problem.reference, *nominal_start(problem))
-        singular = singular_gain(plant, states, inputs, problem.period)
+        singular = singular_gain(plant, *problem.nominal_run, problem.period)
         if singular:
             mistakes.add(f"outputs: {singular}")
-
-
-def nominal_start(problem: Problem) -> tuple[Integrator, tuple[float, ...], Bounds, tuple[float, int]]:
-    """Return integrator, start, bounds of the inputs, and times of the model's nominal run, as `nominal_run` takes them."""
-    lower, upper = problem.limits.input_bounds(problem.plant)
-    bounds = tuple(map(float, lower)), tuple(map(float, upper))
-    return problem.integrator, tuple(map(float, problem.start_state)), bounds, (problem.period, problem.cycles)
 
 
 _GAINS: Latest[ca.Function] = Latest(4)
