@@ -293,8 +293,8 @@ def study(
     """Run controllers in many variants of a problem. Variants are named cases, drawn plants, or swept settings; or one quantity
     grows until each controller fails (--limits).
 
-    The first controller is the one that the others are compared with. study.csv has every run and its parameters; the same
-    command goes on after an interruption.
+    The others are compared with the first controller, or with the headline's. study.csv has every run and its parameters; the
+    same command goes on after an interruption.
     """
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")

@@ -104,7 +104,7 @@ def study(
     Args:
         task: a problem with its controllers.
         variants: `CasesOf`, `Draws` or `Grid`.
-        controllers: names, the first of which the others are compared with; None: all.
+        controllers: names, the first of which the others are compared with; None: all, the headline's first.
         headline: the number that is judged; None: the problem's, or the relative error.
         processes: number of processes, see `run_variants`.
         compiled: whether loops run as compiled C.
@@ -112,7 +112,8 @@ def study(
         command: that reproduces it.
         progress: called with (controller, done, in all).
     """
-    begin, chosen = time.perf_counter(), select(task, controllers)
+    first = [] if controllers else [*(task.headline or ())]
+    begin, chosen = time.perf_counter(), select(task, controllers or [*dict.fromkeys([*first, *task.controllers])])
     check_gains(task, chosen)
     aim = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
     how: dict[str, Any] = {"processes": processes, "compiled": compiled, "judged": aim.judged, "progress": progress}

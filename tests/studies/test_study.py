@@ -271,8 +271,11 @@ def test_a_summary_is_that_of_the_rows(task):
     assert (str(outcome) == "better") == (found.summary.high["CTC+FPI"] < 0)
     told = f"Total variation of u {moves['CTC+FPI']:.3g} against {moves['CTC']:.3g} N/s."
     assert text.endswith(f"smaller in {(apart < 0).sum()} of 12. {told}")
-    few = fp.study(task, fp.Draws(4, 20.0, 5), compiled=False, controllers=["CTC+FPI", "CTC"])
+    turned = ["CTC+FPI", "CTC"]
+    few = fp.study(task, fp.Draws(4, 20.0, 5), compiled=False, controllers=turned)
     assert few.view.sentences[0] == ("CTC against CTC+FPI by error: smaller in 0 of 4.", None)  # it moves less
+    headed = fp.study(replace(task, headline=("CTC+FPI", "CTC")), fp.Draws(1), compiled=False)
+    assert [*headed.summary.index][:2] == turned
 
 
 def test_failures_are_counted_and_worse_than_any_error(task):
