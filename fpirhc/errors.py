@@ -56,9 +56,7 @@ class InvalidField(InvalidValue, InvalidProblem, TypeError):
     @property
     def text(self) -> str:
         """The mistakes without their place."""
-        if len(self.mistakes) == 1:
-            return self.mistakes[0]
-        return "\n".join(f"  {k}. {m}" for k, m in enumerate(self.mistakes, 1))
+        return _numbered(self.mistakes)
 
     def __str__(self) -> str:
         if not self.place:
@@ -197,7 +195,8 @@ def listed(names: Sequence[str]) -> str:
 
 def _near(name: str, names: Sequence[str]) -> list[str]:
     """Valid names that may be meant, the likeliest first."""
-    elsewhere = [one for one in OF_OTHER_TOOLS.get(name, ()) if one in names]
+    ours = (line.split() for line in _OF_OTHER_TOOLS.strip().splitlines())
+    elsewhere = [own[:-1] for own, *theirs in ours if name in theirs and own[:-1] in names]
     for primes in _DERIVATIVES:
         if (of := derivative_of(name, primes)) is not None:
             meant = [(of or one.rstrip("'")) + primes for one in names]
@@ -220,48 +219,41 @@ _DERIVATIVES = {  # how others write them
 }
 _LETTER = 1  # character, which is a part of too many names to mean one
 
-OF_OTHER_TOOLS = {
-    **dict.fromkeys(("MPC", "NMPC", "OptimalControlProblem", "AcadosOcp"), ("RecedingHorizon",)),
-    **dict.fromkeys(("Model", "System", "nlsys"), ("Plant",)),
-    **dict.fromkeys(("dt", "Ts", "ts", "sample_time"), ("period", "step")),
-    **dict.fromkeys(("T", "tf", "t_end", "t_final", "sim_time"), ("duration",)),
-    **dict.fromkeys(("N", "n_horizon", "N_horizon", "prediction_horizon"), ("stages",)),
-    **dict.fromkeys(("max_iter", "maxiter", "max_iterations", "nlp_solver_max_iter"), ("iterations",)),
-    **dict.fromkeys(("lbu", "ubu", "u_min", "u_max", "umin", "umax", "bounds"), ("inputs",)),
-    **dict.fromkeys(("lbx", "ubx", "x_min", "x_max"), ("states",)),
-    **dict.fromkeys(("ref", "x_ref", "y_ref", "yref", "setpoint", "trajectory"), ("reference",)),
-    **dict.fromkeys(("objective", "lterm", "stage_cost"), ("cost",)),
-    **dict.fromkeys(("rhs", "f_expl_expr", "updfcn", "dynamics"), ("response", "rates")),
-    **dict.fromkeys(("p", "params", "parameter_values"), ("parameters",)),
-    **dict.fromkeys(("Kp", "kp"), ("proportional",)),
-    **dict.fromkeys(("Ki", "ki"), ("integral",)),
-    **dict.fromkeys(("Kd", "kd"), ("derivative",)),
-    **dict.fromkeys(("P", "Qf", "mterm"), ("terminal",)),
-    **dict.fromkeys(("delay", "input_delay"), ("dead_time",)),
-    "t_step": ("step",),
-    "x0": ("start",),
-    "Q": ("states",),
-    "R": ("effort",),
-    "rterm": ("rate",),
-    "nominal": ("approximate",),
-}
-"""What do-mpc, acados, python-control and Simulink call a thing, and our names for it."""
+_OF_OTHER_TOOLS = """
+RecedingHorizon: MPC NMPC OptimalControlProblem AcadosOcp
+Plant: Model System nlsys
+period: dt Ts ts sample_time
+step: dt Ts ts sample_time t_step
+duration: T tf t_end t_final sim_time
+stages: N n_horizon N_horizon prediction_horizon
+iterations: max_iter maxiter max_iterations nlp_solver_max_iter
+inputs: lbu ubu u_min u_max umin umax bounds
+states: lbx ubx x_min x_max Q
+reference: ref x_ref y_ref yref setpoint trajectory
+cost: objective lterm stage_cost
+response: rhs f_expl_expr updfcn dynamics
+rates: rhs f_expl_expr updfcn dynamics
+parameters: p params parameter_values
+proportional: Kp kp
+integral: Ki ki
+derivative: Kd kd
+terminal: P Qf mterm
+dead_time: delay input_delay
+start: x0
+effort: R
+rate: rterm
+approximate: nominal
+"""  # our name, and what do-mpc, acados, python-control and Simulink call the same
 
 
-class Mistakes:
+class Mistakes(list[str]):
     """Collects the mistakes of one value and raises them together."""
 
     def __init__(self, where: str) -> None:
+        super().__init__()
         self._where = where
-        self._mistakes: list[str] = []
 
-    def add(self, mistake: str) -> None:
-        """Add one mistake."""
-        self._mistakes.append(mistake)
-
-    def join(self, others: Mistakes) -> None:
-        """Add all mistakes that were found elsewhere."""
-        self._mistakes += others._mistakes
+    add, join = list.append, list.extend
 
     @contextmanager
     def caught(self, where: str = "") -> Iterator[None]:
@@ -274,7 +266,7 @@ class Mistakes:
     @property
     def none(self) -> bool:
         """Whether there is no mistake so far."""
-        return not self._mistakes
+        return not self
 
     def unknown(self, what: str, names: Iterable[str], valid: Iterable[str]) -> None:
         """Add a mistake, with the nearest valid name, for each of `names` that is not in `valid`."""
@@ -284,14 +276,13 @@ class Mistakes:
                 self.add(f"{what} '{name}' is unknown.{nearest(str(name), allowed)}")
 
     def raise_if_any(self) -> None:
-        """Raise InvalidProblem with all mistakes, if there is one.
-
-        Raises:
-            InvalidProblem: with a list of all mistakes.
-        """
+        """Raise InvalidProblem with all mistakes, if there is one."""
         where = f"{self._where}: " if self._where else ""
-        if len(self._mistakes) == 1:
-            raise InvalidProblem(f"{where}{self._mistakes[0]}")
-        if self._mistakes:
-            lines = "\n".join(f"  {k}. {m}" for k, m in enumerate(self._mistakes, 1))
-            raise InvalidProblem(f"{where}{len(self._mistakes)} mistakes\n{lines}")
+        if self:
+            lead = f"{len(self)} mistakes\n" if len(self) > 1 else ""
+            raise InvalidProblem(f"{where}{lead}{_numbered(self)}")
+
+
+def _numbered(mistakes: Sequence[str]) -> str:
+    """One mistake as it is, several as a list."""
+    return mistakes[0] if len(mistakes) == 1 else "\n".join(f"  {k}. {m}" for k, m in enumerate(mistakes, 1))

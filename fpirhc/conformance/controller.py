@@ -52,16 +52,10 @@ def check_controller(
     """Check every law on a controller.
 
     Args:
-        controller: the controller.
-        seed: of the noise and of all draws.
         problem: the problem that it controls; None: two masses between springs, with limits, a horizon and a cost, for 2 s.
         left: share of the largest first error that may be left in the last quarter of a run with the exact model.
         compiled: whether to compare with compiled C too, which costs a second or more the first time; skipped without a
             compiler.
-
-    Raises:
-        AssertionError: the first law that does not hold, in one sentence.
-        FpirhcError: the controller cannot serve the problem.
     """
     keep(controller, Trial(controller, problem or two_masses(), seed, left, compiled), LAWS, seed)
 
@@ -160,7 +154,7 @@ def learning_remembers(trial: Trial, draw: Draw) -> Broken:
         return
     replay = trial.with_deformation(Identity()) if trial.controller.deformation.adapts else None
     replay = replay or trial.replay
-    early, late = (replay.cycle(trial.begun, replay.cycles[k].memory)["command"] for k in (trial.begun, -1))
+    early, late = (replay.cycle(trial.begun, replay.cycles[k]["memory"])["command"] for k in (trial.begun, -1))
     if np.array_equal(early, late):
         yield (
             f"learns is true, but after {len(replay.cycles)} cycles with a wrong model its command for the measurement of cycle "
@@ -183,7 +177,7 @@ def law_is_what_it_does(trial: Trial, draw: Draw) -> Broken:
     law, output, replay, k = tracking_law(trial.ready), trial.problem.plant.output, trial.replay, trial.begun
     if law is None or trial.ready.planner is not None or trial.ready.inner is not None:
         return
-    memory = replay.cycles[k - 1].memory
+    memory = replay.cycles[k - 1]["memory"]
     on = replay.cycle(k, memory)["reference"]
     at = replay.cycle(k, memory, **{output.name: on})["desired"]
     for row, (name, order) in enumerate(trial.problem.plant.response_orders.items()):
@@ -320,7 +314,7 @@ def _measured_once(trial: Trial, bad: float, entry: int | None, what: str) -> Br
             matters = not np.array_equal(moved["command"], run["command"][cycle])
             state[entry] = bad
         said = trial.replay.cycle(cycle, memory, state=state, realised=realised)
-        memory, command, status = said.memory, said["command"], float(said["status"][0])
+        memory, command, status = said["memory"], said["command"], float(said["status"][0])
         if not (np.isfinite(command).all() and (command >= lower).all() and (command <= upper).all()):
             yield f"{what}: the command of cycle {cycle} is {command}"
         if matters and status == Status.OK:

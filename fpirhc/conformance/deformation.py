@@ -40,11 +40,6 @@ def check_deformation(deformation: Deformation, *, elements: Sequence[str] = ("q
 
     Args:
         deformation: the deformation; scales that it leaves open are those for changes of 1, the size of typical responses.
-        elements: names of the coordinates.
-        seed: of all draws.
-
-    Raises:
-        AssertionError: the first law that does not hold, in one sentence.
     """
     settled = scaled_for(deformation, RequestChange(1.0, sudden=True))
     laws = [law for law in LAWS if law not in OF_ONE_PAIR or not deformation.form.pairs]
@@ -92,19 +87,6 @@ class _Map:
             request, memory = (v.full() for v in self.function(request, error, 0.0, memory))
             requests.append(request)
         return np.array(requests)
-
-
-def remembers_as_laid_out(trial: _Map, draw: Draw) -> Broken:
-    """A step gives a request for every element, remembers what `memory` lays out, and `shown` logs scalars of it."""
-    layout, column = trial.layout, ca.SX.sym("column", trial.size)
-    deformed, after = trial.map.step(column, column, column, layout.split(ca.SX.sym("memory", layout.size)))
-    if sorted(after) != sorted(layout.names):
-        yield f"step remembers {sorted(after)} but memory() lays out {sorted(layout.names)}"
-    if ca.SX(deformed).shape != (trial.size, 1):
-        yield f"step gives a request of shape {ca.SX(deformed).shape}, expected ({trial.size}, 1)"
-    for name, source in trial.map.shown().items():
-        if source not in layout or layout[source].size != 1:
-            yield f"it shows '{source}' as '{name}', which is no scalar of its memory {list(layout.names)}"
 
 
 def derivatives_are_finite(trial: _Map, draw: Draw) -> Broken:
@@ -184,11 +166,14 @@ def nan_shows(trial: _Map, draw: Draw) -> Broken:
             yield "a response of NaN is hidden: the request is finite, and not the desired response"
 
 
-def inner_can_be_exchanged(trial: _Map, draw: Draw) -> Broken:
-    """The inner map can be replaced: around its own inner map a wrapper stays the same."""
+def facts_hold(trial: _Map, draw: Draw) -> Broken:
+    """Around its own inner map a wrapper stays the same, and what `shown` logs are scalars of the memory."""
     same = with_inner(trial.map, trial.map.inner) if trial.map.inner is not None else trial.map
     if describe(same) != describe(trial.map):
         yield f"around its own inner map it is {same}"
+    for name, source in trial.map.shown().items():
+        if source not in trial.layout or trial.layout[source].size != 1:
+            yield f"it shows '{source}' as '{name}', which is no scalar of its memory {list(trial.layout.names)}"
 
 
 def automatic_settings_are_chosen(trial: _Map, draw: Draw) -> Broken:
@@ -252,11 +237,10 @@ def compares_as_it_says(trial: _Map, draw: Draw) -> Broken:
 OF_ONE_PAIR = (step_is_bounded, only_desired_is_fixed, nan_shows)
 LAWS = (
     frozen_value,
-    remembers_as_laid_out,
     derivatives_are_finite,
     gain_can_be_set,
     *OF_ONE_PAIR,
-    inner_can_be_exchanged,
+    facts_hold,
     automatic_settings_are_chosen,
     adaptation_is_told,
     gain_and_pairs_are_told,

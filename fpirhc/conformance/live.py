@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -18,58 +18,44 @@ _FACTORS = (1.07, 0.93, 1.01, 0.5, 2.0)  # the first one that the setting accept
 _SHARE, _CLOSE = 0.5, 1e-6
 
 
-@dataclass(frozen=True)
-class Tried:
-    """What became of one number that was asked to be live.
-
-    Args:
-        path: of the number.
-        refused: why it cannot be live; empty where it can.
-        factor: by which the number was changed; None where no change of it is accepted.
-    """
-
-    path: str
-    refused: str = ""
-    factor: float | None = None
+Became: TypeAlias = dict[str, float | str | None]
 
 
 def check_live(
     problem: Problem, controller: Controller, *, paths: Sequence[str] | None = None, cycles: int = 40
-) -> tuple[Tried, ...]:
-    """Try each number of a controller, and of the problem's cost and limits, as a live setting; return which are supported.
+) -> Became:
+    """Try each number of a controller, and of the problem's cost and limits, as a live setting; return what became of it, by path.
 
     Every number either is refused by name, or a loop with another number in it runs as the loop that is built with that number,
     bit by bit, and the number of the build as the loop without live settings. Plans keep the step length and the first plan of
     the build: behind them the command is nearer to that of the loop built with the number than to that of the first one, which
-    holds for plans that are solved.
+    holds for plans that are solved. What became of it: why it is refused, the factor by which it was changed, or None: no change
+    is accepted.
 
     Args:
         problem: on which the loops are tried.
         controller: whose numbers are asked.
         paths: of the numbers; None: all of them.
         cycles: length of the runs.
-
-    Raises:
-        AssertionError: the first number that is lost, in one sentence.
     """
     short = replace(problem, duration=cycles * problem.period, measure_from=0.0)
     asked = list(_own_paths(problem, controller)) if paths is None else list(paths)
-    opened, refused, ready = list(asked), dict[str, str](), None
+    opened, became, ready = list(asked), Became(), None
     while opened and ready is None:
         try:
             ready = simulator(short, controller, compiled=False, live=opened)
         except FpirhcError as error:
             named = [path for path in opened if f"'{path}'" in str(error)]
             _hold(bool(named), f"one of the settings {opened} is refused without its name: {error}")
-            refused |= dict.fromkeys(named, str(error))
+            became |= dict.fromkeys(named, str(error))
             opened = [path for path in opened if path not in named]
-    if ready is None:
-        return tuple(Tried(path, refused[path]) for path in asked)
-    plain = simulator(short, controller, compiled=False).run(seed=0)
-    same = np.array_equal(ready.run(seed=0).log, plain.log, equal_nan=True)
-    _hold(same, f"with live settings {opened} the loop runs differently although their numbers are the same")
-    kept = {path: next((f for f in _FACTORS if _runs_as_rebuilt(ready, path, f)), None) for path in opened}
-    return tuple(Tried(path, refused.get(path, ""), kept.get(path)) for path in asked)
+    if ready is not None:
+        plain = simulator(short, controller, compiled=False).run(seed=0)
+        same = np.array_equal(ready.run(seed=0).log, plain.log, equal_nan=True)
+        _hold(same, f"with live settings {opened} the loop runs differently although their numbers are the same")
+        for path in opened:
+            became[path] = next((factor for factor in _FACTORS if _runs_as_rebuilt(ready, path, factor)), None)
+    return became
 
 
 def _own_paths(problem: Problem, controller: Controller) -> Iterator[str]:

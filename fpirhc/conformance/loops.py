@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -25,6 +24,8 @@ from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 
 Array = npt.NDArray[Any]
+
+Cycle: TypeAlias = dict[str, Array]  # what a controller says in one cycle, and its `memory` before the next one
 
 REPLAYED = 400  # cycles of a run, at most, that are given to a controller again
 _INPUTS = {"Fa": "N", "Fb": "N"}
@@ -100,17 +101,6 @@ def coarse_steps() -> Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class Cycle:
-    """What a controller says in one cycle: its signals by name, and the memory before the next one."""
-
-    signals: dict[str, Array]
-    memory: Array
-
-    def __getitem__(self, name: str) -> Array:
-        return self.signals[name]
-
-
-@dataclass(frozen=True, eq=False)
 class Replay:
     """A controller, without a gate before it, that is given the motion of a recorded run."""
 
@@ -121,14 +111,11 @@ class Replay:
     @cached_property
     def cycles(self) -> list[Cycle]:
         """The first cycles of the run, each from the memory of the one before."""
-        return list(self._cycles())
-
-    def _cycles(self) -> Iterator[Cycle]:
-        memory = self.memory
+        cycles, memory = [], self.memory
         for k in range(min(self.run.cycles, REPLAYED)):
-            cycle = self.cycle(k, memory)
-            memory = cycle.memory
-            yield cycle
+            cycles.append(self.cycle(k, memory))
+            memory = cycles[-1]["memory"]
+        return cycles
 
     @property
     def memory(self) -> Array:
@@ -147,7 +134,7 @@ class Replay:
         read = [seen[n] if n in seen else self.run[n][k] for n in self._composite.reads.names]
         after, trace, _ = self._evaluator(memory, *read)
         said = self._composite.trace
-        return Cycle({name: trace[said.slice(name)].copy() for name in said.names}, after.copy())
+        return {"memory": after.copy()} | {name: trace[said.slice(name)].copy() for name in said.names}
 
     @cached_property
     def _composite(self) -> Composite:

@@ -33,14 +33,8 @@ def check_observer(observer: StateObserver, *, seed: int, problem: Problem | Non
     """Check every law on an observer.
 
     Args:
-        observer: the observer.
-        seed: of all draws.
         problem: whose states are believed, with `Sensing(measured=...)`; its response must be linear in states and inputs.
             None: two masses whose positions a and b are measured.
-
-    Raises:
-        AssertionError: the first law that does not hold, in one sentence.
-        FpirhcError: the observer cannot serve the problem.
     """
     task, sensing = problem or two_masses(), Sensing({}, Measured(), measured=["a", "b"])
     sensing = sensing if problem is None else problem.sensing

@@ -78,13 +78,7 @@ def check_optimiser(
     """Check every law on an optimiser.
 
     Args:
-        optimiser: the optimiser.
         tolerance: stationarity, in the unit of the inputs, below which it calls a plan OK.
-        seed: of first states and plans.
-
-    Raises:
-        AssertionError: the first law that does not hold, in one sentence.
-        InvalidValue: a tolerance that is not positive, or above 1e-3, which is too coarse to recognise a solution.
     """
     keep(optimiser, Trial(optimiser, tolerance), LAWS, seed)
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, wraps
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
+from typing import Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 
 import casadi as ca
 
@@ -40,11 +40,6 @@ class _CheckedWhenCalled(ABCMeta):
         """The arguments that a value is made with, for notebooks and editors."""
         return inspect.Signature(_parameters(cls))
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(cls, name: str) -> object:
-            raise missing(cls, name)
-
 
 class Checked(metaclass=_CheckedWhenCalled):
     """A value whose arguments are checked when it is made; dictionaries in its fields are found by name.
@@ -57,11 +52,6 @@ class Checked(metaclass=_CheckedWhenCalled):
     def _lacks(self) -> Iterator[str]:
         """Yield what the contract of the class asks for and this value does not have, beside abstract methods."""
         yield from ()
-
-
-def missing(owner: type, name: str) -> AttributeError:
-    """The error of an attribute that is not there, with its owner."""
-    return AttributeError(f"{owner.__name__} has no attribute '{name}'", name=name)
 
 
 def expects_whole_number(owner: type, name: str) -> bool:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import Mistakes, NotInvertible
-from fpirhc.fields.checked import Checked, missing
+from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.plant.equations import Equations
 from fpirhc.plant.maps import Differences
@@ -196,11 +196,6 @@ class Plant(Checked):
         if self.controlled is not None:
             notes.append(f"Controlled: {', '.join(self.controlled)}.")
         return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> object:
-            raise missing(type(self), name)
 
     @property
     def next(self) -> Callable[..., Mapping[str, Expression]] | None:

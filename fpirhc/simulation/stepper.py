@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isnan
 from time import perf_counter
-from typing import TYPE_CHECKING, NoReturn, Self
+from typing import NoReturn, Self
 
 import casadi as ca
 import numpy as np
@@ -17,7 +17,7 @@ from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.errors import ConcurrentUse
-from fpirhc.fields.checked import ByName, Checked, missing
+from fpirhc.fields.checked import ByName, Checked
 from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.simulation.clock import Clock, Deadline, missed_cycles
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, refuse_unbounded
@@ -207,11 +207,6 @@ class Stepper(NumbersNow, Checked):
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._counted = self.signals.slice(SKIPPED).start
         self._late, self.replay, self._missing = 1.5 * self._period, step.replay, step.replay.missing
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> object:
-            raise missing(type(self), name)
 
     @property
     def parameters(self) -> Layout:

@@ -207,32 +207,14 @@ def test_plant_laws(name):
     check_plant(problem.plant, seed=1, box=box)
 
 
-def oscillator(response=None, inverse=None, cls=fp.Plant) -> fp.Plant:
-    return cls(
+def oscillator(response=None, inverse=None) -> fp.Plant:
+    return fp.Plant(
         coordinates={"y": "m"},
         inputs={"u": "N"},
         parameters={"m": fp.Parameter(1.5, 1.0, "kg"), "k": fp.Parameter(2.0, 3.0, "N/m")},
         response=response or (lambda q, v, u, p: {"y": (u.u - p.k * q.y) / p.m}),
         inverse=inverse,
     )
-
-
-class HastyEquations(type(oscillator().equations)):  # type: ignore[misc]
-    """Those of a motion that is twice as fast as its velocity says."""
-
-    @property
-    def forced_rate(self):
-        inner = super().forced_rate
-        symbols = inner.sx_in()
-        return ca.Function("hasty", symbols, [inner(*symbols) * ca.DM([2, 1])])
-
-
-class Hasty(fp.Plant):
-    """A plant that moves twice as fast as its velocity says."""
-
-    @property
-    def equations(self):
-        return HastyEquations(self)
 
 
 def kinked(q, v, u, p):
@@ -248,7 +230,6 @@ PLANTS = (
         "response is pure",
         "built twice",
     ),
-    (oscillator(cls=Hasty), "derivative is the chain", "dy/dt is"),
     (oscillator(kinked), "slopes are true", "derivative of the response by 'y'"),
     (oscillator(inverse=lambda q, v, r, p: {"u": p.m * r.y - p.k * q.y}), "inverse inverts", "whose response is"),
 )

@@ -30,10 +30,10 @@ WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0},
 
 def check(controller: Controller, problem: fp.Problem, least: int = 1) -> None:
     """All numbers: what is refused decides what the loop is made of or is computed from, and at least so many can be live."""
-    tried = check_live(problem, controller, cycles=12)
-    reasons = (*STRUCTURE, *COMPUTED)
-    assert [t for t in tried if t.refused and not any(words in t.refused for words in reasons)] == []
-    assert sum(t.factor is not None for t in tried) >= least, tried
+    became = check_live(problem, controller, cycles=12)
+    refused = [one for one in became.values() if isinstance(one, str)]
+    assert [one for one in refused if not any(words in one for words in (*STRUCTURE, *COMPUTED))] == []
+    assert sum(isinstance(one, float) for one in became.values()) >= least, became
 
 
 def thinned(values: Any) -> list[Any]:
@@ -80,7 +80,7 @@ def test_weights_and_limits_of_an_optimiser_are_live(name):
     """They are data of the call; scale, step length and a tolerance that follows from limits are those of the build."""
     controller = fp.RecedingHorizon(SOLVERS[name], cost=fp.Quadratic(**WEIGHTS))
     tried = check_live(two_masses(), controller, paths=["cost.states.a", "limits.inputs.Fa.1"], cycles=30)
-    assert all(t.factor for t in tried), tried
+    assert all(isinstance(one, float) for one in tried.values()), tried
 
 
 def test_what_python_computes_from_a_number_is_refused_by_path_and_place():
@@ -121,12 +121,14 @@ def test_the_switch_of_slots_may_be_live():
     task = fp.load_problem("mass_spring_slots")
     problem = replace(task.problem, measure_from=0.0)
     tried = check_live(problem, task.controllers["slots"], paths=["blend", "slots.q2.tracking.rate"], cycles=60)
-    assert all(t.factor for t in tried), tried
+    assert all(isinstance(one, float) for one in tried.values()), tried
 
 
 def test_the_poles_of_a_law_on_a_map_are_live():
     task = fp.load_problem("fishery")
-    assert check_live(task.problem, task.controllers["CTC"], paths=["tracking.poles"], cycles=12)[0].factor
+    assert check_live(task.problem, task.controllers["CTC"], paths=["tracking.poles"], cycles=12) == {
+        "tracking.poles": 1.07
+    }
 
 
 def test_a_symbol_turned_into_a_number_is_refused():
@@ -171,4 +173,4 @@ def test_every_setting_of_a_plant_with_newtons_inverse_is_live(plan):
     law, optimiser = fp.ComputedTorque(fp.Exponential(rate=6.0), SIGMOID), fp.FixedPoint(iterations=1, tolerance=1e-3)
     paths = ["deformation.gain", "cost.states.y" if plan else "tracking.rate", "limits.inputs.u.1"]
     tried = check_live(problem, fp.RecedingHorizon(optimiser, SIGMOID) if plan else law, paths=paths, cycles=20)
-    assert all(one.factor for one in tried), tried
+    assert all(isinstance(one, float) for one in tried.values()), tried

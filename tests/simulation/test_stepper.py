@@ -136,7 +136,7 @@ def test_live_settings_are_named_with_the_interval_that_a_device_may_accept():
     assert one.bounds()["deformation.gain"] == pytest.approx((-2 * 2 / 1.2, 0.0), abs=1e-5)
     assert small().settings.names == ()
     assert small().setpoints == small().numbers == {}
-    with pytest.raises(AttributeError, match="Stepper has no attribute 'mesures'"):
+    with pytest.raises(AttributeError, match="'Stepper' object has no attribute 'mesures'"):
         one.mesures  # type: ignore[attr-defined]  # noqa: B018
 
 

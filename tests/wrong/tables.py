@@ -73,12 +73,12 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
 MAP_MEMBERS = {
     "adapts": "adaptation is told",
     "effective_gain": "gain and pairs are told",
-    "inner": "inner can be exchanged",
+    "inner": "facts hold",
     "form": "compares as it says",
     "largest_step": "step is bounded",
-    "memory": "remembers as laid out",
+    "memory": "gain and pairs are told",
     "secant_gain": "step is bounded",
-    "shown": "remembers as laid out",
+    "shown": "facts hold",
     "step": "step is bounded",
     "with_effective_gain": "gain can be set",
 }
