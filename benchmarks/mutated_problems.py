@@ -45,7 +45,7 @@ problem = fp.Problem(
         paths={"sum": fp.PathConstraint(lambda view: view.state.y + view.state.z, upper=3.0, unit="m")},
         soft={"y": 10.0},
     ),
-    disturbances={"force": fp.Sine(amplitude=0.1, frequency=1.0), "y": fp.Formula(lambda t: ca.tanh(t))},
+    disturbances={"force": fp.Formula(lambda t: 0.1 * ca.sin(2 * np.pi * 1.0 * t)), "y": fp.Formula(lambda t: ca.tanh(t))},
     dead_time=fp.DeadTime(inputs={"force": 0.01}),
     sensing=fp.Sensing(sensors={"y": fp.Sensor(noise=fp.Noise(deviation=1e-4))}),
     horizon=fp.Horizon(stages=4, step=1e-2),

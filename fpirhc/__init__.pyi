@@ -108,9 +108,7 @@ from .task.disturbance import ColouredNoise as ColouredNoise
 from .task.disturbance import Formula as Formula
 from .task.disturbance import Noise as Noise
 from .task.disturbance import Pulse as Pulse
-from .task.disturbance import Sine as Sine
 from .task.disturbance import Step as Step
-from .task.exogenous import Believed as Believed
 from .task.exogenous import Known as Known
 from .task.exogenous import Samples as Samples
 from .task.exogenous import Unknown as Unknown
@@ -119,9 +117,8 @@ from .task.limits import Limits as Limits
 from .task.limits import PathConstraint as PathConstraint
 from .task.problem import Problem as Problem
 from .task.reality import Reality as Reality
-from .task.reference import Table as Table
+from .task.reference import Setpoint as Setpoint
 from .task.reference import Trajectory as Trajectory
-from .task.set_point import Setpoint as Setpoint
 from .tracking.fractional import Fractional as Fractional
 from .tracking.linear_law import Exponential as Exponential
 from .tracking.linear_law import ShiftPolynomial as ShiftPolynomial

@@ -41,7 +41,7 @@ def reference_block(built: Built) -> Block:
 
     reads = Layout((time_signal(plant), seen, *built.own))
     writes = Layout((like(seen, "reference"), plant.response_signal("_reference_response"), built.error))
-    return Block("reference", reads, writes, step, opaque=built.opaque)
+    return Block("reference", reads, writes, step)
 
 
 def closing_blocks(

@@ -18,7 +18,7 @@ import casadi as ca
 from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
-from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals, stages_of
+from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import refuse
@@ -52,7 +52,6 @@ class Built:
     motion: ca.Function  # (time, own signals) -> (outputs, response) of the reference
     later: ca.Function  # the same one cycle ahead
     aim: Block | None  # that writes the reference's own signals
-    opaque: bool  # whether its motion is a graph of calls
     error: Signal  # of the judged outputs
     judged: tuple[int, ...]  # their places among the outputs
     warm_up: float  # number of the first cycle whose response may be used
@@ -128,8 +127,7 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         given=given_signals(problem),
         motion=motion_of(problem),
         later=motion_of(problem, ahead=problem.period),
-        aim=problem.reference.block(plant, stages_of(problem), problem.period) if own else None,
-        opaque=problem.reference.opaque,
+        aim=problem.reference.block(plant, problem.period) if own else None,
         error=vector("error", problem.judged_names, [units[name] for name in problem.judged_names]),
         judged=tuple(plant.output.elements.index(name) for name in problem.judged_names),
         warm_up=problem.warm_up_cycles,

@@ -29,19 +29,14 @@ _NEAR = 0.05  # share of a turn that a jump of whole turns may be off, because t
 _OWN = 0.25  # share of a turn per cycle, up to which an angle moves by itself
 
 
-def stages_of(problem: Problem) -> int:
-    """Number of stages of the problem's horizon; 0 without one."""
-    return problem.horizon.stages if problem.horizon is not None else 0
-
-
 def given_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return what a controller reads from outside for the reference."""
-    return problem.reference.given(problem.plant, stages_of(problem))
+    return problem.reference.given(problem.plant)
 
 
 def own_signals(problem: Problem) -> tuple[Signal, ...]:
     """Return the reference's own signals, which its block writes."""
-    return problem.reference.own(problem.plant, stages_of(problem))
+    return problem.reference.own(problem.plant)
 
 
 def own_values(problem: Problem, s: Signals) -> list[Expression]:
@@ -51,7 +46,7 @@ def own_values(problem: Problem, s: Signals) -> list[Expression]:
 
 def motion_of(problem: Problem, ahead: float = 0.0) -> ca.Function:
     """Function (t, own signals) -> (state, response) of the reference, now or after some time."""
-    return problem.reference.motion_now(problem.plant, stages_of(problem), ahead)
+    return problem.reference.motion_now(problem.plant, ahead)
 
 
 def preview_of(problem: Problem) -> ca.Function | None:

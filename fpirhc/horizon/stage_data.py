@@ -64,7 +64,7 @@ def stage_data(
     `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
-    matrix = kind(reference.opaque or plant.equations.inverse_opaque or looked_up)
+    matrix = kind(plant.equations.inverse_opaque or looked_up)
     t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
     half = matrix.sym("half") if horizon.lengths else horizon.step / 2
     p = of_cycle if signals is None else signals(t + half, of_cycle)

@@ -145,7 +145,7 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
         along = function(s.time, *own_values(problem, s))[0]
         return {"true_error": along[places] - getattr(s, motion.name)[own]}
 
-    return Block("truth", reads, writes, step, opaque=problem.reference.opaque)
+    return Block("truth", reads, writes, step)
 
 
 def _seen_block(problem: Problem, shown: Shown) -> Block:

@@ -5,7 +5,7 @@ A view takes arrays of float64 of its own shape and nothing else; numpy's assign
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from math import isnan
 from typing import Protocol, cast
 
@@ -29,12 +29,11 @@ from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.checks import check_values
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
-from fpirhc.task.reference import Steps, pairs
-from fpirhc.task.set_point import in_force
+from fpirhc.task.reference import Steps, in_force, pairs
 
 # by coordinate: a number, pairs (time, set-point), function of the time
 Setpoints = Mapping[str, Steps | Callable[[float], float]]
-SetpointsNow = Mapping[str, float | Sequence[float]]  # by coordinate: a number, or one per node of the horizon
+SetpointsNow = Mapping[str, float]  # by coordinate
 _FUNCTION = "a function of time"
 
 
@@ -43,13 +42,10 @@ def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) 
     signals, steps = given_signals(problem), _steps(problem, setpoints)
     if not signals:
         return np.zeros((cycles, 0))
-    names = list(problem.plant.chains)
-    windows = signals[0].size // len(names)
-    nodes = problem.horizon.nodes[:windows] if problem.horizon is not None else 0.0
-    times = (np.arange(cycles) * problem.period)[:, None] + nodes
-    columns = [_values(problem, name, steps[name], times) for name in names]
-    check_values(problem.plant, problem.limits, {n: c.ravel().tolist() for n, c in zip(names, columns, strict=True)})
-    return np.stack(columns, axis=2).reshape(cycles, -1)
+    times = np.arange(cycles) * problem.period
+    columns = {name: _values(problem, name, steps[name], times) for name in problem.plant.chains}
+    check_values(problem.plant, problem.limits, {n: c.tolist() for n, c in columns.items()})
+    return np.stack([*columns.values()], axis=1)
 
 
 def set_point_record(problem: Problem, setpoints: Setpoints | None) -> dict[str, object]:
@@ -61,18 +57,14 @@ def set_point_record(problem: Problem, setpoints: Setpoints | None) -> dict[str,
 def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray) -> np.ndarray:
     """Return the row of one step: `before` with other set-points of some coordinates, shape (entries,)."""
     _check_names(problem, setpoints)
-    names = list(problem.plant.chains)
-    rows = before.reshape(-1, len(names)).copy()
+    row = dict(zip(problem.plant.chains, before.tolist(), strict=True))
     for name, value in setpoints.items():
-        numbers = _numbers(value)
-        if numbers is None:
+        number = real_number(value)
+        if number is None:
             raise InvalidValue(f"set-point of '{name}': expected a number, got {described(value)}")
-        if numbers.size not in (1, len(rows)):
-            wanted = "one number" if len(rows) == 1 else f"one number, or {len(rows)}: now and at every later node"
-            raise InvalidShape(f"set-point of '{name}': expected {wanted}, got {numbers.size}")
-        rows[:, names.index(name)] = numbers
-    check_values(problem.plant, problem.limits, {n: rows[:, names.index(n)].tolist() for n in setpoints})
-    return rows.ravel()
+        row[name] = number
+    check_values(problem.plant, problem.limits, {name: [row[name]] for name in setpoints})
+    return np.array([*row.values()])
 
 
 def _steps(problem: Problem, setpoints: Setpoints | None) -> Setpoints:
@@ -94,26 +86,16 @@ def _check_names(problem: Problem, setpoints: Mapping[str, object]) -> None:
 
 
 def _values(problem: Problem, name: str, steps: Steps | Callable[[float], float], times: np.ndarray) -> np.ndarray:
-    """Set-points of one coordinate at some times, of the same shape."""
+    """Set-points of one coordinate at some times."""
     if not callable(steps):
         return in_force(pairs(name, steps), times, problem.period)
     what = f"set-points of '{name}': the function of time"
-    results = [called(what, steps, float(t)) for t in times.ravel()]
+    results = [called(what, steps, float(t)) for t in times]
     values = [real_number(one) for one in results]
     if None in values:
         wrong = results[values.index(None)]
         raise InvalidValue(f"{what} does not return a number, but {described(wrong)}")
-    return np.array(values, dtype=float).reshape(times.shape)
-
-
-def _numbers(value: object) -> np.ndarray | None:
-    """One number, or several; None where something else is among them."""
-    one = real_number(value)
-    if one is not None:
-        return np.array([one])
-    several = isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | np.ma.MaskedArray)
-    numbers = [real_number(entry) for entry in cast(Sequence[object], value)] if several else [None]
-    return None if None in numbers else np.array(numbers, dtype=float)
+    return np.array(values, dtype=float)
 
 
 NOTHING = np.zeros(0)
@@ -264,7 +246,6 @@ class NumbersNow:
 
         Raises:
             InvalidName: a coordinate without set-point.
-            InvalidShape: neither one number nor one per node.
         """
         if not named_entries("setpoints", setpoints):
             return True
@@ -295,14 +276,10 @@ class NumbersNow:
         return ByName(self._numbers, "Stepper.numbers")
 
     @property
-    def setpoints(self) -> dict[str, float | list[float]]:
-        """The set-points in force, by coordinate or output; where they are announced, one per node of the horizon."""
-        names = self._live.problem.plant.chains
-        rows = self._arguments.setpoints.reshape(-1, len(names)).T
-        values = {
-            n: row.tolist() if row.size > 1 else float(row[0]) for n, row in zip(names, rows, strict=True) if row.size
-        }
-        return ByName(values, "Stepper.setpoints")
+    def setpoints(self) -> dict[str, float]:
+        """The set-points in force, by coordinate or output."""
+        values = zip(self._live.problem.plant.chains, self._arguments.setpoints.tolist(), strict=False)
+        return ByName(dict(values), "Stepper.setpoints")
 
     def _write(self, numbers: Mapping[str, float]) -> None:
         if numbers:

@@ -244,8 +244,7 @@ class Stepper(NumbersNow, Checked):
             taken: time stamp of the sample, in the plant's unit of time; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. They are checked in Python before the
                 step, which takes a tenth of a millisecond; see `change`.
-            setpoints: set-points from this step on, by coordinate or output: a number, or where they are announced one number per
-                node of the horizon; see `set_reference`.
+            setpoints: set-points from this step on, by coordinate or output; see `set_reference`.
 
         Raises:
             InvalidShape: a wrong number of entries, named.

@@ -85,29 +85,6 @@ class Pulse(Disturbance):
 
 
 @dataclass(frozen=True)
-class Sine(Disturbance):
-    """amplitude sin(2 pi frequency t + phase).
-
-    Args:
-        amplitude: in the unit of the disturbed signal.
-        frequency: Hz.
-        phase: rad.
-    """
-
-    amplitude: float
-    frequency: float
-    phase: float = 0.0
-
-    def derivative(self, times: np.ndarray, order: int) -> np.ndarray:
-        """Return amplitude omega^k sin(omega t + phase + k pi / 2)."""
-        omega = 2 * np.pi * self.frequency
-        return self.amplitude * omega**order * np.sin(omega * times + self.phase + order * np.pi / 2)
-
-    def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
-        return self.amplitude * np.sin(2 * np.pi * self.frequency * times + self.phase)
-
-
-@dataclass(frozen=True)
 class Noise(Disturbance):
     """White Gaussian noise, drawn from the run's seed.
 

@@ -32,16 +32,7 @@ from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
-from fpirhc.task.exogenous import (
-    Exogenous,
-    check_held,
-    check_signals,
-    not_held,
-    real_values,
-    rows_of,
-    signals_of,
-    signals_of_models,
-)
+from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
@@ -82,7 +73,7 @@ class Problem(Checked):
             and those that the cost weighs.
         reality: what a run moves, where it is not `plant` with its exact parameters: another plant (`Reality`), or an object
             outside (`ExternalPlant`). `plant` is then the model alone.
-        signals: values over time of every signal from outside that the plants declare, by name: `Known`, `Unknown` or `Believed`.
+        signals: values over time of every signal from outside that the plants declare, by name: `Known` or `Unknown`.
         name: of the problem in results; the problem of a file has the name of the file.
 
     Raises:
@@ -134,7 +125,6 @@ class Problem(Checked):
         mistakes.unknown(f"disturbances: {what}", self.disturbances, names)
         instants = np.array([0.0, self.period])
         check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
-        held = self.duration, self.period, self.signal_steps, self.real_integrator
         checks = (
             lambda: self._check_derivatives(instants),
             lambda: self.limits.check(plant),
@@ -144,7 +134,6 @@ class Problem(Checked):
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: self.reality.check(plant, *self._needed) if self.reality else None,
-            lambda: check_held(self.real_plant, {} if self.foreign else self.signals, *held),
         )
         for name, one in self.disturbances.items():
             with mistakes.caught(f"disturbances: '{name}': "):
@@ -276,8 +265,7 @@ class Problem(Checked):
         disturbances = {keys[place]: one for place, one in there.items() if place in keys}
         signals = signals_of(self.plant, self.signals)
         late = self.dead_time.all_simulated
-        with signals_of_models():
-            return replace(self, reality=None, disturbances=disturbances, signals=signals, dead_time=late)
+        return replace(self, reality=None, disturbances=disturbances, signals=signals, dead_time=late)
 
     @cached_property
     def of_equations(self) -> Problem:

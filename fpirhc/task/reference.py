@@ -1,6 +1,12 @@
 """References: the nominal motion and its derivatives, as a function of time; of a map its divided forward differences.
 
-Theory: docs/theory.md.
+Set-points are values that a run is given while it runs, and a filter, part of the controller's step, makes a motion of them:
+
+    (d/dt + a)^m y = a^m w       for every coordinate y with its set-point w
+
+With z = (y, y', ..., y^(m-1)), b = (1, 0, ..., 0) and w held, z(t + h) = w b + Phi(h) (z(t) - w b) with Phi(h) =
+e^(-a h) sum_{k<m} (h N)^k / k!; N = A + a I, A the companion matrix of (s + a)^m, is nilpotent. So motion, velocity and response
+belong together. Source: Franklin, Powell, Workman, Digital Control of Dynamic Systems, 1998, 4.3.3. Theory: docs/theory.md.
 """
 
 from __future__ import annotations
@@ -10,38 +16,39 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NoReturn
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
+from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Finite, described, real_number
+from fpirhc.fields.kinds import Count, Finite, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
+from fpirhc.plant.chain import response_units
 from fpirhc.plant.maps import time_derivatives
-from fpirhc.plant.motion import followed, followed_units
+from fpirhc.plant.motion import followed, followed_units, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.expression import kind
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.expression import Signals, power
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 Steps = float | Sequence[Sequence[float]]  # one set-point, or pairs (time, set-point)
 
-
+_GIVEN = "setpoints"  # signal from outside: the set-points in force
+_OWN = "_reference_own"  # the filters' state, what is given
+_FILTER = "reference_filter"  # remembered: the filters' state
+_ON_TIME = 1e-12  # share of a change's time by which a time may be rounded
+_LATE = 1e-9  # the same, of a cycle
 _FUNCTIONS: Latest[ca.Function] = Latest(16)
 
 
 class Reference(Checked, ABC):
     """Contract: the nominal motion of every coordinate, and how the motion of a run differs from it.
 
-    A horizon of N stages asks for a preview of N + 1 nodes; `stages` is N, or 0 for a problem without a horizon.
+    A horizon of N stages asks for a preview of N + 1 nodes.
     """
-
-    @property
-    def opaque(self) -> bool:
-        """Whether the reference holds operations that scalar expressions cannot, such as the look-up of a table."""
-        return False
 
     @abstractmethod
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
@@ -56,58 +63,44 @@ class Reference(Checked, ABC):
         return _FUNCTIONS.of((self, plant.equations), (), lambda: self._function(plant))
 
     def _function(self, plant: Plant) -> ca.Function:
-        matrix, what = kind(self.opaque), followed(plant)
-        t = matrix.sym("t")
-        motion = {name: matrix(value) for name, value in self.coordinates(t).items()}
+        what, t = followed(plant), ca.SX.sym("t")
+        motion = {name: ca.SX(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)
         by = time_derivatives(plant)
-        derivatives = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
-        state = [derivatives[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
-        response = [derivatives[c][r] for c, r in plant.chains.items()]
-        results = [ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))]
-        return ca.Function("fpirhc_reference", [t], results, ["t"], ["state", "response"])
+        chains = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
+        state, response = _arranged(plant, chains)
+        return ca.Function("fpirhc_reference", [t], [state, response], ["t"], ["state", "response"])
 
     @property
     def set_points(self) -> Mapping[str, Steps]:
         """The set-points of a run that is given no others, by coordinate; {}: a run gives this reference no set-points."""
         return {}
 
-    def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
+    def given(self, plant: Plant) -> tuple[Signal, ...]:  # noqa: ARG002
         """Return the signals that a controller reads from outside for this reference."""
-        del plant, stages
         return ()
 
-    def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
+    def own(self, plant: Plant) -> tuple[Signal, ...]:  # noqa: ARG002
         """Return the signals on which the motion depends besides the time; the block writes them."""
-        del plant, stages
         return ()
 
-    def block(self, plant: Plant, stages: int, period: float) -> Block | None:
+    def block(self, plant: Plant, period: float) -> Block | None:  # noqa: ARG002
         """Return the block from what is given to the own signals; None: there are no own signals."""
-        del plant, stages, period
         return None
 
-    def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
-        """Function (t, own signals) -> (state, response) as far as it is known now.
-
-        Args:
-            ahead: time by which the motion lies in the future.
-        """
-        del stages
-        function = self.function(plant)
+    def motion_now(self, plant: Plant, ahead: float = 0.0) -> ca.Function:
+        """Function (t, own signals) -> (state, response) as far as it is known now, or `ahead` of it."""
+        function, t = self.function(plant), ca.SX.sym("t")
         if ahead == 0:
             return function
-        t = kind(self.opaque).sym("t")
         return ca.Function("fpirhc_reference_ahead", [t], list(function(t + ahead)), ["t"], ["state", "response"])
 
-    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:  # noqa: ARG002
         """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from t on; None without own signals."""
-        del plant, nodes
         return None
 
-    def largest_jump(self, plant: Plant) -> float:
+    def largest_jump(self, plant: Plant) -> float:  # noqa: ARG002
         """Largest known jump of the controlled responses from one cycle to the next, which no derivative shows."""
-        del plant
         return 0.0
 
 
@@ -141,47 +134,194 @@ class Trajectory(Reference):
 
 
 @dataclass(frozen=True, eq=False)
-class Table(Reference):
-    """A nominal motion given by samples and joined by splines; outside the table it is constant.
+class Setpoint(Reference):
+    """A motion towards set-points: Setpoint({"q1": 0.2, "q2": [(0.0, 1.0), (2.0, 1.5)]}, rate=10.0).
 
     Args:
-        times: increasing sample times, shape (m,), s.
-        values: coordinate -> samples, shape (m,).
-        degree: degree of the splines; derivatives are continuous up to degree - 1.
+        values: set-points by coordinate: a number, or pairs (time, set-point), each in force from its time on. A run may be given
+            others (`simulate(..., setpoints=...)`, `Stepper.step(..., setpoints=...)`); what is decided before a run follows these,
+            and a horizon knows none before its time.
+        rate: a, the rate of the filter, per unit of time.
+        order: m of every coordinate, at least the plant's order; None: the plant's order. With the plant's order the response jumps
+            by a^m (w_new - w_old) at a change, with one more it is continuous.
+        start: where the filter begins, at rest, by coordinate; the others begin at their first set-point.
 
     Raises:
-        InvalidValue: times that do not increase, or values that are not finite.
-        InvalidShape: lengths that differ, or too few samples.
+        InvalidValue: values that are no steps.
+        InvalidProblem: a start of a coordinate without set-point.
     """
 
-    times: Sequence[float] | np.ndarray
-    values: Mapping[str, Sequence[float] | np.ndarray]
-    degree: int = 5
+    values: Mapping[str, Steps]
+    rate: Positive = field(metadata={"structure": True})
+    order: Count | None = None
+    start: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        times = np.asarray(self.times, dtype=float)
-        if times.ndim != 1 or times.size < self.degree + 1:
-            raise InvalidShape(f"a table of degree {self.degree} needs at least {self.degree + 1} times")
-        if not np.all(np.isfinite(times)) or np.any(np.diff(times) <= 0):
-            raise InvalidValue("the times of a table must be finite and increasing")
-        for name, samples in self.values.items():
-            column = np.asarray(samples, dtype=float)
-            if column.shape != times.shape:
-                raise InvalidShape(f"table '{name}' has shape {column.shape}, expected {times.shape} as its times")
-            if not np.all(np.isfinite(column)):
-                raise InvalidValue(f"table '{name}' holds values that are not finite")
+        for name, steps in self.values.items():
+            pairs(name, steps)
+        mistakes = Mistakes("Setpoint")
+        mistakes.unknown("start: coordinate", self.start, self.values)
+        mistakes.raise_if_any()
 
-    opaque = True
+    def coordinates(self, t: Expression) -> NoReturn:  # noqa: ARG002
+        raise NotSupported(
+            "the motion towards set-points depends on the orders of a plant; use Setpoint.function(plant)"
+        )
 
-    def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        return {name: self._spline(name, np.asarray(v, dtype=float), t) for name, v in self.values.items()}
+    @property
+    def set_points(self) -> Mapping[str, Steps]:
+        return self.values
 
-    def _spline(self, name: str, samples: np.ndarray, t: Expression) -> Expression:
-        times = np.asarray(self.times, dtype=float)
-        spline = ca.interpolant(f"fpirhc_table_{name}", "bspline", [times], samples, {"degree": [self.degree]})
-        # A choice and not a clamped argument: fmin and fmax have half a derivative at the table's first and last time.
-        held = ca.if_else(t < times[0], spline(times[0]), spline(times[-1]))
-        return ca.if_else(ca.logic_or(t < times[0], t > times[-1]), held, spline(t))
+    def _function(self, plant: Plant) -> ca.Function:
+        """Function t -> (state, response) along `values`: a sum of step responses."""
+        self._check_names(plant)
+        t, chains = ca.SX.sym("t"), {}
+        for name, order in self._orders(plant).items():
+            held, z = ca.SX(self._rest(name)), ca.SX(ca.DM([self._rest(name), *[0.0] * (order - 1)]))
+            for time, change in self._changes(name):
+                rising = _transition(self.rate, ca.fmax(t - time, 0), order)[:, 0]
+                z = z + change * (ca.DM(np.eye(order)[:, 0]) - rising)
+                held = held + change * (t >= time * (1 - _ON_TIME))
+            chains[name] = self._chain(plant, z, held)
+        return ca.Function("fpirhc_reference", [t], list(_arranged(plant, chains)), ["t"], ["state", "response"])
+
+    def given(self, plant: Plant) -> tuple[Signal, ...]:
+        first = tuple(pairs(name, self.values[name])[0][1] for name in plant.chains)
+        return (Signal(_GIVEN, tuple(plant.chains), plant.output.units[: len(first)], start=first),)
+
+    def own(self, plant: Plant) -> tuple[Signal, ...]:
+        """The filters' state, and the set-points."""
+        return (Signal(_OWN, (*self._elements(plant), *(f"{_GIVEN}.{name}" for name in plant.chains))),)
+
+    def block(self, plant: Plant, period: float) -> Block:
+        (given,), (own,), elements = self.given(plant), self.own(plant), self._elements(plant)
+        motion, rest = self.motion_now(plant), {name: self._rest(name) for name in plant.chains}
+
+        def step(s: Signals) -> dict[str, Expression]:
+            z, points = getattr(s, _FILTER), getattr(s, _GIVEN)
+            along = ca.vertcat(z, points)
+            return {
+                "setpoint": points,
+                "reference_response": motion(0.0, along)[1],
+                _OWN: along,
+                f"{_FILTER}_next": self._later(plant, z, points, period),
+            }
+
+        names = given.elements
+        shown = Signal("setpoint", names, given.units), Signal("reference_response", names, response_units(plant))
+        memory = Signal(_FILTER, elements, start=tuple(rest.get(element, 0.0) for element in elements))
+        return Block("set_points", Layout((given,)), Layout((*shown, own)), step, Layout((memory,)))
+
+    def motion_now(self, plant: Plant, ahead: float = 0.0) -> ca.Function:
+        own, z, points = self._symbols(plant)
+        motion = self._motion(plant, self._later(plant, z, points, ahead) if ahead else z, points)
+        arguments, names = [ca.SX.sym("t"), own], ["t", "own"]
+        return ca.Function("fpirhc_reference_now", arguments, list(motion), names, ["state", "response"])
+
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
+        own, z, points = self._symbols(plant)
+        columns = [self._motion(plant, z, points)]
+        for length in np.round(np.diff(nodes) / nodes[1], 12).tolist():  # equal stages are equal to the last bit
+            z = self._later(plant, z, points, nodes[1] * length)
+            columns.append(self._motion(plant, z, points))
+        tables = [ca.horzcat(*parts) for parts in zip(*columns, strict=True)]
+        arguments, names = [ca.SX.sym("t"), own], ["t", "own"]
+        return ca.Function("fpirhc_reference_preview", arguments, tables, names, ["states", "responses"])
+
+    def largest_jump(self, plant: Plant) -> float:
+        jumps: dict[float, list[float]] = {}
+        for name in plant.controlled_names:
+            order = plant.chains[name]
+            if self._orders(plant)[name] == order:
+                by_one = float(ca.evalf(self._chain(plant, ca.SX.zeros(order), ca.SX(1.0))[-1]))
+                for time, change in self._changes(name):
+                    jumps.setdefault(time, []).append(by_one * change)
+        return max((float(np.linalg.norm(together)) for together in jumps.values()), default=0.0)
+
+    def _symbols(self, plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """The own signal, and of it the state of all filters and the set-points."""
+        own = ca.SX.sym("own", self.own(plant)[0].size)
+        z, points = ca.vertsplit(own, [0, len(self._elements(plant)), own.numel()])
+        return own, z, points
+
+    def _later(self, plant: Plant, z: Expression, points: Expression, time: float) -> Expression:
+        """The state of all filters after a time with the set-points held; at rest every difference is exactly zero."""
+        orders = self._orders(plant)
+        aims = ca.diagcat(*(ca.DM(np.eye(order)[:, 0]) for order in orders.values())) @ points
+        phi = ca.diagcat(*(_transition(self.rate, time, order) for order in orders.values()))
+        return aims + phi @ (z - aims)
+
+    def _motion(self, plant: Plant, z: Expression, points: Expression) -> tuple[Expression, Expression]:
+        """State and response of the plant's reference, of the state of all filters."""
+        orders = self._orders(plant)
+        parts = ca.vertsplit(z, [0, *np.cumsum(list(orders.values())).tolist()])
+        return _arranged(plant, {c: self._chain(plant, parts[k], points[k]) for k, c in enumerate(orders)})
+
+    def _chain(self, plant: Plant, z: Expression, held: Expression) -> list[Expression]:
+        """(y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map y and its divided forward differences.
+
+        With the distance d = z - w b the differences are the first entries of ((Phi(T) - I) / T)^j d.
+        """
+        order = z.numel()
+        if plant.step is None:
+            highest = power(self.rate, order) * (held - z[0])
+            for j in range(1, order):
+                highest = highest - math.comb(order, j) * power(self.rate, order - j) * z[j]
+            return [*ca.vertsplit(z), highest]
+        step, values, apart = sampling(plant), [z[0]], ca.vertcat(z[0] - held, z[1:])
+        phi = _transition(self.rate, step, order)
+        for _ in range(order):
+            apart = (phi @ apart - apart) / step
+            values.append(apart[0])
+        return values
+
+    def _elements(self, plant: Plant) -> tuple[str, ...]:
+        """Names of the filters' states: y, y', ... of every coordinate."""
+        return tuple(name + "'" * k for name, order in self._orders(plant).items() for k in range(order))
+
+    def _orders(self, plant: Plant) -> dict[str, int]:
+        return {c: self.order or r for c, r in plant.chains.items()}
+
+    def _rest(self, name: str) -> float:
+        """Where the filter of a coordinate begins."""
+        return float(self.start.get(name, pairs(name, self.values[name])[0][1]))
+
+    def _changes(self, name: str) -> list[tuple[float, float]]:
+        """Times and sizes of the changes of one set-point."""
+        steps = pairs(name, self.values[name])
+        before = [self._rest(name), *(value for _, value in steps[:-1])]
+        return [(time, value - old) for (time, value), old in zip(steps, before, strict=True) if value != old]
+
+    def _check_names(self, plant: Plant) -> None:
+        mistakes = Mistakes("reference")
+        mistakes.unknown("coordinate", self.values, plant.chains)
+        for name, order in plant.chains.items():
+            if name not in self.values:
+                mistakes.add(f"coordinate '{name}' has no set-point; add '{name}' to Setpoint(values=...)")
+            if self.order is not None and self.order < order:
+                mistakes.add(
+                    f"Setpoint(order={self.order}) is below the order {order} of '{name}', whose motion would jump; leave order out"
+                )
+        mistakes.raise_if_any()
+
+
+def _transition(rate: float, time: float | ca.SX, order: int) -> ca.DM | ca.SX:
+    """Phi(time), shape (order, order)."""
+    matrix = ca.SX if isinstance(time, ca.SX) else ca.DM
+    companion = [[0.0] * order] * (order - 1) + [[math.comb(order, j) * power(rate, order - j) for j in range(order)]]
+    nilpotent = matrix(np.eye(order, k=1) + rate * np.eye(order) - companion)
+    term = terms = matrix.eye(order)
+    for k in range(1, order):
+        term = term @ nilpotent * time / k
+        terms = terms + term
+    return ca.exp(-(rate * time)) * terms
+
+
+def _arranged(plant: Plant, chains: Mapping[str, Sequence[Expression]]) -> tuple[Expression, Expression]:
+    """State in the plant's order and response, of (y, y', ..., y^(r)) of every coordinate."""
+    state = [chains[e.rstrip("'")][e.count("'")] for e in plant.output.elements]
+    response = [chains[c][r] for c, r in plant.chains.items()]
+    return ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))
 
 
 def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
@@ -217,3 +357,9 @@ def pairs(name: str, steps: Steps) -> list[tuple[float, float]]:
     if times[0] != 0 or any(later <= time for time, later in pairwise(times)):
         raise InvalidValue(f"{text}: the times must begin at 0 and increase, got {times}")
     return numbers
+
+
+def in_force(steps: Sequence[tuple[float, float]], times: np.ndarray, period: float) -> np.ndarray:
+    """Return the set-point at some times: a change counts from the first cycle at or after its time."""
+    begins, values = np.array(steps).T
+    return values[np.searchsorted(begins, times + _LATE * period, side="right") - 1]

@@ -146,8 +146,8 @@ measured after the end
   measure_from=0.05 -> measure_from=5.0
     measure_from must lie in [0, 0.2), got 5.0
 disturbance without a name
-  measure_from=0.05 -> disturbances=fp.Sine(0.1, 1.0)
-    expected {name: a Disturbance}, got a value of the class Sine; write {'NAME': Sine(...)} with the name of what it belongs to
+  measure_from=0.05 -> disturbances=fp.Step(0.1, 1.0)
+    expected {name: a Disturbance}, got a value of the class Step; write {'NAME': Step(...)} with the name of what it belongs to
 deformation before the optimiser
   fp.RecedingHorizon(optimiser, adaptive) -> fp.RecedingHorizon(adaptive, optimiser)
     the values of 'optimiser' and 'deformation' are swapped

@@ -172,7 +172,7 @@ def test_l1_leaves_the_published_share_of_a_load(predictor):
 
 def test_repetition_shrinks_what_repeats_by_its_gain():
     """With the plant's gain right, the response error of a period is |1 - gamma| of that of the period before."""
-    load = {"y": fp.Sine(amplitude=3.0, frequency=1.0)}
+    load = {"y": fp.Formula(lambda t: 3.0 * ca.sin(2 * np.pi * 1.0 * t))}
     problem = pushed(chain(2), disturbances=load, duration=6.0)
     result = run(problem, fp.rivals.RepetitiveControl(TRACK, repeats=1.0, gain=0.4))
     errors = result["realised.y"][1:] - result["desired.y"][:-1]
@@ -182,7 +182,7 @@ def test_repetition_shrinks_what_repeats_by_its_gain():
 
 def test_sine_as_disturbance_model_leaves_nothing_of_a_sine():
     """The internal model principle; a random walk is late, and more so the slower its filter."""
-    problem = pushed(chain(2), disturbances={"y": fp.Sine(amplitude=3.0, frequency=5.0 / (2 * np.pi))}, duration=30.0)
+    problem = pushed(chain(2), disturbances={"y": fp.Formula(lambda t: 3.0 * ca.sin(5.0 * t))}, duration=30.0)
     measured, drift = {"y": 1e-3, "y'": 1e-2}, {"y": 1.0}
     late = {}
     for name, estimator in {

@@ -24,7 +24,10 @@ SENSING: dict[str, dict[str, Any]] = {
     "ideal": {},
     "estimated": {"sensing": fp.Sensing(estimator=fp.PositionDifference())},
     "noisy": {"sensing": fp.Sensing(sensors={"y'": fp.Sensor(noise=fp.Noise(1e-4), dropout=0.1)})},
-    "late": {"dead_time": fp.DeadTime(measurement=2.5 * PERIOD), "disturbances": {"y": fp.Sine(0.1, 2.0)}},
+    "late": {
+        "dead_time": fp.DeadTime(measurement=2.5 * PERIOD),
+        "disturbances": {"y": fp.Formula(lambda t: 0.1 * ca.sin(2 * np.pi * 2.0 * t))},
+    },
 }
 
 # The twin meets every way of sensing, every controller noisy sensors.

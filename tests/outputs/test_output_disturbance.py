@@ -12,7 +12,7 @@ from helpers.plants import simulated
 import fpirhc as fp
 
 LAW = fp.Exponential(rate=1.0)
-WAVE = fp.Sine(2.0, 0.1, 0.3)
+WAVE = fp.Formula(lambda t: 2.0 * ca.sin(2 * np.pi * 0.1 * t + 0.3))
 FORMULA = fp.Formula(lambda t: 2.0 * ca.sin(0.2 * ca.pi * t + 0.3))
 
 

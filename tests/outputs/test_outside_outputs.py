@@ -58,7 +58,7 @@ def test_an_output_of_order_zero_may_depend_on_a_signal() -> None:
 def test_an_output_whose_derivative_has_that_of_a_smooth_signal_is_refused(course: Any) -> None:
     difference = room(outputs={"d": fp.Output("K", lambda q, p: q.T - p.ambient)})
     problem = heated(room(), "T", rising)
-    for signal in (fp.Known(course), fp.Unknown(course), fp.Believed(280.0, course)):
+    for signal in (fp.Known(course), fp.Unknown(course)):
         with pytest.raises(InvalidProblem, match=r"signals: .* depend on ambient, .* state it in steps, Samples\("):
             replace(
                 problem,

@@ -21,7 +21,9 @@ from fpirhc.contracts import Controller
 # Coordinates as outputs
 
 TRACK, MAP = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=20.0)
-PUSHED = {"disturbances": {"q1": fp.Sine(0.5, 3.0), "Q2": fp.Step(at=0.01, size=5.0)}}
+PUSHED = {
+    "disturbances": {"q1": fp.Formula(lambda t: 0.5 * ca.sin(2 * np.pi * 3.0 * t)), "Q2": fp.Step(at=0.01, size=5.0)}
+}
 LATE = {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}, measurement=2e-3)}
 AIMS = {"reference": fp.Setpoint({"q1": [(0.0, 2.2), (0.01, 2.4)], "q2": [(0.0, 5.4), (0.02, 5.3)]}, rate=10.0)}
 NOISES = {"q1": 1e-3, "q2": 1e-3, "q1'": 1e-2, "q2'": 1e-2, "q1''": 0.1, "q2''": 0.1}

@@ -30,7 +30,10 @@ def joints(motors: tuple[str, str], keys: tuple[str, str, str], **changes) -> fp
     )
     of_motor, of_joint, rate = keys
     settings = {
-        "disturbances": {of_motor: fp.Step(at=0.05, size=0.7), of_joint: fp.Sine(amplitude=0.4, frequency=3.0)},
+        "disturbances": {
+            of_motor: fp.Step(at=0.05, size=0.7),
+            of_joint: fp.Formula(lambda t: 0.4 * ca.sin(2 * np.pi * 3.0 * t)),
+        },
         "limits": fp.Limits(
             inputs=dict.fromkeys(motors, (-5.0, 5.0)),
             states={"shoulder": (-2.0, 2.0)},

@@ -1,11 +1,10 @@
-"""A signal acts in every step of what moves with the value in its middle; one that changes within such a step is named."""
+"""A signal acts in every step of what moves with the value in its middle."""
 
 import casadi as ca
 import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
 
 PERIOD = 5.0
 INTEGRAL = fp.ComputedTorque(fp.Exponential(rate=0.01))
@@ -41,11 +40,6 @@ def flowing():
     )
 
 
-def short(t):
-    """The same in nine seconds of the cycle from 5 to 10, between whole shares of it."""
-    return 200.0 / 3 * ca.logic_and(t >= 8.2, t < 8.35)
-
-
 def problem(plant, reality, signal=pulse, **more):
     return fp.Problem(
         plant=plant,
@@ -76,33 +70,3 @@ def test_what_is_stated_is_what_arrives(task):
     x = run["reality_state"][:, 0]
     assert x == pytest.approx(np.where(run["time"].ravel() > 7.0, 10.0, 0.0), abs=1e-12)
     assert run["signals.eaten"].sum() * PERIOD == pytest.approx(10.0, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("task", "fix"),
-    [
-        (lambda: problem(stored(PERIOD), None), "a map with a shorter step"),
-        (lambda: problem(flowing(), None), r"substeps=2"),
-        (lambda: problem(flowing(), fp.Reality(flowing(), integrator=fp.RungeKutta4(substeps=2))), r"substeps=4"),
-        (lambda: problem(flowing(), None, short), r"substeps=2"),
-        (lambda: problem(flowing(), None, integrator=fp.Cvodes()), r"integrator=Collocation\(substeps=2\)"),
-        (
-            lambda: problem(flowing(), fp.Reality(flowing(), integrator=fp.Cvodes())),
-            r"integrator=Collocation\(substeps=2\)",
-        ),
-        (lambda: problem(flowing(), None, integrator=fp.Collocation(3)), r"integrator=Collocation\(substeps=2\)"),
-    ],
-)
-def test_a_signal_that_changes_within_a_step_is_named_with_its_cycle(task, fix):
-    with pytest.raises(InvalidProblem, match=rf"'eaten' changes within the step of .* \(cycle 1\), .*{fix}"):
-        task()
-
-
-def test_smooth_signals_and_samples_at_the_cycles_are_held():
-    """A wave of twelve cycles, lines between samples, and steps at the cycles."""
-    for signal in (
-        lambda t: ca.sin(2 * np.pi * t / 60.0),
-        fp.Samples(np.arange(0.0, 61.0, 12.0), [0.0, 3.0, 1.0, 0.0, 2.0, 0.0], hold="linear"),
-        fp.Samples(np.arange(0.0, 60.0, PERIOD), np.arange(12.0)),
-    ):
-        assert problem(flowing(), None, signal).signal_steps == 1

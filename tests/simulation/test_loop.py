@@ -6,7 +6,6 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers.faults import Failing
-from helpers.machine import COMPILER
 from helpers.plants import heavy, linear, swing
 
 import fpirhc as fp
@@ -104,17 +103,6 @@ def test_a_loop_that_runs_away_stops_where_its_error_is_a_million_times_the_refe
 
 
 # Every kind of reference and integrator, compiled where it can be and where it is worth it
-
-
-def test_table_reference_is_tracked_like_the_expression_it_samples():
-    """A table goes through the same loop; its look-up keeps the loop an MX graph, which still compiles."""
-    times = np.linspace(0, 3, 601)
-    table = swing(reference=fp.Table(times, {"angle": 0.5 * np.sin(2 * times)}))
-    runs = [
-        fp.simulate(p, fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0)), seed=0) for p in (swing(), table)
-    ]
-    assert runs[1].compiled == (COMPILER is not None)
-    np.testing.assert_allclose(runs[1]["state.angle"], runs[0]["state.angle"], atol=1e-6)
 
 
 def test_reference_integrator_gives_the_same_run():

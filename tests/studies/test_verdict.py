@@ -208,7 +208,7 @@ def tank(**changes: Any) -> fp.Problem:
 def test_a_held_reference_diverges_where_the_plant_left_alone_does_better():
     """More than what is off at the start is no divergence beside a disturbance that moves the plant by more."""
     laws = {n: fp.ComputedTorque(fp.Exponential(rate=rate)) for n, rate in {"good": 20.0, "bad": 2.9}.items()}
-    disturbed = tank(disturbances={"y": fp.Sine(amplitude=8.0, frequency=0.5)})
+    disturbed = tank(disturbances={"y": fp.Formula(lambda t: 8.0 * ca.sin(2 * np.pi * 0.5 * t))})
     one = tasks.made(disturbed, laws, cases=fp.Cases({"usual": {}}))
     table = fp.study(one, fp.CasesOf(), compiled=False).table.set_index("controller")
     assert table.outcome.to_dict() == {"good": "finished", "bad": "diverged"}

@@ -1,4 +1,4 @@
-"""Signals from outside: known and previewed, unknown, believed; a room that is heated against the weather."""
+"""Signals from outside: known and previewed, unknown; a room that is heated against the weather."""
 
 from dataclasses import replace
 from typing import Any
@@ -57,7 +57,6 @@ def task(plant: fp.Plant, signals: Any = None, **changes: Any) -> fp.Problem:
 
 OUTSIDE = fp.outside(nominal=283.0, unit="K")
 NIGHT = fp.Samples([0.0, 6.0, 12.0, 18.0, 24.0, 30.0], [283.0, 276.0, 274.0, 281.0, 285.0, 279.0], hold="linear")
-FRONT = fp.Samples([0.0, 15.0], [283.0, 268.0])  # a cold front at 15 h
 RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=4, tolerance=1e-6))
 CTC = fp.ComputedTorque(fp.Exponential(rate=0.6))
 CONTROLLERS = {
@@ -90,7 +89,7 @@ def test_a_constant_signal_is_the_parameter_of_that_value(name, course):
 @pytest.mark.parametrize("name", ["CTC+FPI", "CTC+model-referenced", "RHC+FPI"])
 def test_the_compiled_loop_looks_values_up_as_the_virtual_machine_does(name):
     """Look-up of samples is generated C."""
-    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Believed(NIGHT, FRONT)})
+    problem = task(room(OUTSIDE, wrong=1.3), {"ambient": fp.Known(NIGHT)})
     slow, fast = run(problem, CONTROLLERS[name]), run(problem, CONTROLLERS[name], compiled=True)
     assert fast.compiled
     assert np.array_equal(fast["signals.ambient"], slow["signals.ambient"])
@@ -173,11 +172,7 @@ def test_a_right_model_with_known_weather_leaves_a_model_referenced_deformation_
 def test_who_is_told_what():
     """The log shows both; an exact model is told the truth."""
     plant = room(OUTSIDE, wrong=1.3)
-    told = {
-        "known": (fp.Known(NIGHT), _weather),
-        "unknown": (fp.Unknown(NIGHT), lambda t: np.full(t.shape, 283.0)),
-        "believed": (fp.Believed(NIGHT, lambda t: 280.0 - t / 10), lambda t: 280.0 - t / 10),
-    }
+    told = {"known": (fp.Known(NIGHT), _weather), "unknown": (fp.Unknown(NIGHT), lambda t: np.full(t.shape, 283.0))}
     for one, expected in told.values():
         logged = run(task(plant, {"ambient": one}), CTC)
         at = logged.time + PERIOD / 2
@@ -269,10 +264,6 @@ BAD = {
         "stated from 0 to 9, the run is from 0 to 30",
     ),
     "too late": (lambda: known(fp.Samples([2.0], [1.0])), "stated from 2 to inf"),
-    "of the model too short": (
-        lambda: task(room(OUTSIDE), {"ambient": fp.Believed(280.0, fp.Samples([0.0, 9.0], [1.0, 2.0], hold="linear"))}),
-        "values of the model of 'ambient'",
-    ),
     "unknown name": (lambda: known(1.0, ambiant=fp.Known(1.0)), "'ambiant' is unknown.*'ambient'"),
     "a parameter": (lambda: known(1.0, loss=fp.Known(1.0)), "'loss' is a parameter; declare it as outside"),
     "not finite": (lambda: known(lambda t: ca.sqrt(t - 15)), "not finite at t = 0"),

@@ -1,4 +1,4 @@
-"""References and disturbances: derivatives by differentiation, tables by splines, and what acts at which time."""
+"""References and disturbances: derivatives by differentiation, and what acts at which time."""
 
 import casadi as ca
 import numpy as np
@@ -7,7 +7,7 @@ from helpers.plants import chain
 
 import fpirhc as fp
 from fpirhc.contracts import Disturbance
-from fpirhc.errors import InvalidProblem, InvalidShape, InvalidValue
+from fpirhc.errors import InvalidProblem, InvalidValue
 
 
 def test_derivatives_up_to_the_order():
@@ -27,42 +27,9 @@ def test_a_scale_goes_from_the_first_point():
     np.testing.assert_allclose(float(ca.evalf(scaled.coordinates(ca.SX(0.3))["y"])), wanted[0], rtol=1e-12)
 
 
-def test_table_agrees_with_the_expression_it_samples():
-    """A quintic spline through samples of a smooth motion follows its first two derivatives."""
-    times = np.linspace(0, 3, 301)
-    table = fp.Table(times, {"y": np.sin(2 * times)}).function(chain(2))
-    exact = fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}).function(chain(2))
-    for t in (0.5, 1.234, 2.5):
-        for result, expected in zip(table(t), exact(t), strict=True):
-            np.testing.assert_allclose(result.full(), expected.full(), atol=1e-6, equal_nan=False)
-
-
-def test_table_is_held_outside():
-    """Beyond its last sample a table stands still."""
-    times = np.linspace(0, 1, 11)
-    state, response = fp.Table(times, {"y": times**2}).function(chain(2))(5.0)
-    np.testing.assert_allclose(state.full().ravel(), [1.0, 0.0], atol=1e-9, equal_nan=False)
-    assert float(response) == 0.0
-
-
 def test_missing_and_unknown_coordinates():
     with pytest.raises(InvalidProblem, match=r"(?s)'z' is unknown.*'y' has no nominal motion"):
         fp.Trajectory(lambda t: {"z": t}).function(chain(2))
-
-
-@pytest.mark.parametrize(
-    ("times", "values", "error"),
-    [
-        ([0, 1, 1, 2, 3, 4], [0] * 6, InvalidValue),
-        ([0, 1, 2, 3, 4, 5], [0] * 5, InvalidShape),
-        ([0, 1, 2], [0] * 3, InvalidShape),
-        ([0, 1, 2, 3, 4, 5], [0, 1, float("nan"), 1, 1, 1], InvalidValue),
-    ],
-)
-def test_bad_tables(times, values, error):
-    """Times must increase, lengths must agree, values must be finite."""
-    with pytest.raises(error):
-        fp.Table(times, {"y": values})
 
 
 # Disturbances: what they are at which time
@@ -75,11 +42,10 @@ def _values(disturbance, seed=0):
     return disturbance.values(TIMES, np.random.default_rng(seed))
 
 
-def test_step_pulse_and_sine():
+def test_step_and_pulse():
     """Edges are where they were asked for."""
     assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
     assert _values(fp.Pulse(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
-    np.testing.assert_allclose(_values(fp.Sine(2.0, 0.25)), 2 * np.sin(np.pi / 2 * TIMES), equal_nan=False)
 
 
 def test_noise_is_drawn_from_the_seed():

@@ -94,7 +94,7 @@ def _nominal_block(built: Built) -> Block:
 
     reads = Layout((time_signal(plant), plant.response_signal("_reference_response"), *built.own))
     writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
-    return Block("nominal", reads, writes, step, opaque=built.opaque)
+    return Block("nominal", reads, writes, step)
 
 
 def _increment_block(built: Built) -> Block:

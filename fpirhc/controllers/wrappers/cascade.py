@@ -27,7 +27,7 @@ from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
-from fpirhc.symbolic.expression import Signals, is_finite, kind
+from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.dead_time import MOST, Queue, every
 from fpirhc.task.problem import Problem
@@ -46,10 +46,6 @@ class Shifted(Reference):
     reference: Reference  # that is shifted. Its own signals are given from outside too.
 
     @property
-    def opaque(self) -> bool:
-        return self.reference.opaque
-
-    @property
     def set_points(self) -> Mapping[str, Steps]:
         return self.reference.set_points
 
@@ -60,21 +56,21 @@ class Shifted(Reference):
         """Function t -> (nominal state (nx), nominal response (n)) without shift."""
         return self.reference.function(plant)
 
-    def given(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        return self.own(plant, stages)
+    def given(self, plant: Plant) -> tuple[Signal, ...]:
+        return self.own(plant)
 
-    def own(self, plant: Plant, stages: int) -> tuple[Signal, ...]:
-        return (*self.reference.own(plant, stages), _shift_signal(plant, SHIFT))
+    def own(self, plant: Plant) -> tuple[Signal, ...]:
+        return (*self.reference.own(plant), _shift_signal(plant, SHIFT))
 
-    def motion_now(self, plant: Plant, stages: int, ahead: float = 0.0) -> ca.Function:
+    def motion_now(self, plant: Plant, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signals) -> (state, response), now or after some time with the shift held."""
-        t, own, shift = self._symbols(plant, stages)
-        state, response = self.reference.motion_now(plant, stages, ahead)(t, *own)
+        t, own, shift = self._symbols(plant)
+        state, response = self.reference.motion_now(plant, ahead)(t, *own)
         return ca.Function("fpirhc_target", [t, *own, shift], [state + _places(plant) @ shift, response])
 
     def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
         """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
-        t, own, shift = self._symbols(plant, len(nodes) - 1)
+        t, own, shift = self._symbols(plant)
         known, function = self.reference.preview(plant, nodes), self.reference.function(plant)
         at_nodes = [] if known is not None else [function(t + float(time)) for time in nodes]
         states, responses = known(t, *own) if known is not None else map(ca.horzcat, *at_nodes)
@@ -84,10 +80,10 @@ class Shifted(Reference):
     def largest_jump(self, plant: Plant) -> float:
         return self.reference.largest_jump(plant)
 
-    def _symbols(self, plant: Plant, stages: int) -> tuple[Expression, list[Expression], Expression]:
+    def _symbols(self, plant: Plant) -> tuple[Expression, list[Expression], Expression]:
         """Time, the own signals of the reference, and the shift."""
-        *own, shift = (kind(self.opaque).sym(signal.name, signal.size) for signal in self.own(plant, stages))
-        return kind(self.opaque).sym("t"), own, shift
+        *own, shift = (ca.SX.sym(signal.name, signal.size) for signal in self.own(plant))
+        return ca.SX.sym("t"), own, shift
 
 
 def _shift_signal(plant: Plant, name: str) -> Signal:

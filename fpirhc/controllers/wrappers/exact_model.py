@@ -10,7 +10,7 @@ from fpirhc.controllers.contract import ControllerWrapper, PlantModel
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.task.exogenous import really_known, signals_of, signals_of_models
+from fpirhc.task.exogenous import really_known, signals_of
 from fpirhc.task.problem import Problem
 
 
@@ -28,8 +28,7 @@ class ExactModel(ControllerWrapper):
     def inner_problem(self, problem: Problem) -> Problem:
         model = self.plant_model(problem)
         plant = _EXACT.of((model.plant,), (), lambda: _known(model.plant))
-        with signals_of_models():
-            return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
+        return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
 
     def plant_model(self, problem: Problem) -> PlantModel:
         plant = problem.moves.as_model(problem.plant)

@@ -75,10 +75,7 @@ class Predicted(ControllerWrapper):
         if not given_signals(problem) or not cycles:
             return notes
         late = f"{cycles * problem.period:g} {problem.time_unit}"
-        return (
-            *notes,
-            f"Predicted follows set-points {late} late, announced ones too; give one that is known ahead so much earlier",
-        )
+        return (*notes, f"Predicted follows set-points {late} late; give one that is known ahead so much earlier")
 
     def check(self, problem: Problem) -> None:
         """Raise if the wrapped controller, the prediction or the dead time does not fit the problem.
