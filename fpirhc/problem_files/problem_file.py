@@ -231,7 +231,7 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
         controllers[name] = with_settings(controller, own)
     for path, errors in lacked.items():
         if chosen and len(errors) == len(chosen):
-            if path in task.problem.moved.parameters:
+            if path in task.problem.moves.parameters:
                 mend = f"write exact.{path} for the plant, approximate.{path} for the model"
                 raise InvalidName(f"setting '{path}': {mend}")
             raise max(errors, key=lambda error: "Did you mean" in str(error))

@@ -41,7 +41,7 @@ def with_settings(owner: Owner, values: Mapping[str, float]) -> Owner:
 def of_problem(problem: Problem, path: str) -> str | None:
     """Return a path as a case has it, 'exact.m1' for 'm1.exact'; None where it does not begin with a word of a case."""
     name, _, word = path.rpartition(".")
-    named = word in PARAMETERS and (name in problem.plant.parameters or name in problem.moved.parameters)
+    named = word in PARAMETERS and (name in problem.plant.parameters or name in problem.moves.parameters)
     of_case = f"{word}.{name}" if named else path
     return of_case if of_case.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(problem))} else None
 
@@ -69,7 +69,7 @@ def unit_of_setting(path: str, problem: Problem) -> str:
     """Return the unit of a setting of a controller or of the problem, '' where its kind does not say it."""
     word, _, name = path.partition(".")
     if word in PARAMETERS:
-        return (problem.moved if word == "exact" else problem.plant).parameters[name].unit
+        return (problem.moves if word == "exact" else problem.plant).parameters[name].unit
     if word in ("dead_time", "duration", "measure_from", "period"):
         return problem.time_unit
     name = name.removeprefix("inputs.").removeprefix("states.") if word == "limits" else name
@@ -82,7 +82,7 @@ def number_of_case(problem: Problem, path: str) -> float | None:
     """Return the number that a problem has at a path of a case; None where there is none, or no number."""
     word, _, name = path.partition(".")
     if word in PARAMETERS:
-        one = (problem.moved if word == "exact" else problem.plant).parameters.get(name)
+        one = (problem.moves if word == "exact" else problem.plant).parameters.get(name)
         return None if one is None else float(one.exact if word == "exact" else one.approximate)
     if word == START:
         return dict(zip(problem.plant.state.elements, map(float, problem.start_state), strict=True)).get(name)

@@ -40,7 +40,7 @@ _RAW, HELD = "_foreign", "_foreign_held"
 
 def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
-    problem, plant, late = mover.problem, mover.problem.plant, mover.problem.dead_time.simulated
+    problem, plant, late = mover.problem, mover.problem.plant, mover.problem.simulated_dead_time
     queued = [name for name in plant.inputs if name in late.queued]
     if not queued:
         return [mover.advance(disturbed, plant.input)]

@@ -58,8 +58,8 @@ def _one(problem: Problem, seed: int, key: object, built: Problem, believed: Pro
 
 def _mismatch(problem: Problem, seed: int) -> Quantity:
     known = {n: p.approximate for n, p in problem.plant.parameters.items()}
-    exact = np.array([p.exact for p in problem.moved.parameters.values()])
-    model = np.array([known.get(n, p.exact) for n, p in problem.moved.parameters.items()])
+    exact = np.array([p.exact for p in problem.moves.parameters.values()])
+    model = np.array([known.get(n, p.exact) for n, p in problem.moves.parameters.items()])
     if np.array_equal(exact, model):
         raise InvalidValue("the model is right")
     scaled = exact * model > 0
@@ -95,7 +95,8 @@ def _latency(problem: Problem, seed: int) -> Quantity:
 
     def at(value: float) -> list[Variant]:
         inputs = {n: times.inputs.get(n, 0.0) + value for n in problem.plant.inputs}
-        later = replace(problem, dead_time=replace(times, inputs=inputs))
+        late = {"inputs": inputs} if problem.equations_known else {"measurement": times.measurement + value}
+        later = replace(problem, dead_time=replace(times, **late))
         return _one(later, seed, value, later, problem)
 
     most = min(_FARTHEST, max(problem.cycles // 4, 1))

@@ -121,7 +121,7 @@ class Draws(Variants):
         """Return the variants of a problem."""
         if self.count < 1:
             raise InvalidValue(f"draws {self.count}: expected at least 1")
-        wide = {n for n, (low, high) in exact_ranges(problem.moved, self.percent).items() if high > low}
+        wide = {n for n, (low, high) in exact_ranges(problem.moves, self.percent).items() if high > low}
         late = bool(self.percent) and _is_late(problem)
         noisy = bool(problem.disturbances) or not problem.sensing.ideal or problem.foreign is not None
         if self.count > 1 and not (wide or late or noisy):
@@ -135,8 +135,8 @@ class Draws(Variants):
 
     def _one(self, problem: Problem, times: Mapping[int, Problem], wide: Container[str], number: int) -> Variant:
         parameters, noise, late = _streams(self.seed, number).spawn(3)
-        shares = np.random.default_rng(parameters).random(len(problem.moved.parameters))
-        stated = zip(problem.moved.parameters.items(), shares, strict=True)
+        shares = np.random.default_rng(parameters).random(len(problem.moves.parameters))
+        stated = zip(problem.moves.parameters.items(), shares, strict=True)
         exact = {name: drawn(one, self.percent, float(share)) for (name, one), share in stated}
         built = times[int(np.random.default_rng(late).integers(-1, 2))]
         numbers = {f"exact.{name}": float(value) for name, value in exact.items() if name in wide}
@@ -240,7 +240,7 @@ def _told_apart(variants: Sequence[Variant]) -> list[Variant]:
 def _is_late(problem: Problem) -> bool:
     """Whether a dead time can be drawn: there is one, and it is not that of a body outside."""
     times = problem.dead_time
-    return bool(times.measurement or any(times.inputs.values())) and not problem.moves.dead_time
+    return bool(times.measurement or any(times.inputs.values())) and problem.foreign is None
 
 
 def _with_dead_times(problem: Problem, percent: float) -> Problem:

@@ -121,7 +121,7 @@ class Cases(Checked):
 
     def exactly(self, name: str, built: Problem) -> Problem:
         """Return what `build` returned, with the exact parameters of a case."""
-        before = {name: one.exact for name, one in built.moved.parameters.items()}
+        before = {name: one.exact for name, one in built.moves.parameters.items()}
         exact = {**before, **_exact_of(self.changes[name], before)}
         return built if exact == before else built.with_exact(np.array(list(exact.values())))
 
@@ -247,12 +247,12 @@ def _parametric(problem: Problem, changes: Mapping[str, object], word: str) -> P
     """Whose parameter a case changes; a case with a reality of its own means that one."""
     if word != _EXACT:
         return problem.plant
-    return changed_at(problem, "reality", changes["reality"]).moved if "reality" in changes else problem.moved
+    return changed_at(problem, "reality", changes["reality"]).moves if "reality" in changes else problem.moves
 
 
 def _meant(problem: Problem, path: str) -> str:
     """What to write for the name of a parameter, a state or an input alone."""
-    if path in problem.plant.parameters or path in problem.moved.parameters:
+    if path in problem.plant.parameters or path in problem.moves.parameters:
         words = ", ".join(f"'{word}.{path}' is {what}" for word, what in PARAMETERS.items())
         return f" It is a parameter: {words}."
     if path in problem.plant.state.elements:

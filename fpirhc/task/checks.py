@@ -17,7 +17,7 @@ from fpirhc.horizon.cost import Cost, view_of_symbols
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
-from fpirhc.plant.maps import over
+from fpirhc.plant.maps import check_time, over
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -62,12 +62,11 @@ def settled_maps(
     return settled
 
 
-def check_maps(model: Plant, reality: Reality | ExternalPlant | None, sensing: Sensing, mistakes: Mistakes) -> None:
+def check_maps(model: Plant, real: Plant, sensing: Sensing, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     instant = _instant(model)
     at_once = bool(instant) and set(instant) == set(model.controlled or model.chains)  # no derivative is looked for
-    if reality is not None:
-        reality.check_steps(model, mistakes, at_once=at_once)
+    check_time(real, model, model.chains, mistakes, at_once=at_once)
     if model.step is None:
         return
     if instant and not at_once:

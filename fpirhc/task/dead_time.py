@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import casadi as ca
 
@@ -31,51 +30,15 @@ class DeadTime(Checked):
     one after the other; a measurement is that between two samples.
 
     Args:
-        inputs: dead time by input; zero where not named.
+        inputs: dead time by input; zero where not named. An external plant has it itself, so that it is not simulated.
         measurement: dead time of the state and the response. At first the queue holds the start.
         before: commands that are on their way at the start, by input. `Problem(input_before=...)` says the
             same, and also serves problems without dead time.
-        outside: the part of `inputs` that an external plant has itself, so that it is not simulated. `Problem` fills it in from
-            `ExternalPlant(dead_time=...)`.
     """
 
     inputs: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"structure": True})
     measurement: NotNegative = field(default=0.0, metadata={"structure": True})
     before: Mapping[str, Finite] = field(default_factory=dict)
-    outside: Mapping[str, float] = field(default_factory=dict, kw_only=True, repr=False, metadata={"setting": False})
-
-    @cached_property
-    def simulated(self) -> DeadTime:
-        """The dead time that a run adds: all but the part that the external plant has."""
-        if not self.outside:
-            return self
-        return replace(self, inputs={n: time - self.outside.get(n, 0.0) for n, time in self.inputs.items()}, outside={})
-
-    @cached_property
-    def all_simulated(self) -> DeadTime:
-        """The same dead time where a plant of equations stands for the external one, so that a run adds all of it."""
-        return replace(self, outside={}) if self.outside else self
-
-    def behind(self, outside: Mapping[str, float], mistakes: Mistakes) -> DeadTime:
-        """Return it with the dead time of an external plant in place of that of the last one; what is simulated stays.
-
-        Args:
-            outside: dead time by input; empty: there is no external plant, or it states none.
-            mistakes: gets an input whose dead time is stated twice, and differently.
-        """
-        if dict(outside) == dict(self.outside):
-            return self
-        own = {n: time for n, time in self.simulated.inputs.items() if time or n not in self.outside}
-        twice = {} if self.outside else {n: time for n, time in own.items() if n in outside}
-        for name, time in twice.items():
-            if time != outside[name]:
-                mistakes.add(
-                    f"dead_time: of input '{name}' the external plant states {outside[name]!r}, and the problem {time!r}; state it "
-                    "once, ExternalPlant(dead_time=...) for what the body has, DeadTime(inputs=...) for what is simulated before it"
-                )
-        added = {n: time for n, time in own.items() if n not in twice}
-        known = {n: added.get(n, 0.0) + outside.get(n, 0.0) for n in {**outside, **added}}
-        return replace(self, inputs=known, outside=dict(outside))
 
     def over(self, period: float) -> DeadTime:
         """Return it without dead times that are below the rounding of a cycle, as .3 - .1 - .2 is."""
@@ -115,12 +78,6 @@ class DeadTime(Checked):
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("before: input", self.before, plant.inputs)
-        for name, least in self.outside.items():
-            if self.inputs.get(name, 0.0) < least - WHOLE * period:
-                mistakes.add(
-                    f"'{name}' is {self.inputs.get(name, 0.0):g} {unit}, less than the {least:g} {unit} that the external "
-                    "plant states; state less there, ExternalPlant(dead_time=...)"
-                )
         for name, value in {**self.inputs, MEASUREMENT: self.measurement}.items():
             if value > MOST * period:
                 mistakes.add(

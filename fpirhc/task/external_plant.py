@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import reprlib
 import warnings
-from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -63,10 +62,8 @@ class ExternalPlant(Checked):
         rest: by input, what is sent when a run ends, however it ends: complete, stopped, by an exception or Ctrl-C. Every input of
             the model; {}: nothing is sent. A body with a method `close` is a machine, which would keep its last command: it must
             say, and is closed.
-        dead_time: by input, in the model's unit of time: how late the body acts. Controllers and reviews know it as that of the
-            problem; the body has it already, so it is not simulated.
         lag: by input, in the model's unit of time: the time constant with which the body follows a command. `ModelReferenced` and
-            reviews know it, and no other controller; it is not simulated either.
+            reviews know it, and no other controller; it is not simulated.
         make: function (parameters, seed) -> body, called before every reset with the exact values of `parameters` by name.
         period: time that a step of the body takes, in the model's unit of time; problems of another one are refused. None: any.
         parameters: of the body. Scenarios draw their exact values as those of a plant; a controller knows none of them.
@@ -79,9 +76,7 @@ class ExternalPlant(Checked):
     measures: Mapping[str, str] | Sequence[str] = field(default_factory=dict)
     holds: CountOrZero = 0
     rest: Mapping[str, Finite] | None = field(default=None, metadata={"setting": "where given"})
-    dead_time: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
     lag: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
-
     make: Make | None = field(default=None, metadata={"setting": "apart"})
     parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
     period: Positive | None = field(default=None, metadata={"setting": False})
@@ -93,14 +88,12 @@ class ExternalPlant(Checked):
             raise InvalidValue(
                 "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body"
             )
-        mistakes = Mistakes("ExternalPlant")
-        for name, times in Counter([*self.measures]).items():
-            if times > 1:
-                mistakes.add(f"measures: {name} is named {times} times; an answer has every quantity once")
+        mistakes, names = Mistakes("ExternalPlant"), [*self.measures]
+        for name in dict.fromkeys(n for n in names if names.count(n) > 1):
+            mistakes.add(f"measures: {name} is named {names.count(name)} times; an answer has every quantity once")
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
-        mistake = "" if self.body is None else self._wrong(self.body)
-        if mistake:
+        if self.make is None and (mistake := self._wrong(self.body)):
             raise InvalidValue(f"ExternalPlant: its body is {mistake}")
 
     @property
@@ -116,12 +109,7 @@ class ExternalPlant(Checked):
         return f", after {self.holds} in a row that were held; ExternalPlant(holds={self.holds + 1}) bridges one more"
 
     @property
-    def symbolic(self) -> None:
-        """No plant: nothing is known of it but its answers."""
-
-    @property
     def foreign(self) -> ExternalPlant:
-        """Itself."""
         return self
 
     def with_exact(self, exact: np.ndarray) -> ExternalPlant:
@@ -139,85 +127,34 @@ class ExternalPlant(Checked):
         return replace(self, parameters=with_exact_values(self.parameters, exact))
 
     def as_model(self, model: Plant) -> NoReturn:  # noqa: ARG002
-        """Raise: it has no equations.
-
-        Raises:
-            NotSupported: always.
-        """
-        self.require_equations("an ExternalPlant has no equations that could be the exact model; leave ExactModel out")
-
-    def require_equations(self, refusal: str) -> NoReturn:
-        """Raise: it is an object outside.
-
-        Args:
-            refusal: who needs equations, and what to do.
-
-        Raises:
-            NotSupported: always, with the refusal.
-        """
-        raise NotSupported(refusal)
-
-    def finer(self, integrator: Integrator, factor: int) -> None:
-        """Nothing: it has no steps of an integrator."""
-
-    @property
-    def drawn(self) -> ExternalPlant:
-        """Whose exact parameters studies draw."""
-        return self
-
-    @property
-    def fact(self) -> str:
-        """What tables call it."""
-        return f"{self.name}, outside"
-
-    def disturbable(self, model: Plant) -> tuple[str, ...]:  # noqa: ARG002
-        """Return the names beside the inputs that disturbances may have: none, because nothing reaches into it."""
-        return ()
+        raise NotSupported("an ExternalPlant has no equations that could be the exact model; leave ExactModel out")
 
     def over(self, cycle: float) -> ExternalPlant:  # noqa: ARG002
-        """Return itself: it is called once in every cycle, whatever that is."""
-        return self
+        return self  # it is called once in every cycle, whatever that is
 
     def shows(self, name: str) -> bool:
-        """Whether it measures a coordinate or an output of the model."""
         return name in self.measures
 
-    def check_steps(self, model: Plant, mistakes: Mistakes, *, at_once: bool) -> None:
-        """Nothing: what it has inside is not known."""
-
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:  # noqa: ARG002
-        """Raise if a step of the body takes another time than a cycle; what it has inside is not known."""
         if self.period is not None and abs(self.period - period) > _SAME * period:
             raise InvalidProblem(
                 f"reality: one step of it takes {self.period:g}, and the problem's period is {period:g}; write both alike"
             )
 
     def check(self, model: Plant, needed: Collection[str], measured: Collection[str]) -> None:  # noqa: ARG002
-        """Raise if it does not measure what the model's sensing needs.
-
-        Args:
-            model: the model.
-            needed: names of coordinates and outputs that a plant of equations would need.
-            measured: names of the quantities that sensors and estimator use.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
-        mistakes = Mistakes("reality")
-        units = quantities(model)
+        """Raise if it does not measure what the model's sensing needs, the names in `measured`."""
+        mistakes, units = Mistakes("reality"), quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
         mistakes.unknown("lag: input", self.lag, model.inputs)
         rest = self.rest or {}
         mistakes.unknown("rest: input", rest, model.inputs)
-        for name in model.inputs if rest else ():
-            if name not in rest:
-                mistakes.add(f"rest: input '{name}' has no value; state what every input is sent when a run ends")
-        for name in measured:
-            if name not in self.measures:
-                mistakes.add(
-                    f"it does not measure {name} ({units[name]}), which the sensing of the problem needs; add it to measures, or "
-                    "choose an estimator that does without: Sensing(estimator=...)"
-                )
+        for name in (n for n in model.inputs if rest and n not in rest):
+            mistakes.add(f"rest: input '{name}' has no value; state what every input is sent when a run ends")
+        for name in (n for n in measured if n not in self.measures):
+            mistakes.add(
+                f"it does not measure {name} ({units[name]}), which the sensing of the problem needs; add it to measures, or "
+                "choose an estimator that does without: Sensing(estimator=...)"
+            )
         stated = self.measures if isinstance(self.measures, Mapping) else {}
         for name, unit in stated.items():
             if units.get(name, unit) != unit:
@@ -264,13 +201,17 @@ class ExternalPlant(Checked):
                     close()
 
     def _wrong(self, body: object) -> str:
-        """What is wrong with a body, and what to write; empty where nothing is."""
-        if self.rest is None and not isinstance(body, type) and callable(getattr(body, "close", None)):
+        """What stands in place of a body, and what to write; empty where nothing is wrong."""
+        if isinstance(body, type):
+            return f"the class {body.__name__}; write {body.__name__}() for an object of it"
+        if self.rest is None and callable(getattr(body, "close", None)):
             return (
                 f"a machine, as {type(body).__name__} has close(), and would keep its last command when a run ends; state what it "
                 "is sent then, rest={'u': 0.0} with every input, or rest={} where nothing is to be sent"
             )
-        return _wrong_body(body)
+        lacking = [name for name in ("reset", "step") if not callable(getattr(body, name, None))]
+        what = "None" if body is None else f"a value of the class {type(body).__name__} without {' and '.join(lacking)}"
+        return f"{what}; expected an object with reset(seed) and step(time, command)" if lacking else ""
 
     @cached_property
     def _present(self) -> list[Body]:
@@ -299,17 +240,6 @@ class ExternalPlant(Checked):
 
 def _words(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":")
-
-
-def _wrong_body(body: object) -> str:
-    """What stands in place of a body, and what to write; empty where it is one."""
-    if isinstance(body, type):
-        return f"the class {body.__name__}; write {body.__name__}() for an object of it"
-    lacking = [name for name in ("reset", "step") if not callable(getattr(body, name, None))]
-    if not lacking:
-        return ""
-    what = "None" if body is None else f"a value of the class {type(body).__name__} without {' and '.join(lacking)}"
-    return f"{what}; expected an object with reset(seed) and step(time, command)"
 
 
 def quantities(model: Plant) -> dict[str, str]:

@@ -26,7 +26,7 @@ from fpirhc.plant.motion import followed, followed_units, with_exact_parameters,
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
-from fpirhc.summary import behind_equals, line, number, table
+from fpirhc.summary import line
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
@@ -60,7 +60,7 @@ class Problem(Checked):
         disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
             and an output is the coordinate's, and adds to its response. Where an input and a coordinate share a name, they are
             "input NAME" and "coordinate NAME".
-        dead_time: of inputs and measurement, with that of an `ExternalPlant` added. A controller may assume another one.
+        dead_time: of inputs and measurement. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
         cost: of such a plan.
@@ -107,15 +107,14 @@ class Problem(Checked):
         known = self.plant, self.reality, self.period, self.integrator, self.horizon, self.sensing
         for name, value in settled_maps(*known, mistakes).items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "dead_time", self.dead_time.behind(self.moves.dead_time, mistakes).over(self.period))
+        object.__setattr__(self, "dead_time", self.dead_time.over(self.period))
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), followed_units(plant))
-        others = self.moves.disturbable(plant)
-        shared = [n for n in self.disturbances if n in plant.inputs and n in others]
+        shared = [n for n in self.disturbances if n in plant.inputs and n in self._pushed]
         for name in shared:
             mistakes.add(
                 f"disturbances: '{name}' names both an input and a coordinate; write 'input {name}' or 'coordinate {name}'"
@@ -142,7 +141,7 @@ class Problem(Checked):
             with mistakes.caught():
                 check()
         mistakes.raise_if_any()
-        check_maps(plant, self.reality, self.sensing, mistakes)
+        check_maps(plant, self.real_plant, self.sensing, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
@@ -154,10 +153,6 @@ class Problem(Checked):
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))
-
-    def _repr_html_(self) -> str:
-        """Times, limits and what disturbs as a table, for notebooks."""
-        return _table(self)
 
     @property
     def time_unit(self) -> str:
@@ -198,9 +193,14 @@ class Problem(Checked):
         return self.reality.foreign if self.reality is not None else None
 
     @property
+    def simulated_dead_time(self) -> DeadTime:
+        """What a run adds of the dead time: an object outside has that of its inputs itself."""
+        return replace(self.dead_time, inputs={}) if self.foreign else self.dead_time
+
+    @property
     def equations_known(self) -> bool:
         """Whether what moves has equations, so that it can be run again to answer a question."""
-        return self.reality is None or self.reality.symbolic is not None
+        return self.foreign is None
 
     @property
     def moves(self) -> Reality | ExternalPlant:
@@ -210,17 +210,12 @@ class Problem(Checked):
     @cached_property
     def truth(self) -> Reality:
         """What a run moves, where its equations are known; else the model itself."""
-        return (self.reality and self.reality.symbolic) or Reality(self.plant)
+        return self.reality if isinstance(self.reality, Reality) else Reality(self.plant)
 
     @property
     def real_plant(self) -> Plant:
         """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
         return self.truth.plant
-
-    @property
-    def moved(self) -> Plant | ExternalPlant:
-        """What a run moves, and whose exact parameters studies draw."""
-        return self.moves.drawn
 
     @cached_property
     def disturbed_outputs(self) -> Mapping[str, int]:
@@ -264,36 +259,12 @@ class Problem(Checked):
         there = {disturbed_place(name, inputs): one for name, one in self.disturbances.items()}
         disturbances = {keys[place]: one for place, one in there.items() if place in keys}
         signals = signals_of(self.plant, self.signals)
-        late = self.dead_time.all_simulated
-        return replace(self, reality=None, disturbances=disturbances, signals=signals, dead_time=late)
+        return replace(self, reality=None, disturbances=disturbances, signals=signals)
 
     @cached_property
     def of_equations(self) -> Problem:
         """The problem as far as equations tell it: where an object outside moves, the model moves in its place."""
-        known = self.reality and self.reality.symbolic
-        return self if known is self.reality else replace(self, reality=known, dead_time=self.dead_time.all_simulated)
-
-    def finer(self, factor: int) -> Problem | None:
-        """Return the problem with so many times the integrator steps of what moves; None where that has no finer integrator."""
-        finer = self.moves.finer(self.real_integrator, factor)
-        if finer is None:
-            return None
-        return (
-            replace(self, reality=finer)
-            if self.reality
-            else replace(self, integrator=finer.integrator or self.integrator)
-        )
-
-    def require_equations(self, refusal: str) -> None:
-        """Raise where what moves is an object outside, which has no equations and is not run to answer a question.
-
-        Args:
-            refusal: the message: who needs equations, and what to do.
-
-        Raises:
-            NotSupported: with the refusal.
-        """
-        self.moves.require_equations(refusal)
+        return self if self.foreign is None else replace(self, reality=None)
 
     @property
     def real_integrator(self) -> Integrator:
@@ -339,7 +310,12 @@ class Problem(Checked):
     @property
     def disturbable(self) -> tuple[str, ...]:
         """Names that disturbances may have: of the inputs in the plant's order, then of what else moves."""
-        return disturbance_keys(self.plant.inputs, self.moves.disturbable(self.plant))
+        return disturbance_keys(self.plant.inputs, self._pushed)
+
+    @property
+    def _pushed(self) -> tuple[str, ...]:
+        """Names beside the inputs that disturbances may have; nothing reaches into an object outside."""
+        return () if self.foreign else (*self.real_plant.coordinates, *self.plant.outputs)
 
     @property
     def _needed(self) -> tuple[frozenset[str], tuple[str, ...]]:
@@ -610,64 +586,3 @@ def problem_facts(problem: Problem) -> tuple[str, ...]:
     """Return what sums up a problem: its name, its cycles, its quantities."""
     named = (problem.name,) if problem.name else ()
     return *named, f"{problem.cycles} cycles of {problem.period:g} {problem.time_unit}", *plant_facts(problem.plant)
-
-
-def _table(problem: Problem) -> str:
-    """Return HTML: one fact per row; what the problem does not have is left out."""
-    title = f"Problem {problem.name}".strip()
-    rows = [*_time_rows(problem), *_limit_rows(problem), *_other_rows(problem)]
-    return table(title, ("", "value"), rows, [f"Plant: {'; '.join(plant_facts(problem.plant))}."])
-
-
-def _time_rows(problem: Problem) -> list[tuple[str, str]]:
-    unit, horizon = problem.time_unit, problem.horizon
-    rows = [
-        (
-            "run",
-            f"{problem.cycles} cycles of {problem.period:g} {unit}, {problem.cycles * problem.period:g} {unit} in all",
-        ),
-        ("measured from", f"{problem.measure_from:g} {unit}"),
-        ("start", _values(dict(zip(problem.plant.state.elements, problem.start_state, strict=True)))),
-        ("judged", ", ".join(problem.judged_names)),
-    ]
-    if horizon is not None:
-        rows.append(
-            (
-                "horizon",
-                f"{horizon.stages} stages of {horizon.step:g} {unit}"
-                + (f" to {horizon.longest:g} {unit}" if horizon.lengths else ""),
-            )
-        )
-    return rows
-
-
-def _limit_rows(problem: Problem) -> list[tuple[str, str]]:
-    limits = problem.limits
-    rates = {f"{name} rate": f"the rate of {name}" for name in limits.rates}
-    members = limits.members(problem.plant, 1.0)  # of stages of any length: an interval is the same for all
-    return [(f"limits of {rates.get(n, n)}", _interval((one.lower, one.upper), one.unit)) for n, one in members]
-
-
-def _other_rows(problem: Problem) -> list[tuple[str, str]]:
-    unit, late = problem.time_unit, problem.dead_time
-    rows = [(f"dead time of {name}", f"{value:g} {unit}") for name, value in late.inputs.items()]
-    if late.measurement:
-        rows.append(("dead time of the measurement", f"{late.measurement:g} {unit}"))
-    rows += [(f"disturbance of {name}", type(one).__name__) for name, one in problem.disturbances.items()]
-    if problem.reality is not None:
-        rows.append(("reality", problem.reality.fact))
-    if not problem.sensing.ideal:
-        rows.append(("sensing", "with sensors or an estimator"))
-    believed = problem.sensing.believed(problem.plant)
-    if believed:
-        rows.append(("measured", ", ".join(problem.sensing.measures(problem.plant))))
-        rows.append(("observed", f"{', '.join(believed)}, by {type(problem.sensing.observer).__name__}"))
-    return rows
-
-
-def _interval(ends: tuple[float, float], unit: str) -> str:
-    return f"{number(ends[0])} to {number(ends[1])} {unit}".strip()
-
-
-def _values(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {behind_equals(value)}" for name, value in values.items())

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -19,9 +20,10 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, input_reaches_at, output_order
 from fpirhc.plant.integrators import Integrator, stiffness
-from fpirhc.plant.maps import check_time, over, unlike
+from fpirhc.plant.maps import over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
-from fpirhc.plant.plant import Plant, plant_facts
+from fpirhc.plant.parameter import Parameter
+from fpirhc.plant.plant import Plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +48,13 @@ class Reality(Checked):
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def symbolic(self) -> Reality:
-        """Itself: a plant whose equations are known."""
-        return self
+    foreign: ClassVar[None] = None  # no object outside
+    lag: ClassVar[Mapping[str, float]] = {}  # of its inputs: none beside what its equations have
 
     @property
-    def foreign(self) -> None:
-        """No object outside."""
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Whose exact values studies draw."""
+        return self.plant.parameters
 
     def with_exact(self, exact: np.ndarray) -> Reality:
         """Return the reality with other exact parameters, shape (np,).
@@ -62,38 +63,6 @@ class Reality(Checked):
             InvalidProblem: see `with_exact_parameters`.
         """
         return replace(self, plant=with_exact_parameters(self.plant, exact))
-
-    @property
-    def dead_time(self) -> Mapping[str, float]:
-        """That of its inputs: none, because it is the problem's."""
-        return {}
-
-    @property
-    def lag(self) -> Mapping[str, float]:
-        """That of its inputs: none beside what its equations have."""
-        return {}
-
-    @property
-    def drawn(self) -> Plant:
-        """Whose exact parameters studies draw."""
-        return self.plant
-
-    @property
-    def fact(self) -> str:
-        """What tables call it."""
-        return "; ".join(plant_facts(self.plant))
-
-    def require_equations(self, refusal: str) -> None:
-        """Nothing: its equations are known."""
-
-    def finer(self, integrator: Integrator, factor: int) -> Reality | None:
-        """Return it with so many times the steps of the integrator with which it moves; None where that has no finer one."""
-        finer = integrator.finer(factor)
-        return replace(self, integrator=finer) if finer else None
-
-    def disturbable(self, model: Plant) -> tuple[str, ...]:
-        """Return the names beside the inputs that disturbances may have: its coordinates, and outputs of the model."""
-        return (*self.plant.coordinates, *model.outputs)
 
     def over(self, cycle: float) -> Reality:
         """Return it as a controller with this cycle sees it; see `fpirhc.plant.maps.over`.
@@ -104,50 +73,70 @@ class Reality(Checked):
         plant = over(self.plant, cycle)
         return self if plant is self.plant else replace(self, plant=plant)
 
-    def check_steps(self, model: Plant, mistakes: Mistakes, *, at_once: bool) -> None:
-        """Add to `mistakes` where one of model and reality steps and the other does not, and a response needs both alike.
-
-        Args:
-            model: of the problem.
-            mistakes: of the problem.
-            at_once: whether the command moves everything controlled at once, so that no derivative is looked for.
-        """
-        check_time(self.plant, model, model.chains, mistakes, at_once=at_once)
-
-    def check(self, model: Plant, needed: Collection[str] | None = None, measured: Collection[str] = ()) -> None:  # noqa: ARG002
+    def check(self, model: Plant, needed: Collection[str], measured: Collection[str]) -> None:  # noqa: ARG002
         """Raise if the reality cannot stand for what the model describes.
 
         Args:
             model: of the problem.
-            needed: names of the model's coordinates that it must have; None: all. What else it has under the same name has the same
-                unit.
+            needed: names of the model's coordinates that it must have. What else it has under the same name has the same unit.
             measured: names of what the sensing uses, which follows from the coordinates.
 
         Raises:
             InvalidProblem: all mistakes together.
         """
-        mistakes = Mistakes("reality")
-        _check_inputs(self.plant, model, mistakes)
-        mistakes.unknown("seen: coordinate of the model", self.seen, {**model.coordinates, **followed_units(model)})
-        mistakes.unknown("seen: coordinate of the reality", self.seen.values(), self.plant.coordinates)
-        mistakes.unknown("start: state", self.start, self.plant.state.elements)
-        if self.plant.time_unit != model.time_unit:
+        plant, mistakes = self.plant, Mistakes("reality")
+        own, expected = (", ".join(f"{n} in {unit}" for n, unit in one.inputs.items()) for one in (plant, model))
+        if own != expected:
             mistakes.add(
-                f"its time is in {self.plant.time_unit}, the model's in {model.time_unit}; write both in one unit"
+                f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
             )
-        for name, unit in model.coordinates.items():
-            if needed is None or name in needed:
-                _check_coordinate(self.plant, self.seen, model, name, mistakes)
-            elif self.plant.coordinates.get(name, unit) != unit:
-                mistakes.add(_other_unit(self.plant, name, name, unit))
-        for name in model.outputs:
-            _check_expression(self.plant, self.seen, model, name, mistakes)
+        quantities = {**model.coordinates, **followed_units(model)}
+        mistakes.unknown("seen: coordinate of the model", self.seen, quantities)
+        mistakes.unknown("seen: coordinate of the reality", self.seen.values(), plant.coordinates)
+        mistakes.unknown("start: state", self.start, plant.state.elements)
+        if plant.time_unit != model.time_unit:
+            mistakes.add(f"its time is in {plant.time_unit}, the model's in {model.time_unit}; write both in one unit")
+        for name in quantities:
+            self._check_quantity(model, name, mistakes, needed=name in model.outputs or name in needed)
         mistakes.raise_if_any()
+
+    def _check_quantity(self, model: Plant, name: str, mistakes: Mistakes, *, needed: bool) -> None:
+        """Add what is wrong with what is measured or judged in the place of a coordinate or an output of the model."""
+        plant, units, seen = self.plant, self._units, self.seen.get(name, name)
+        what, unit = (
+            ("output", followed_units(model)[name])
+            if name in model.outputs
+            else ("coordinate", model.coordinates[name])
+        )
+        there = [one for one in dict.fromkeys((seen, name)) if one in units]
+        if needed and not there:
+            mistakes.add(
+                f"it has no {what} '{name}', which the model has; add it, or name what is measured in its place, "
+                f"Reality(seen={{'{name}': ...}}), or estimate it, Sensing(measured=..., observer=KalmanFilter(...)). "
+                f"It has {', '.join(units)}"
+            )
+        for one in there if needed else [name] * (name in units):
+            if units[one] != unit:
+                mistakes.add(f"its '{one}' is in {units[one]}, the model's '{name}' in {unit}; write both in one unit")
+        if not needed or seen not in units:
+            return
+        order = model.equations.output_orders[name] if what == "output" else model.orders[model.names.index(name)]
+        at_once = input_reaches_at(plant, seen, order - 1) if order else None
+        if at_once is not None:
+            mistakes.add(
+                f"its derivative {seen}{chr(39) * at_once} jumps with the command, but '{name}' has order {order} in the model; "
+                "give the model this order, or the reality an actuator or a coordinate of its own"
+            )
+        elif name in (model.controlled or model.chains) and output_order(plant, seen) is None:
+            mistakes.add(f"no input reaches its {what} '{seen}', however often it is differentiated")
 
     def shown(self, quantities: Sequence[str]) -> tuple[str, ...]:
         """Return those of the model's states, outputs and their derivatives that it has."""
-        own = _quantities_of(self.plant)
-        return tuple(e for e in quantities if self._own(e.rstrip("'"), seen=True) in own)
+        return tuple(e for e in quantities if self._own(e.rstrip("'"), seen=True) in self._units)
+
+    def shows(self, name: str) -> bool:
+        """Whether it has a coordinate or an output at which one of the model is judged."""
+        return self._own(name, seen=False) in self._units
 
     def function(self, quantities: Sequence[str], *, seen: bool = False) -> ca.Function:
         """Function (state, input, parameters, forcing) of what moves -> quantities of the model by name: "q1", "q1'", "y".
@@ -160,18 +149,17 @@ class Reality(Checked):
         return derivatives_function(self.plant, wanted)
 
     def start_state(self, model: Plant, start: np.ndarray) -> np.ndarray:
-        """Return the first state of the reality, shape (its nx,).
-
-        Args:
-            model: of the problem.
-            start: first state of the model, shape (nx,).
+        """Return the first state of the reality, shape (its nx,), from that of the model, shape (nx,).
 
         Raises:
             InvalidProblem: a state that neither the model nor `start` says.
         """
         elements = self.plant.state.elements
-        shared = {elements[there]: start[own] for own, there in self.shared(model).items()}
-        known = {**shared, **self.start}
+        known: dict[str, float] = {
+            self._own(e.rstrip("'"), seen=False) + "'" * e.count("'"): value
+            for e, value in zip(model.state.elements, start, strict=True)
+        }
+        known |= self.start
         free = [e for e in elements if e not in known]
         if free:
             raise InvalidProblem(
@@ -180,26 +168,14 @@ class Reality(Checked):
             )
         return np.array([float(known[e]) for e in elements])
 
-    def shared(self, model: Plant) -> dict[int, int]:
-        """Return the places of the states that both have: place in the model's state -> place in its own."""
-        elements, places = self.plant.state.elements, {}
-        for k, e in enumerate(model.state.elements):
-            own = self.true_name(e.rstrip("'")) + "'" * e.count("'")
-            if own in elements:
-                places[k] = elements.index(own)
-        return places
-
-    def shows(self, coordinate: str) -> bool:
-        """Whether it has a coordinate or an output at which one of the model is judged."""
-        return self.true_name(coordinate) in self._shown_quantities
-
-    def true_name(self, coordinate: str) -> str:
-        """Return its coordinate at which a coordinate of the model is judged."""
-        return coordinate if coordinate in self._shown_quantities else self.seen.get(coordinate, coordinate)
+    def _own(self, name: str, *, seen: bool) -> str:
+        """Its coordinate or output at which one of the model is measured, or judged."""
+        return name if not seen and name in self._units else self.seen.get(name, name)
 
     @cached_property
-    def _shown_quantities(self) -> dict[str, str]:
-        return _quantities_of(self.plant)
+    def _units(self) -> dict[str, str]:
+        """Of what it can show: its coordinates and its outputs."""
+        return {**self.plant.coordinates, **followed_units(self.plant)}
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
@@ -232,108 +208,22 @@ class Reality(Checked):
         plant = self.plant
         if plant is model:
             return plant
-        differences = [
-            f"the coordinate {c}, which the controller is not given" for c in plant.names if c not in model.names
-        ]
-        differences += [f"no coordinate {c}, which the model has" for c in model.names if c not in plant.names]
-        differences += [
-            f"the order {plant.orders[plant.names.index(c)]} of {c} in place of {order}"
-            for c, order in zip(model.names, model.orders, strict=True)
-            if c in plant.names and plant.orders[plant.names.index(c)] != order
-        ]
-        differences += [f"{own} measured in place of {c}" for c, own in self.seen.items()]
-        if not differences and plant.names != model.names:
-            differences = ["its coordinates in another order"]
-        if plant.output.elements != model.output.elements:
-            differences.append("other outputs")
-        if unlike(plant, model):
-            differences.append(unlike(plant, model))
-        if not differences and tuple(plant.controlled or plant.chains) != model.controlled_names:
-            differences = [
-                f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)"
-            ]
+        names = plant.names, model.names
+        differences = [f"the coordinate {c}, which the controller is not given" for c in names[0] if c not in names[1]]
+        differences += [f"no coordinate {c}, which the model has" for c in names[1] if c not in names[0]]
+        facts = {
+            "its coordinates in another order": names[0] == names[1],
+            "other orders": plant.orders == model.orders,
+            "other outputs": plant.output.elements == model.output.elements,
+            unlike(plant, model): not unlike(plant, model),
+            "another coordinate measured": not self.seen,
+            f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)": (
+                tuple(plant.controlled or plant.chains) == model.controlled_names
+            ),
+        }
+        differences = differences or [what for what, same in facts.items() if not same]
         require(
             not differences,
             f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out",
         )
-        same = tuple(plant.outputs) == tuple(model.outputs)
-        return plant if same else replace(plant, outputs=model.outputs)
-
-    def _own(self, name: str, *, seen: bool) -> str:
-        """Its coordinate or output for one of the model."""
-        return self.seen.get(name, name) if seen else self.true_name(name)
-
-
-def _quantities_of(plant: Plant) -> dict[str, str]:
-    """Return the units of what a reality can show: its coordinates and its outputs."""
-    return {**plant.coordinates, **followed_units(plant)}
-
-
-def _check_inputs(plant: Plant, model: Plant, mistakes: Mistakes) -> None:
-    """Add what is wrong with the reality's inputs, which are the model's."""
-    own, expected = ", ".join(plant.inputs), ", ".join(model.inputs)
-    if own != expected:
-        mistakes.add(
-            f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
-        )
-    for name, unit in plant.inputs.items():
-        other = model.inputs.get(name, unit)
-        if unit != other:
-            mistakes.add(f"its input '{name}' is in {unit}, the model's in {other}; write both in one unit")
-
-
-def _check_coordinate(plant: Plant, seen: Mapping[str, str], model: Plant, name: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the coordinate of a reality that stands for a coordinate of the model.
-
-    `seen`: name of the model's coordinate -> name of what is measured in its place. `name`: of the model's coordinate.
-    """
-    own, units, unit = seen.get(name, name), _quantities_of(plant), model.coordinates[name]
-    if own not in units:
-        if name not in seen:
-            followed = name in (model.controlled or model.chains)
-            believed = "" if followed else ", or estimate it: Sensing(measured=..., observer=KalmanFilter(...))"
-            mistakes.add(
-                f"it has no coordinate '{name}', which the model has and the controller is given; add it, or name the one that is "
-                f"measured in its place: Reality(seen={{'{name}': ...}}){believed}. Its coordinates: {', '.join(plant.coordinates)}"
-            )
-        return
-    for one in sorted({own, name} & set(units)):
-        if units[one] != unit:
-            mistakes.add(_other_unit(plant, one, name, unit))
-    order = model.orders[model.names.index(name)]
-    at_once = input_reaches_at(plant, own, order - 1)
-    if at_once is not None:
-        mistakes.add(
-            f"its derivative {own}{chr(39) * at_once} jumps with the command, but it is a state of the model, where '{name}' has "
-            f"the order {order}; give the model this order, or the reality a coordinate of its own"
-        )
-    elif name in (model.controlled or model.chains) and output_order(plant, own) is None:
-        mistakes.add(f"no input reaches its coordinate '{own}', however often it is differentiated")
-
-
-def _other_unit(plant: Plant, own: str, name: str, unit: str) -> str:
-    """Return the sentence about a coordinate in another unit."""
-    units = f"in {_quantities_of(plant)[own]}, the model's '{name}' in {unit}"
-    return f"its coordinate '{own}' is {units}; write both in one unit"
-
-
-def _check_expression(plant: Plant, seen: Mapping[str, str], model: Plant, name: str, mistakes: Mistakes) -> None:
-    """Add what is wrong with the output, or coordinate, of a reality that is judged or measured for an output of the model."""
-    unit, own = followed_units(model)[name], seen.get(name, name)
-    units = _quantities_of(plant)
-    if not {own, name} & set(units):
-        mistakes.add(
-            f"it has no output '{name}', which the model has and which is judged; give its plant this output too. Its coordinates "
-            f"and outputs: {', '.join(units)}"
-        )
-        return
-    for one in sorted({own, name} & set(units)):
-        if units[one] != unit:
-            mistakes.add(f"its '{one}' is in {units[one]}, the model's in {unit}; write both in one unit")
-    order = model.equations.output_orders[name]
-    at_once = input_reaches_at(plant, own, order - 1) if order and own in units else None
-    if at_once is not None:
-        mistakes.add(
-            f"its derivative {own}{chr(39) * at_once} jumps with the command, but '{name}' has the relative order {order} in the "
-            "model; give the model this order, or the reality an actuator"
-        )
+        return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)

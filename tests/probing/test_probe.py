@@ -106,8 +106,8 @@ def test_an_excited_run_finds_what_suits_the_plant():
     gain, dead, lag = 1.6, 2, 0.03
     problem = replace(body_problem(gain, dead, lag, 0.1), duration=1.5)
     assert isinstance(problem.reality, fp.ExternalPlant)
-    stated = replace(problem.reality, dead_time={"u": dead * PERIOD}, lag={"u": lag})
-    found = fp.probe(replace(problem, reality=stated), RHC, cycles=150)
+    late = {"reality": replace(problem.reality, lag={"u": lag}), "dead_time": fp.DeadTime(inputs={"u": dead * PERIOD})}
+    found = fp.probe(replace(problem, **late), RHC, cycles=150)
     assert found.dead_time["u"].value == dead
     assert found.gain["q"]["q"].low <= gain <= found.gain["q"]["q"].high
     assert found.lag["u"].low <= lag <= found.lag["u"].high

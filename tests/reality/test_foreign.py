@@ -64,9 +64,9 @@ def test_wrapped_plant_runs_as_the_plant_itself(controller, sensing):
     assert set(other.layout.names) - set(one.layout.names) - {"lost_sample"} == {"foreign", "foreign_held"}
 
 
-def test_dead_times_stand_around_the_body():
-    """The problem's dead times of input and measurement are those of the loop, whatever the body does."""
-    problem = task(dead_time=fp.DeadTime(inputs={"u": 0.002}, measurement=0.001))
+def test_a_late_measurement_stands_around_the_body():
+    """It is that of the loop, whatever the body does."""
+    problem = task(dead_time=fp.DeadTime(measurement=0.001))
     one, other = (run(p, CONTROLLERS["computed torque"]) for p in (problem, outside(problem)))
     assert np.abs(one["plant_state"] - other["plant_state"]).max() < 1e-12
 
@@ -91,10 +91,8 @@ def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
     law = CONTROLLERS["computed torque"]
     controller = fp.Predicted(law, inputs=0.002) if name == "predicted" else law
     problem = task(dead_time=fp.DeadTime(inputs={"u": 0.002}))
-    body = fp.ExternalPlant(Late(task()), measures=MEASURES, dead_time={"u": 0.002})
-    own = replace(task(), reality=body)
+    own = replace(problem, reality=fp.ExternalPlant(Late(task()), measures=MEASURES))
     assert own.response_delay == problem.response_delay == 2
-    assert replace(own, duration=0.1).dead_time.inputs == {"u": 0.002}
     inside, outside_ = run(problem, controller), run(own, controller)
     for signal in ("plant_state", "command"):
         assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
@@ -328,11 +326,12 @@ CART = fp.Plant(
 FORM = fp.ModelReferenced(fp.Affine(gain=-1.0))
 
 
-def cart(**facts) -> fp.Problem:
-    body = Cart(round(facts.get("dead_time", {}).get("u", 0.0) / CYCLE), facts.get("lag", {}).get("u", 0.0))
+def cart(late: float = 0.0, lag: float = 0.0) -> fp.Problem:
+    body = Cart(round(late / CYCLE), lag)
     return fp.Problem(
         plant=CART,
-        reality=fp.ExternalPlant(body, measures={"x": "m", "x'": "m/s", "x''": "m/s^2"}, **facts),
+        reality=fp.ExternalPlant(body, measures={"x": "m", "x'": "m/s", "x''": "m/s^2"}, lag={"u": lag}),
+        dead_time=fp.DeadTime(inputs={"u": late}),
         reference=fp.Trajectory(lambda t: {"x": 1 - ca.cos(2 * t)}),
         start={"x": 0.0},
         period=CYCLE,
@@ -352,7 +351,7 @@ def deformed(one: fp.Problem, form: fp.ModelReferenced) -> float:
     return float(np.abs(result["deformed"] - result["desired"]).max())
 
 
-@pytest.mark.parametrize("facts", [{"dead_time": {"u": LATE * CYCLE}}, {"lag": {"u": LAG}}], ids=["dead time", "lag"])
+@pytest.mark.parametrize("facts", [{"late": LATE * CYCLE}, {"lag": LAG}], ids=["dead time", "lag"])
 def test_an_exact_model_is_left_alone_behind_what_the_body_states(facts):
     """The form that knows of nothing deforms what needs no deformation."""
     one = cart(**facts)

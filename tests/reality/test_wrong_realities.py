@@ -46,11 +46,11 @@ WRONG: dict[str, tuple[Any, str]] = {
     "no output": (lambda: task(plant=OUTPUT, reality=fp.Reality(Y), cost=None, horizon=None,
                                reference=fp.Trajectory(lambda t: {"z": 0 * t})), "no output 'z'"),
     "unit": (lambda: real(replace(Y, coordinates={"y": "mm"})), "in mm, the model's 'y' in m;"),
-    "unit of an input": (lambda: real(replace(Y, inputs={"u": "kN"})), "'u' is in kN"),
+    "unit of an input": (lambda: real(replace(Y, inputs={"u": "kN"})), "its inputs are u in kN, the model's are u in N"),
     "unit of time": (lambda: real(replace(Y, time_unit="ms")), "time is in ms, the model's in s"),
     "other input": (
         lambda: real(replace(Y, inputs={"F": "N"}, response=lambda q, v, u, p: {"y": p.b * u.F})),
-        "inputs are F, the model's are u",
+        "inputs are F in N, the model's are u in N",
     ),
     "lower order": (
         lambda: real(fp.Plant({"y": "m"}, {"u": "N"}, parameters(), lambda q, u, p: {"y": p.b * u.u}, order=1)),
@@ -90,15 +90,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "unknown measure": (lambda: body(measures={**MEASURES, "yy": "m"}), "'yy' is unknown. Did you mean 'y'?"),
     "measured unit": (lambda: body(measures={**MEASURES, "y": "mm"}), "measures y in mm, the model has it in m"),
     "half a hold": (lambda: loose(holds=1.5), "holds: expected a whole number of at least 0, got 1.5"),
-    "an option": (lambda: loose(dead_times={}), "no field 'dead_times'. Did you mean 'dead_time'?"),
-    "a dead time": (lambda: loose(dead_time=0.002), "dead_time: expected {name: a finite number of at least 0}"),
-    "dead time twice": (
-        lambda: body(dead_time={"u": 0.002}) and task(
-            reality=loose(dead_time={"u": 0.002}), dead_time=fp.DeadTime(inputs={"u": 0.005})
-        ),
-        "state it once",
-    ),
-    "dead time of nobody": (lambda: body(dead_time={"v": 0.1}), "dead_time: input 'v' is unknown. Valid: u."),
+    "an option": (lambda: loose(rests={}), "no field 'rests'. Did you mean 'rest'?"),
+    "a lag of nothing": (lambda: loose(lag=0.002), "lag: expected {name: a finite number of at least 0}"),
     "a negative lag": (lambda: body(lag={"u": -0.1}), "lag['u']: expected a finite number of at least 0, got -0.1"),
     "an infinite lag": (lambda: body(lag={"u": math.inf}), "got inf"),
     "lag of nobody": (lambda: body(lag={"v": 0.1}), "input 'v' is unknown"),

@@ -128,8 +128,9 @@ class LabLoop:
 def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: Path) -> None:
     """Write the page of some controllers of a task, which `fpirhc.load_problem` finds by `file`."""
     problem = task.problem
-    problem.require_equations(
-        "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
+    require(
+        problem.equations_known,
+        "a lab runs the plant's equations in the page; a plant outside Python's equations has none",
     )
     require(
         not loses(moving(problem)),
