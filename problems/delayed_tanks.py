@@ -63,7 +63,8 @@ problem = fp.Problem(
     period=PERIOD,
     duration=300.0,  # s
     limits=fp.Limits(inputs={"u": (0.0, 150.0)}),  # ml/s
-    dead_time=fp.DeadTime(inputs={"u": DEAD_TIME}, before={"u": 61.4}),  # ml/s: what keeps 0.12 m
+    dead_time=fp.DeadTime(inputs={"u": DEAD_TIME}),
+    input_before={"u": 61.4},  # ml/s: what keeps 0.12 m
     horizon=fp.Horizon(stages=30, step=1.0),
     cost=fp.Quadratic(states={"h2": 1e4, "h2'": 1e3}, deviation={"u": 1e-4}),
     measure_from=30.0,  # s

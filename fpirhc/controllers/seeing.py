@@ -115,7 +115,7 @@ def check_observed(problem: Problem) -> None:
         hidden = [plant.state.elements[k] for k in members(basis)]
         raise NoAnswer(
             f"{type(observer).__name__}: {' and '.join(hidden)} cannot be observed along the reference from {', '.join(names)}, "
-            f"and an error of the estimate does not decay (pole {pole:.3g} {problem.rate_unit}); measure {hidden[0]}, or "
+            f"and an error of the estimate does not decay (pole {pole:.3g} 1/{problem.time_unit}); measure {hidden[0]}, or "
             "another quantity that depends on it"
         )
 

@@ -1,8 +1,7 @@
-"""The model on the reference: its state where the reference gives it, else a simulation with the feedforward; and its gain there.
+"""The model on the reference: its state where the reference gives it, else a simulation with the feedforward.
 
 A state that is an output, or a derivative of one, has a reference. Inner states have none. Along a horizon they are simulated from
 the start, x_{i+1} = F(x_i, u_i), with the input that the model needs for the nominal response, u_i = inverse(x_i, y^(r),N_i).
-The relative order of an output is decided from the symbols; the gain d y^(r)/du may still vanish at some states of this run.
 """
 
 from __future__ import annotations
@@ -25,8 +24,6 @@ from fpirhc.task.reference import Reference
 _CYCLES = 20_000  # of a run that are looked at
 _DECAYS = 20.0  # times in a run, by which the error of the start decays
 _FASTEST = 0.1  # of the cycle, the rate of this decay
-_NOTHING = 1e-9  # share of the largest gain that counts as none
-_SMALL = 1e-2  # share of the largest gain before a run that is not finite
 
 
 def require_reference_of_states(plant: Plant, refusal: str) -> None:
@@ -175,39 +172,6 @@ def nominal_run(
     rate = min(_DECAYS / (period * times[1]), _FASTEST / period)
     ends = np.array(bounds[0]), np.array(bounds[1])
     return nominal_motion(plant, reference, step, np.array(start), ends, period * np.arange(cycles), rate)
-
-
-def singular_gain(plant: Plant, states: np.ndarray, inputs: np.ndarray, period: float) -> str:
-    """Return a sentence that says where the gain vanishes or changes its sign, and its values; empty where it does not."""
-    x, u, p = plant.symbols()
-    response, count = plant.equations.controlled_response(x, u, p), states.shape[1]
-    gain = ca.Function("fpirhc_output_gain", [x, u, p], [ca.densify(ca.det(ca.jacobian(response, u)))])
-    believed = np.repeat(plant.approximate[:, None], count, axis=1)
-    gains = np.asarray(gain.map(count)(states, inputs, believed).full()).ravel()
-    return _judged(plant, gains, states, period)
-
-
-def _judged(plant: Plant, gains: np.ndarray, states: np.ndarray, period: float) -> str:
-    finite = np.isfinite(gains)
-    count = len(gains) if finite.all() else int(np.argmin(finite))
-    if not count:
-        return ""
-    sizes, first = np.abs(gains[:count]), np.sign(gains[0])
-    wrong = (sizes <= _NOTHING * sizes.max()) | (np.sign(gains[:count]) != first)
-    if wrong.any():
-        k = int(np.argmax(wrong))
-    elif count < len(gains) and sizes[-1] <= _SMALL * sizes.max():
-        k = count - 1
-    else:
-        return ""
-    where = ", ".join(f"{e} = {v:.4g}" for e, v in zip(plant.state.elements, states[:, k], strict=True))
-    what = "gain" if len(plant.inputs) == 1 else "determinant of the gain"
-    inputs, outputs = ", ".join(plant.inputs), ", ".join(plant.controlled_names)
-    return (
-        f"the {what} from {inputs} to {outputs} vanishes along the model's nominal run: it is {gains[0]:.4g} at the start and "
-        f"{gains[k]:.4g} at t = {k * period:.4g} {plant.time_unit} ({where}). The relative order changes there; choose another "
-        "output, or a reference that stays away from it"
-    )
 
 
 _STEPS = 4

@@ -88,7 +88,7 @@ def watch_block(problem: Problem, controller: Controller, status: str, *, longes
 def _iterates(problem: Problem, controller: Controller) -> bool:
     """Whether the map compares the last request with its response, undelayed."""
     deformation = controller.deformation
-    direct = not problem.answers_late and controller.deforms == "response"
+    direct = not problem.response_delay and controller.deforms == "response"
     return deformation.adapts and of_last_pair(deformation) and direct and deformation.effective_gain() != 0
 
 

@@ -79,7 +79,7 @@ def _of_errors(problem: Problem, trace: Layout) -> _Entries:
     """Errors that no reference explains: the loop has run away, whatever its signals still are."""
     signal = trace[next(name for name in _ERRORS if name in trace)]
     plant, first = problem.plant, trace.slice(signal.name).start
-    function = problem.reference_function
+    function = problem.reference.function(plant)
 
     def moved() -> np.ndarray:
         times = np.linspace(0.0, problem.duration, _INSTANTS)

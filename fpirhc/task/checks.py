@@ -95,22 +95,20 @@ def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
     return MapSteps()
 
 
-def needed_measurements(plant: Plant, sensing: Sensing) -> tuple[str, ...]:
-    """Return the names of what is measured: by sensors, and the state that is given beside outputs where nothing is believed."""
+def needed_names(
+    plant: Plant, sensing: Sensing, judged: Sequence[str] | None
+) -> tuple[frozenset[str], tuple[str, ...]]:
+    """Return the names of the model's coordinates and outputs that what moves must have, and of what is measured.
+
+    Measured is what sensors show, and the state that is given beside outputs where nothing is believed. `judged`: names whose
+    errors are judged beside the controlled ones; None: no other need be there.
+    """
     beside = measured_signals(plant)[:-1] if sensing.observer is None else ()
     states = [element for signal in beside for element in signal.elements]
-    return tuple(dict.fromkeys((*states, *sensing.measures(plant))))
-
-
-def needed_names(plant: Plant, sensing: Sensing, judged: Sequence[str] | None) -> frozenset[str]:
-    """Return the names of the model's coordinates and outputs that the plant that moves must have.
-
-    `judged`: names whose errors are judged beside the controlled ones; None: no other need be there.
-    """
+    measured = tuple(dict.fromkeys((*states, *sensing.measures(plant))))
     if sensing.observer is None:
-        return frozenset((*plant.coordinates, *followed_units(plant)))
-    measured = (name.rstrip("'") for name in needed_measurements(plant, sensing))
-    return frozenset((*measured, *(judged or ()), *plant.controlled_names))
+        return frozenset((*plant.coordinates, *followed_units(plant))), measured
+    return frozenset((*(name.rstrip("'") for name in measured), *(judged or ()), *plant.controlled_names)), measured
 
 
 def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:

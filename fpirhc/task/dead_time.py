@@ -13,7 +13,7 @@ import casadi as ca
 
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Finite, NotNegative
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, entry_at, total
@@ -32,13 +32,10 @@ class DeadTime(Checked):
     Args:
         inputs: dead time by input; zero where not named. An external plant has it itself, so that it is not simulated.
         measurement: dead time of the state and the response. At first the queue holds the start.
-        before: commands that are on their way at the start, by input. `Problem(input_before=...)` says the
-            same, and also serves problems without dead time.
     """
 
     inputs: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"structure": True})
     measurement: NotNegative = field(default=0.0, metadata={"structure": True})
-    before: Mapping[str, Finite] = field(default_factory=dict)
 
     def over(self, period: float) -> DeadTime:
         """Return it without dead times that are below the rounding of a cycle, as .3 - .1 - .2 is."""
@@ -77,7 +74,6 @@ class DeadTime(Checked):
         """
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
-        mistakes.unknown("before: input", self.before, plant.inputs)
         for name, value in {**self.inputs, MEASUREMENT: self.measurement}.items():
             if value > MOST * period:
                 mistakes.add(

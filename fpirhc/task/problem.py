@@ -18,7 +18,7 @@ from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.nominal import nominal_run, singular_gain
+from fpirhc.horizon.nominal import nominal_run
 from fpirhc.plant.chain import differentiated_signals, measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
@@ -29,7 +29,7 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Signal
-from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_measurements, needed_names, settled_maps
+from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
 from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
@@ -40,7 +40,6 @@ from fpirhc.task.reference import Reference
 
 _WHOLE = 1e-6  # cycles by which a duration may miss a whole number of them
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
-_TRIED = 8  # states near the start, at which an input may have an effect that it lacks there
 # Cached properties that depend on the exact parameters.
 _OF_EXACT = ("truth", "real_start", "start_output", "first_shown", "of_equations")
 _INSTANTS = 101  # at which signals from outside are tried before a run
@@ -66,8 +65,7 @@ class Problem(Checked):
         cost: of such a plan.
         integrator: of the simulated plant; a map has none.
         input_before: inputs before the first cycle, by name. The first rate and the first weight of a rate are counted from them,
-            and they act until the first command arrives. An input that is not named has the value of `DeadTime(before=...)`, or
-            else zero, moved into its limits.
+            and they act until the first command arrives. An input that is not named is at zero, moved into its limits.
         measure_from: time from which metrics count; the transient before it is left out.
         judged: coordinates, or outputs of a plant that has some, whose errors are logged and measured; None: the controlled ones,
             and those that the cost weighs.
@@ -122,21 +120,21 @@ class Problem(Checked):
         names = [*self.disturbable, *shared]
         what = "input, coordinate or output" if plant.outputs else "input or coordinate"
         mistakes.unknown(f"disturbances: {what}", self.disturbances, names)
-        instants = np.array([0.0, self.period])
-        check_signals(self._plants, self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes)
+        check_signals(
+            dict.fromkeys((plant, self.real_plant)), self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes
+        )
         checks = (
-            lambda: self._check_derivatives(instants),
+            lambda: self._check_disturbances(),
             lambda: self.limits.check(plant),
             lambda: check_names(self.horizon, self.limits) if self.horizon else None,
             lambda: _check_reference(self),
             lambda: check_steps(plant, self.limits, self.reference.set_points),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
-            lambda: self.reality.check(plant, *self._needed) if self.reality else None,
+            lambda: (
+                self.reality.check(plant, *needed_names(plant, self.sensing, self.judged)) if self.reality else None
+            ),
         )
-        for name, one in self.disturbances.items():
-            with mistakes.caught(f"disturbances: '{name}': "):
-                one.values(instants, np.random.default_rng(0))
         for check in checks:
             with mistakes.caught():
                 check()
@@ -145,8 +143,12 @@ class Problem(Checked):
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
-        mistakes.raise_if_any()
-        _check_outputs(self, mistakes)
+        smooth = not_held(self.signals, differentiated_signals(plant))
+        if smooth:
+            mistakes.add(
+                f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state it "
+                "in steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
+            )
         mistakes.raise_if_any()
         if self.reality is not None:
             self.reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
@@ -164,11 +166,6 @@ class Problem(Checked):
         """Number of control cycles in a run."""
         return round(self.duration / self.period)
 
-    @property
-    def rate_unit(self) -> str:
-        """Unit of a rate: 1/s, or one per unit of time."""
-        return f"1/{self.time_unit}"
-
     @cached_property
     def judged_names(self) -> tuple[str, ...]:
         """Coordinates whose errors are logged and measured."""
@@ -176,11 +173,7 @@ class Problem(Checked):
             return tuple(self.judged)
         weighed = (self.cost.tracked if self.cost is not None else None) or {}
         controlled = self.plant.controlled_names
-        return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self._shows(n)))
-
-    def _shows(self, name: str) -> bool:
-        """Whether the plant that moves has a coordinate or an output of the model."""
-        return self.moves.shows(name)
+        return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self.moves.shows(n)))
 
     @property
     def sees_plant(self) -> bool:
@@ -243,11 +236,6 @@ class Problem(Checked):
         mistakes.raise_if_any()
         return other
 
-    @cached_property
-    def reference_function(self) -> ca.Function:
-        """The reference's Function for this plant."""
-        return self.reference.function(self.plant)
-
     @property
     def of_model(self) -> Problem:
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
@@ -273,11 +261,7 @@ class Problem(Checked):
 
     @cached_property
     def real_start(self) -> np.ndarray:
-        """First state of the plant that a run moves.
-
-        Raises:
-            InvalidProblem: a reality whose own states neither are given nor settle.
-        """
+        """First state of the plant that a run moves."""
         return self.truth.start_state(self.plant, self.start_state)
 
     @property
@@ -297,15 +281,21 @@ class Problem(Checked):
         middle = self.period / 2 / self.signal_steps
         return rows_of(real_values(plant, self.signals), np.array([middle]), plant.exact)[0]
 
-    def _check_derivatives(self, instants: np.ndarray) -> None:
-        """Raise if the disturbance of an output does not have the derivatives that are needed."""
+    def _check_disturbances(self) -> None:
+        """Raise if a disturbance has no values, or one of an output not the derivatives that are needed."""
+        mistakes, instants = Mistakes("disturbances"), np.array([0.0, self.period])
+        for name, one in self.disturbances.items():
+            with mistakes.caught(f"'{name}': "):
+                one.values(instants, np.random.default_rng(0))
         for name, order in self.disturbed_outputs.items():
             if response_age(self.plant) * order > 1:
-                raise InvalidValue(
-                    f"disturbances: the output '{name}' of a map has relative order {order}, and its differences look ahead to "
-                    "unknown disturbances; disturb a state or an input, or an output of order 1"
+                mistakes.add(
+                    f"the output '{name}' of a map has relative order {order}, and its differences look ahead to unknown "
+                    "disturbances; disturb a state or an input, or an output of order 1"
                 )
-            self.disturbances[name].derivative(instants, 1)
+            with mistakes.caught():
+                self.disturbances[name].derivative(instants, 1)
+        mistakes.raise_if_any()
 
     @property
     def disturbable(self) -> tuple[str, ...]:
@@ -317,16 +307,6 @@ class Problem(Checked):
         """Names beside the inputs that disturbances may have; nothing reaches into an object outside."""
         return () if self.foreign else (*self.real_plant.coordinates, *self.plant.outputs)
 
-    @property
-    def _needed(self) -> tuple[frozenset[str], tuple[str, ...]]:
-        """Names of the model's coordinates and outputs that what moves must have, and of the quantities that are measured."""
-        return needed_names(self.plant, self.sensing, self.judged), needed_measurements(self.plant, self.sensing)
-
-    @property
-    def _plants(self) -> tuple[Plant, ...]:
-        """The model, and another plant that moves."""
-        return tuple(dict.fromkeys((self.plant, self.real_plant)))
-
     @cached_property
     def start_state(self) -> np.ndarray:
         """First state, shape (nx,)."""
@@ -337,8 +317,7 @@ class Problem(Checked):
         """Inputs before the first cycle, shape (nu,)."""
         lower, upper = self.limits.input_bounds(self.plant)
         resting = np.clip(np.zeros(len(self.plant.inputs)), lower, upper)
-        stated = {**self.dead_time.before, **self.input_before}
-        values = [stated.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
+        values = [self.input_before.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
         return np.array(values, dtype=float)
 
     @cached_property
@@ -395,11 +374,6 @@ class Problem(Checked):
         It is the sum of dead time and estimator, for the slowest input and coordinate.
         """
         return self.dead_time.longest / self.period + self.sensing.delay(self.plant, self.period)
-
-    @property
-    def answers_late(self) -> bool:
-        """Whether a response may take longer than the one cycle of every loop."""
-        return bool(self.dead_time.queued) or self.sensing.delay(self.plant, self.period) > 0
 
     @property
     def warm_up_cycles(self) -> float:
@@ -466,26 +440,6 @@ def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
         lower, upper = problem.limits.inputs.get(name, (-math.inf, math.inf))
         if not math.isfinite(value) or not lower <= value <= upper:
             mistakes.add(f"input_before: '{name}' must be a finite number within its limits, got {value!r}")
-        if problem.dead_time.before.get(name, value) != value:
-            other = problem.dead_time.before[name]
-            mistakes.add(f"input_before: '{name}' is {value!r}, but dead_time has before={other!r}; state it once")
-
-
-def _check_outputs(problem: Problem, mistakes: Mistakes) -> None:
-    """Add what speaks against outputs in this problem."""
-    plant = problem.plant
-    if not plant.outputs:
-        return
-    smooth = not_held(problem.signals, differentiated_signals(plant))
-    if smooth:
-        mistakes.add(
-            f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state it in "
-            "steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
-        )
-    if len(plant.inputs) == len(plant.controlled or plant.chains):
-        singular = singular_gain(plant, *problem.nominal_run, problem.period)
-        if singular:
-            mistakes.add(f"outputs: {singular}")
 
 
 _GAINS: Latest[ca.Function] = Latest(4)
@@ -536,16 +490,16 @@ def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = 
                 "start elsewhere, or change what is divided by zero there"
             )
         elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
-            weakest = plant.input.elements[int(np.argmin(np.linalg.norm(gain, axis=0)))]
-            if _switched(plant, weakest):
-                mistakes.add(
-                    f"input '{weakest}' is switched: the response depends on it by a step alone (if_else, floor, sign), which "
-                    "has no slope; write its mean, a number from 0 to 1, and switch in the reality: Reality(plant=...)"
-                )
-                return
+            weakest = int(np.argmin(np.linalg.norm(gain, axis=0)))
+            x, u, p = plant.symbols()
+            reached = np.asarray(ca.DM(ca.jacobian_sparsity(plant.equations.rate(x, u, p), u), 1).full())[:, weakest]
+            moved = ", ".join(
+                f"the rate of {e}" for e, moves in zip(plant.state.elements, reached, strict=True) if moves
+            )
             mistakes.add(
-                f"the response ({which} parameters) is not invertible at the start ({state}): input '{weakest}' has no "
-                f"independent effect there{_remedy(problem, gain_of, values, weakest)}"
+                f"the response ({which} parameters) is not invertible at the start ({state}): input '{plant.input.elements[weakest]}' "
+                "has no independent effect there; start elsewhere, or give Plant(inverse=...), or control what follows from "
+                f"{moved or 'another input'}. In a switch (if_else, floor, sign) it has no slope: write its mean"
             )
 
 
@@ -554,32 +508,6 @@ def _gain(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     response = plant.equations.controlled_response(x, u, p)
     return ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
-
-
-def _switched(plant: Plant, name: str) -> bool:
-    """Whether the response depends on an input, and nowhere by a slope."""
-    x, u, p = plant.symbols()
-    response, place = plant.equations.controlled_response(x, u, p), plant.input.elements.index(name)
-    depends = np.asarray(ca.DM(ca.jacobian_sparsity(response, u), 1).full())[:, place]
-    return bool(depends.any()) and bool(ca.jacobian(response, u)[:, place].is_zero())
-
-
-def _remedy(problem: Problem, gain_of: ca.Function, values: np.ndarray, weakest: str) -> str:
-    """What helps where an input has no effect of its own at the start: another start; another output where it has none nearby."""
-    plant, random = problem.plant, np.random.default_rng(0)
-    for _ in range(_TRIED):
-        x, u = (
-            v + 0.1 * np.maximum(1, abs(v)) * random.normal(size=len(v))
-            for v in (problem.start_state, problem.inputs_before)
-        )
-        gain = np.asarray(gain_of(x, u, values)[0].full())
-        if np.isfinite(gain).all() and np.linalg.matrix_rank(gain) == len(gain):
-            return "; start elsewhere, or give Plant(inverse=...)"
-    x, u, p = plant.symbols()
-    rates = ca.jacobian_sparsity(plant.equations.rate(x, u, p), u)
-    column = np.asarray(ca.DM(rates, 1).full())[:, plant.input.elements.index(weakest)]
-    moved = ", ".join(f"the rate of {e}" for e, moves in zip(plant.state.elements, column, strict=True) if moves)
-    return f", nor near it. It moves {moved or 'nothing'} first: control what follows from that, or leave the input out"
 
 
 def problem_facts(problem: Problem) -> tuple[str, ...]:

@@ -131,7 +131,7 @@ reference that is not finite
     mine.py, line 23 ... reference: at t = 0 s angle' is inf, angle'' is -inf ... give a motion that has these values
 an input that is switched
   u.torque - p.friction -> ca.if_else(u.torque > 0.5, 1, 0) - p.friction
-    input 'torque' is switched: the response depends on it by a step alone ... write its mean
+    input 'torque' has no independent effect there ... In a switch (if_else, floor, sign) it has no slope: write its mean
 response that divides by zero
   ca.sin(q.angle) -> ca.sin(q.angle) / q.angle
     the response of 'angle' (approximate parameters) is not finite at the start (angle = 0, angle' = 0) ... start elsewhere, or

@@ -26,10 +26,13 @@ ESTIMATORS = (
 )
 QUANTA = {"q1": fp.Sensor(quantum=1e-5), "q2": fp.Sensor(quantum=3e-5)}
 WAITS = (
-    fp.DeadTime(),
-    fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3}),
-    fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 8e-3}, measurement=2e-3),
-    fp.DeadTime(inputs={"Q1": 2e-3, "Q2": 2e-3}, measurement=1e-3, before={"Q1": -20.0, "Q2": -30.0}),
+    {},
+    {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 3e-3})},
+    {"dead_time": fp.DeadTime(inputs={"Q1": 3e-3, "Q2": 8e-3}, measurement=2e-3)},
+    {
+        "dead_time": fp.DeadTime(inputs={"Q1": 2e-3, "Q2": 2e-3}, measurement=1e-3),
+        "input_before": {"Q1": -20.0, "Q2": -30.0},
+    },
 )
 
 
@@ -49,7 +52,7 @@ def short(problem: fp.Problem, cycles: int = 150) -> fp.Problem:
 def test_null_behind_sensors_and_dead_time(estimator, wait):
     """An exact model is left alone to rounding: late, rounded and smoothed alike, the two responses are the same number."""
     quanta = QUANTA if isinstance(estimator, fp.PositionDifference) else {}
-    late = replace(tasks.two_mass.problem, dead_time=wait, sensing=fp.Sensing(quanta, estimator))
+    late = replace(tasks.two_mass.problem, **wait, sensing=fp.Sensing(quanta, estimator))
     problem = short(with_exact_model(late))
     referenced = fp.ModelReferenced(SIGMOID, **told(problem))
     assert change(problem, fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, referenced)) <= 1e-9
@@ -58,7 +61,7 @@ def test_null_behind_sensors_and_dead_time(estimator, wait):
 @pytest.mark.parametrize("wait", WAITS[1:], ids=("inputs", "both", "before"))
 def test_null_with_a_measured_response_and_dead_time(wait):
     """The same with ideal sensors, and under a prediction: the mirror sees the measured state, not the predicted one."""
-    problem = short(with_exact_model(replace(tasks.two_mass.problem, dead_time=wait)))
+    problem = short(with_exact_model(replace(tasks.two_mass.problem, **wait)))
     law, adaptive = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID, **told(problem)))
     assert change(problem, law, adaptive) <= 1e-9
     ahead: Any = {"inputs": 3e-3, "measurement": 1e-3}

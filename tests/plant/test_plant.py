@@ -218,7 +218,7 @@ HARD: dict[str, Any] = {
         {"left": "N", "right": "N", "bow": "N"},
         lambda q, v, u, p: {"x": u.left + u.right + u.bow, "heading": u.right - u.left},
     ),
-    "'v' has no independent effect there, nor near it. It moves the rate of b first": lambda: acting(
+    "'v' has no independent effect there; .* control what follows from the rate of b": lambda: acting(
         lambda x, _: 2 * x.a, 0.0
     ),
     "'v' has no independent effect there; start elsewhere": lambda: acting(lambda x, _: x.b**2, 0.0),

@@ -76,8 +76,9 @@ def covariance(stepper: fp.Stepper, result: fp.Run, size: int) -> np.ndarray:
 
 def test_behind_dead_time_states_are_those_of_the_samples():
     """Commands one and samples two cycles late: every believed state is the one of that time, to rounding."""
-    dead_time = fp.DeadTime(inputs={"u": 1 / 6}, measurement=2 / 6, before={"u": 9.0})
-    result = run(infusion(KALMAN, dead_time=dead_time, duration=15.0), fp.ExactModel(CTC))
+    dead_time = fp.DeadTime(inputs={"u": 1 / 6}, measurement=2 / 6)
+    problem = infusion(KALMAN, dead_time=dead_time, input_before={"u": 9.0}, duration=15.0)
+    result = run(problem, fp.ExactModel(CTC))
     true = result["plant_state"]
     expected = true[1:-2]
     np.testing.assert_allclose(result["state"][3:], expected, atol=1e-11)

@@ -44,24 +44,19 @@ def test_it_is_zero_or_the_nearest_limit_unless_it_is_given():
     ):
         problem = replace(PROBLEM, limits=fp.Limits(inputs=limits), input_before=given)
         assert problem.inputs_before.tolist() == [expected]
-    late = fp.DeadTime(inputs={"u": 0.02}, before={"u": 4.0})
-    assert replace(PROBLEM, dead_time=late).inputs_before.tolist() == [4.0]
-    assert replace(PROBLEM, dead_time=late, input_before={"u": 4.0}).inputs_before.tolist() == [4.0]
 
 
 @pytest.mark.parametrize(
-    ("before", "dead_time", "message"),
+    ("before", "message"),
     [
-        ({"w": 1.0}, {}, "input_before: input 'w' is unknown"),
-        ({"u": 99.0}, {}, "'u' must be a finite number within its limits, got 99.0"),
-        ({"u": float("inf")}, {}, "finite"),
-        ({"u": 1.0}, {"u": 2.0}, "state it once"),
+        ({"w": 1.0}, "input_before: input 'w' is unknown"),
+        ({"u": 99.0}, "'u' must be a finite number within its limits, got 99.0"),
+        ({"u": float("inf")}, "finite"),
     ],
 )
-def test_mistakes_are_named(before, dead_time, message):
-    late = fp.DeadTime(inputs={"u": 0.02}, before=dead_time)
+def test_mistakes_are_named(before, message):
     with pytest.raises(InvalidProblem, match=message):
-        replace(PROBLEM, limits=fp.Limits(inputs={"u": (-10.0, 10.0)}), dead_time=late, input_before=before)
+        replace(PROBLEM, limits=fp.Limits(inputs={"u": (-10.0, 10.0)}), input_before=before)
 
 
 def test_the_first_weight_of_a_rate_is_counted_from_it():
