@@ -19,7 +19,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.task.limits import Limit, Limits
+from fpirhc.task.limits import Limits, PathConstraint
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ def read_before(limits: Limits, plant: Plant, step: float) -> bool:
     return any("input_before" in _read_by(name, one, plant) for name, one in limits.written(plant, step).items())
 
 
-def _read_by(name: str, one: Limit, plant: Plant) -> frozenset[str]:
+def _read_by(name: str, one: PathConstraint, plant: Plant) -> frozenset[str]:
     return read_by(plant, lambda view: [one.named_value(name, view)])
 
 
@@ -75,7 +75,7 @@ def check_names(horizon: Horizon, limits: Limits) -> None:
     mistakes.raise_if_any()
 
 
-def _entry_of(name: str, one: Limit, view: View) -> ConstraintState:
+def _entry_of(name: str, one: PathConstraint, view: View) -> ConstraintState:
     return ConstraintState(name, one.unit, one.named_value(name, view), one.lower, one.upper)
 
 

@@ -6,7 +6,7 @@ Theory: docs/theory.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias
 
@@ -118,7 +118,7 @@ def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndar
 
 
 def check_signals(
-    plants: Sequence[Plant], signals: Mapping[str, Exogenous], times: np.ndarray, mistakes: Mistakes
+    plants: Collection[Plant], signals: Mapping[str, Exogenous], times: np.ndarray, mistakes: Mistakes
 ) -> None:
     """Add every mistake of the signals to `mistakes`. `plants`: the model, and the plant of a reality where there is one."""
     units: dict[str, str] = {}

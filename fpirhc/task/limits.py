@@ -1,15 +1,11 @@
-"""Limits of inputs, states, rates and paths by name. A quantity that is not named is free.
-
-Every limit is a member of the contract `Limit`: one scalar of a stage, in an interval.
-"""
+"""Limits of inputs, states, rates and paths by name. A quantity that is not named is free."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import Protocol
 
 import numpy as np
 
@@ -24,6 +20,7 @@ from fpirhc.symbolic.layout import Named
 from fpirhc.symbolic.open import nominal
 
 Interval = tuple[float, float]
+_FREE = (-math.inf, math.inf)
 
 
 class OfStage(Protocol):
@@ -36,49 +33,9 @@ class OfStage(Protocol):
     parameters: Named
 
 
-class Limit(Checked, ABC):
-    """Contract: lower <= c(x_i, u_i) <= upper in stages i = 0 ... N-1 of a plan, with one scalar c.
-
-    Concrete limits are frozen dataclasses; they stand in `Limits(paths={name: ...})`.
-    """
-
-    if TYPE_CHECKING:
-
-        @property
-        def lower(self) -> float:
-            """Lower end of the interval; infinite where free."""
-
-        @property
-        def upper(self) -> float:
-            """Upper end of the interval; infinite where free."""
-
-        @property
-        def unit(self) -> str:
-            """Unit of the scalar."""
-
-    else:  # plain attributes, so that dataclasses may have fields of these names
-        lower, upper, unit = -math.inf, math.inf, ""
-
-    @abstractmethod
-    def value(self, view: OfStage) -> Value:
-        """Return the limited scalar of a stage, of a `View`: view.state.q1, view.input.Q1, view.output.y, view.parameters.m1."""
-
-    def named_value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
-        """Return the limited scalar of a stage, checked.
-
-        Args:
-            symbols: those that the view is made of; without them any.
-
-        Raises:
-            InvalidProblem: it fails, or is no scalar of the view.
-        """
-        what = f"limits: paths['{name}']"
-        return scalar_expression(what, called(what, self.value, view), symbols=symbols, finite=False)
-
-
 @dataclass(frozen=True, eq=False)
-class PathConstraint(Limit):
-    """A limit on any expression of a stage.
+class PathConstraint(Checked):
+    """A limit on any expression of a stage: lower <= c(x_i, u_i) <= upper in stages i = 0 ... N-1 of a plan, with one scalar c.
 
     Args:
         expression: function of a View (view.state.q1, view.input.Q1, view.parameters.m1, ...) that returns one scalar.
@@ -92,34 +49,17 @@ class PathConstraint(Limit):
     upper: float = math.inf
     unit: str = ""
 
-    def value(self, view: OfStage) -> Value:
-        return self.expression(view)
+    def named_value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
+        """Return the limited scalar of a stage, checked.
 
+        Args:
+            symbols: those that the view is made of; without them any.
 
-@dataclass(frozen=True, eq=False)
-class _Box(Limit):
-    part: str  # of a stage, 'input' or 'state', which may have entries of one name
-    name: str  # of the entry
-    lower: float  # lower end of the interval
-    upper: float  # upper end of the interval
-    unit: str
-
-    def value(self, view: OfStage) -> Value:
-        return cast(Value, getattr(view, self.part)[self.name])
-
-
-@dataclass(frozen=True, eq=False)
-class _Rate(Limit):
-    """The change of an input per unit of time, from stage to stage."""
-
-    input: str
-    step: float
-    lower: float  # lower end of the interval
-    upper: float  # upper end of the interval
-    unit: str
-
-    def value(self, view: OfStage) -> Value:
-        return (view.input[self.input] - view.input_before[self.input]) / self.step
+        Raises:
+            InvalidProblem: it fails, or is no scalar of the view.
+        """
+        what = f"limits: paths['{name}']"
+        return scalar_expression(what, called(what, self.expression, view), symbols=symbols, finite=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +75,7 @@ class Limits(Checked):
         states: intervals (lower, upper) by name of the state (q1, q1', ...).
         rates: intervals of the change of inputs per second, from stage to stage of a plan and from cycle to cycle of the command,
             by name of the input.
-        paths: named limits on expressions of state and input in stages 0 ... N-1: `PathConstraint`, or a
-            `Limit` of your own.
+        paths: named limits on expressions of state and input in stages 0 ... N-1.
         soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
             path, or by name of an input for its rate ("NAME rate" where a state has that name). The cost then has the term
             'soft NAME'.
@@ -148,7 +87,7 @@ class Limits(Checked):
     inputs: Mapping[str, Interval] = field(default_factory=dict)
     states: Mapping[str, Interval] = field(default_factory=dict)
     rates: Mapping[str, Interval] = field(default_factory=dict)
-    paths: Mapping[str, Limit] = field(default_factory=dict)
+    paths: Mapping[str, PathConstraint] = field(default_factory=dict)
     soft: Mapping[str, Positive] = field(default_factory=dict)
     prices: Mapping[str, Positive] = field(default_factory=dict)
 
@@ -180,31 +119,20 @@ class Limits(Checked):
             mistakes.add(f"'{name}' is both soft and priced; choose one")
         mistakes.raise_if_any()
 
-    def members(self, plant: Plant, step: float) -> list[tuple[str, Limit]]:
-        """Return all limits with their names: boxes of inputs and states, rates of inputs, with stages of length `step`, and paths.
-
-        An input and a state may have one name.
-        """
-        inputs = [(name, _Box("input", name, *ends, unit=plant.inputs[name])) for name, ends in self.inputs.items()]
-        return [*inputs, *self.boxes(plant).items(), *self.written(plant, step).items()]
-
-    def boxes(self, plant: Plant) -> dict[str, Limit]:
+    def boxes(self, plant: Plant) -> dict[str, PathConstraint]:
         """Return the limits of states, which every optimiser keeps as bounds."""
         units = dict(zip(plant.state.elements, plant.state.entry_units, strict=True))
-        return {name: _Box("state", name, *ends, unit=units[name]) for name, ends in self.states.items()}
+        return {name: PathConstraint(_state(name), *ends, unit=units[name]) for name, ends in self.states.items()}
 
-    def written(self, plant: Plant, step: float) -> dict[str, Limit]:
-        """Return rates and paths, which a plan writes as further entries of its state."""
-        rates: dict[str, Limit] = {
-            f"{name} rate": _Rate(name, step, *ends, unit=derivative_unit(plant.inputs[name], 1, plant.time_unit))
-            for name, ends in self.rates.items()
-        }
+    def written(self, plant: Plant, step: float) -> dict[str, PathConstraint]:
+        """Return rates of inputs, with stages of length `step`, and paths, which a plan writes as further entries of its state."""
+        units = {name: derivative_unit(plant.inputs[name], 1, plant.time_unit) for name in self.rates}
+        rates = {f"{n} rate": PathConstraint(_rate(n, step), *ends, unit=units[n]) for n, ends in self.rates.items()}
         return {**rates, **self.paths}
 
     def input_ends(self, plant: Plant) -> tuple[list[float], list[float]]:
         """Lower and upper end of every input, which may be open numbers; infinite where free."""
-        free = (-math.inf, math.inf)
-        intervals = [self.inputs.get(name, free) for name in plant.input.elements]
+        intervals = [self.inputs.get(name, _FREE) for name in plant.input.elements]
         return [low for low, _ in intervals], [high for _, high in intervals]
 
     def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
@@ -226,6 +154,14 @@ class Limits(Checked):
         return _bounds(self.states, plant.state.elements)
 
 
+def _state(name: str) -> Callable[[OfStage], Value]:
+    return lambda view: view.state[name]
+
+
+def _rate(name: str, step: float) -> Callable[[OfStage], Value]:
+    return lambda view: (view.input[name] - view.input_before[name]) / step
+
+
 def _check_interval(name: str, interval: object, mistakes: Mistakes) -> None:
     if not isinstance(interval, Sequence) or len(interval) != 2:
         mistakes.add(f"'{name}' needs two numbers (lower, upper), got {interval!r}")
@@ -238,6 +174,5 @@ def _check_interval(name: str, interval: object, mistakes: Mistakes) -> None:
 
 
 def _bounds(intervals: Mapping[str, Interval], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    free = (-math.inf, math.inf)
-    pairs = np.array([nominal(intervals.get(n, free)) for n in names], dtype=float).reshape(-1, 2)
+    pairs = np.array([nominal(intervals.get(n, _FREE)) for n in names], dtype=float).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]

@@ -146,8 +146,8 @@ class Problem(Checked):
         smooth = not_held(self.signals, differentiated_signals(plant))
         if smooth:
             mistakes.add(
-                f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state it "
-                "in steps, Samples(times, values), which hold between their times, or choose an output whose derivatives it is not in"
+                f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state "
+                "it in steps, Samples(times, values), which hold between their times, or choose an output without it"
             )
         mistakes.raise_if_any()
         if self.reality is not None:
@@ -497,9 +497,10 @@ def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = 
                 f"the rate of {e}" for e, moves in zip(plant.state.elements, reached, strict=True) if moves
             )
             mistakes.add(
-                f"the response ({which} parameters) is not invertible at the start ({state}): input '{plant.input.elements[weakest]}' "
-                "has no independent effect there; start elsewhere, or give Plant(inverse=...), or control what follows from "
-                f"{moved or 'another input'}. In a switch (if_else, floor, sign) it has no slope: write its mean"
+                f"the response ({which} parameters) is not invertible at the start ({state}): input "
+                f"'{plant.input.elements[weakest]}' has no independent effect there; start elsewhere, give Plant(inverse=...), or "
+                f"control what follows from {moved or 'another input'}. In a switch (if_else, floor, sign) it has no slope: write "
+                "its mean"
             )
 
 
