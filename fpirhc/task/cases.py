@@ -7,18 +7,16 @@ state, and any other one a field of the problem or a number inside it, 'limits.i
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import cast
 
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, InvalidValue, Mistakes, nearest
+from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
 from fpirhc.fields.kinds import described, finite_number
-from fpirhc.plant.parameter import Parametric
 from fpirhc.summary import line
-from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.paths import changed_at, content_at
 from fpirhc.task.problem import Problem
 
@@ -90,10 +88,9 @@ class Cases(Checked):
         Raises:
             InvalidName: a name of neither.
         """
-        for one in wanted:
-            valid = dict.fromkeys((EVERY, *filter(None, map(self.group, self.names)), *self.names))
-            if one not in valid:
-                raise InvalidName(f"case '{one}' is unknown.{nearest(one, valid)}")
+        valid = dict.fromkeys((EVERY, *filter(None, map(self.group, self.names)), *self.names))
+        for one in (one for one in wanted if one not in valid):
+            raise InvalidName(f"case '{one}' is unknown.{nearest(one, valid)}")
         return tuple(name for name in self.names if {EVERY, name, self.group(name)} & {*wanted})
 
     @checked_call
@@ -102,27 +99,29 @@ class Cases(Checked):
 
         Raises:
             InvalidName: an unknown case.
-            InvalidProblem: a change that the problem does not accept.
+            InvalidProblem: changes that the problem does not accept, each with its path.
         """
         return self.exactly(name, self.build(name, problem))
 
     def build(self, name: str, problem: Problem) -> Problem:
-        """Return the problem with all changes of a case but those of exact parameters, which are data of a loop.
-
-        Whichever case is asked first, the mistakes of all are told together.
-        """
+        """Return the problem with all changes of a case but those of exact parameters, which are data of a loop."""
         if name not in self.changes:
             raise InvalidName(f"case '{name}' is unknown.{nearest(name, self.names)}")
-        _CHECKED.of((self, problem), (), lambda: self.check(problem))
-        try:
-            return _changed(problem, self.changes[name])
-        except FpirhcError as error:
-            raise InvalidProblem(f"case {name!r}: {error}") from None
+        changes, mistakes = self.changes[name], Mistakes(f"case {name!r}")
+        for path in (p for p in changes if p not in (_GROUP, _SEED)):
+            with mistakes.caught(f"'{path}': "):
+                check_change(problem, changes, path)
+        mistakes.raise_if_any()
+        with mistakes.caught():
+            problem = _changed(problem, changes)
+        mistakes.raise_if_any()
+        return problem
 
     def exactly(self, name: str, built: Problem) -> Problem:
-        """Return what `build` returned, with the exact parameters of a case."""
-        before = {name: one.exact for name, one in built.moves.parameters.items()}
-        exact = {**before, **_exact_of(self.changes[name], before)}
+        """Return what `build` returned, with the exact parameters of a case; what is known is exact where what moves has it too."""
+        before, changes = {name: one.exact for name, one in built.moves.parameters.items()}, self.changes[name]
+        known = {one: value for one, value in _named(changes, _KNOWN).items() if one in before}
+        exact = {n: float(value) for n, value in {**before, **known, **_named(changes, _EXACT)}.items()}
         return built if exact == before else built.with_exact(np.array(list(exact.values())))
 
     def key(self, name: str) -> tuple[object, ...]:
@@ -133,33 +132,13 @@ class Cases(Checked):
             if path not in (_GROUP, _SEED) and not path.startswith(f"{_EXACT}.")
         )
 
-    def check(self, problem: Problem) -> None:
-        """Raise where a path or a number does not fit the problem.
-
-        Raises:
-            InvalidProblem: all mistakes together, each with its case and path; a wrong path once, in however many cases it stands.
-        """
-        mistakes, unknown = Mistakes("cases"), set[str]()
-        for name, changes in self.changes.items():
-            for path in (p for p in changes if p not in (*unknown, _GROUP, _SEED)):
-                try:
-                    check_change(problem, changes, path)
-                except FpirhcError as error:
-                    if isinstance(error, InvalidName):
-                        unknown.add(path)
-                    mistakes.add(f"case {name!r}, '{path}': {error}")
-        mistakes.raise_if_any()
-
-
-_CHECKED: Latest[None] = Latest(8)  # cases with the problem that they fit
-
 
 def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     """The problem with all changes but those of exact parameters."""
     for path, value in changes.items():
-        if _word(path) not in (*_WORDS, _GROUP, _SEED):
+        if path.partition(".")[0] not in (*_WORDS, _GROUP, _SEED):
             problem = changed_at(problem, path, as_declared(problem, path, value))
-    model = {name: value for word in (_APPROXIMATE, _KNOWN) for name, value in _named(changes, word).items()}
+    model = {**_named(changes, _APPROXIMATE), **_named(changes, _KNOWN)}
     start = _named(changes, START)
     if model:
         parameters = {
@@ -182,27 +161,15 @@ def as_declared(owner: object, path: str, value: object) -> object:
     return int(value) if isinstance(value, float) and value.is_integer() and is_whole(owner, path) else value
 
 
-def _word(path: str) -> str:
-    return path.partition(".")[0]
-
-
 def _named(changes: Mapping[str, object], word: str) -> dict[str, float]:
     """The numbers below a word, by the name behind it."""
     return {p.partition(".")[2]: cast(float, value) for p, value in changes.items() if p.startswith(f"{word}.")}
 
 
-def _exact_of(changes: Mapping[str, object], moved: Container[str]) -> dict[str, float]:
-    """The exact parameters that a case changes; what is known has its exact value where the plant that moves has it too."""
-    known = {name: value for name, value in _named(changes, _KNOWN).items() if name in moved}
-    return {name: float(value) for name, value in {**known, **_named(changes, _EXACT)}.items()}
-
-
 def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
     """What is wrong with a case whatever its problem is."""
-    if not name.strip():
-        yield "the name of a case is a text that is not empty"
-    if name == EVERY:
-        yield f"'{EVERY}' means every case; choose another name"
+    if not name.strip() or name == EVERY:
+        yield f"the name of a case is a text that is not empty; '{EVERY}' means every case"
     group, seed = changes.get(_GROUP, ""), changes.get(_SEED)
     if not isinstance(group, str):
         yield f"'{_GROUP}' is a text, got {described(group)}"
@@ -219,19 +186,14 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
 def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
     """Raise where one change does not fit."""
     word, _, name = path.partition(".")
-    if word in _WORDS and not name:
-        what = "state" if word == START else "parameter"
-        raise InvalidName(f"'{word}' alone names no {what}; write one entry for each, '{word}.NAME'")
     if word == START:
         _check_name(f"'{START}.NAME' has a state", name, problem.plant.state.elements)
         _check_number(changes[path], problem.plant.ranges.get(name))
     elif word in PARAMETERS:
-        settable = {n: one for n, one in _parametric(problem, changes, word).parameters.items() if not one.outside}
-        if not settable and problem.foreign is not None and word == _EXACT:
-            raise InvalidName(
-                f"what moves is outside and has no parameter '{name}'; state it: "
-                f"ExternalPlant(make=lambda parameters, seed: body, parameters={{'{name}': ...}})"
-            )
+        # A case with a reality of its own means the parameters of that one.
+        moves = changed_at(problem, "reality", changes["reality"]).moves if "reality" in changes else problem.moves
+        stated = (moves if word == _EXACT else problem.plant).parameters
+        settable = {n: one for n, one in stated.items() if not one.outside}
         _check_name(f"'{word}.NAME' has a parameter of {PARAMETERS[word]}", name, settable)
         _check_number(changes[path], settable[name].bounds, settable[name].unit)
     else:
@@ -241,13 +203,6 @@ def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> 
             raise InvalidName(f"the problem has no '{path}'.{meant}")
         if isinstance(content_at(problem, path, "the problem"), int | float):
             _check_number(changes[path])
-
-
-def _parametric(problem: Problem, changes: Mapping[str, object], word: str) -> Parametric:
-    """Whose parameter a case changes; a case with a reality of its own means that one."""
-    if word != _EXACT:
-        return problem.plant
-    return changed_at(problem, "reality", changes["reality"]).moves if "reality" in changes else problem.moves
 
 
 def _meant(problem: Problem, path: str) -> str:

@@ -93,8 +93,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "a parameter of a plant outside that has none": (
         lambda: case({"exact.mass": 2.0}),
-        "cases: case 'heavy', 'exact.mass': what moves is outside and has no parameter 'mass'; state it: "
-        "ExternalPlant(make=lambda parameters, seed: body, parameters={'mass': ...})",
+        "case 'heavy': 'exact.mass': 'exact.NAME' has a parameter of what moves, and there is no 'mass'.",
     ),
     "a negative amplitude": (
         lambda: probed(amplitude=-1.0),
