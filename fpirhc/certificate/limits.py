@@ -128,7 +128,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     plant, planner, deformation = problem.plant, ready.planner, ready.deformation
     if plant.outputs or plant.step is not None or not plant.equations.affine:
         yield "the plant is a map, has outputs, or its response is not affine in the inputs"
-    rated = problem.limits.rates.keys() - {*problem.limits.soft, *problem.limits.prices}
+    rated = problem.limits.rates.keys() - problem.limits.prices.keys()
     if problem.disturbances or problem.reality is not None or problem.signals or rated:
         yield "there are disturbances, signals from outside, hard limits of rates, or a reality that is not the plant"
     if not problem.sensing.ideal or problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
@@ -150,7 +150,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
 
 def _hard(problem: Problem) -> list[str]:
     limits = problem.limits
-    return [e for e in limits.states if e not in limits.soft and e not in limits.prices]
+    return [e for e in limits.states if e not in limits.prices]
 
 
 def _pieces(box: Mapping[str, tuple[float, float]], pieces: int) -> Iterator[Piece]:

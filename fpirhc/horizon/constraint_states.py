@@ -10,14 +10,12 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.errors import Mistakes
 from fpirhc.horizon.cost import Cost, View, read_by, read_by_cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.expression import Value, expression
 from fpirhc.symbolic.layout import Expression, Named, Signal
 from fpirhc.task.limits import Limits, PathConstraint
 
@@ -61,10 +59,8 @@ def check_names(horizon: Horizon, limits: Limits) -> None:
     """Raise where a margin is that of no limited state, or leaves nothing between two limits."""
     mistakes = Mistakes("horizon")
     mistakes.unknown("margins: limit of state", horizon.margins, list(limits.states))
-    for name in sorted(horizon.margins.keys() & {*limits.soft, *limits.prices}):
-        mistakes.add(
-            f"margins of '{name}': its limit is soft or has a price, and a margin makes it hard; leave one of them out"
-        )
+    for name in sorted(horizon.margins.keys() & limits.prices.keys()):
+        mistakes.add(f"margins of '{name}': its limit has a price, and a margin makes it hard; leave one of them out")
     for name in horizon.margins.keys() & limits.states.keys():
         lower, upper = limits.states[name]
         if 2 * horizon.margins[name] >= upper - lower:
@@ -81,14 +77,14 @@ def _entry_of(name: str, one: PathConstraint, view: View) -> ConstraintState:
 
 def inside(limits: Limits, plant: Plant, view: View, seen: Named, step: int) -> list[ConstraintState]:
     """Hard limits of states and paths after so many steps inside a stage of a map; no other limits hold between the nodes."""
-    nodes_alone, measured_view = limits.soft.keys() | limits.prices.keys(), replace(view, state=seen)
+    measured_view = replace(view, state=seen)
     states = [_entry_of(name, one, measured_view) for name, one in limits.boxes(plant).items()]
     paths = [
         _entry_of(name, one, view)
         for name, one in limits.paths.items()
         if "input_before" not in _read_by(name, one, plant)
     ]
-    return [replace(w, name=f"{w.name}, step {step}") for w in (*states, *paths) if w.name not in nodes_alone]
+    return [replace(w, name=f"{w.name}, step {step}") for w in (*states, *paths) if w.name not in limits.prices]
 
 
 def measured(names: Collection[str], limits: Limits, plant: Plant, next_state: Expression) -> list[ConstraintState]:
@@ -98,28 +94,6 @@ def measured(names: Collection[str], limits: Limits, plant: Plant, next_state: E
     return [ConstraintState(name, one.unit, value, one.lower, one.upper) for name, one, value in entries]
 
 
-def hard(written: list[ConstraintState], soft: frozenset[str]) -> list[ConstraintState]:
-    """The entries whose limits are not soft."""
-    return [w for w in written if w.name not in soft]
-
-
-def softened(written: list[ConstraintState], limits: Limits, plant: Plant, state: Expression) -> dict[str, Expression]:
-    """Cost rate of every soft limit by name: weight times the violation squared."""
-    lower, upper = limits.state_bounds(plant)
-    values = {w.name: (w.expression, w.lower, w.upper) for w in written}
-    values |= {e: (state[k], lower[k], upper[k]) for k, e in enumerate(plant.state.elements)}
-    return {
-        f"soft {name}": weight * _violation(*values[_entry(name, plant)]) ** 2 for name, weight in limits.soft.items()
-    }
-
-
-def hard_state_bounds(limits: Limits, plant: Plant, replaced: Collection[str] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the plant's states without the soft ones and without those that stand in entries of their own."""
-    lower, upper = limits.state_bounds(plant)
-    free = np.array([e in limits.soft or e in replaced for e in plant.state.elements])
-    return np.where(free, -math.inf, lower), np.where(free, math.inf, upper)
-
-
 def state_prices(limits: Limits, state: Signal, plant: Plant, step: float) -> np.ndarray:
     """Price of a violation of every entry's limits at one node (ns,), in cost per unit; infinite where limits are hard."""
     prices = {_entry(name, plant): step * price for name, price in limits.prices.items()}
@@ -127,21 +101,10 @@ def state_prices(limits: Limits, state: Signal, plant: Plant, step: float) -> np
     return np.array([prices.get(e, math.inf) for e in state.elements])
 
 
-def soft_names(limits: Limits, plant: Plant) -> frozenset[str]:
-    """Names of the entries that are soft."""
-    return frozenset(_entry(name, plant) for name in limits.soft)
-
-
 def _entry(name: str, plant: Plant) -> str:
-    """Name of the entry; a rate is softened by the name of its input where no state has it, else by its own name."""
+    """Name of the entry; a rate is priced by the name of its input where no state has it, else by its own name."""
     return f"{name} rate" if name in plant.inputs and name not in plant.state.elements else name
 
 
 def _as_measured(name: str) -> str:
     return f"{name} as measured"
-
-
-def _violation(value: Expression, lower: float, upper: float) -> Expression:
-    above: Value = ca.fmax(value - upper, 0) if math.isfinite(upper) else 0
-    below: Value = ca.fmax(lower - value, 0) if math.isfinite(lower) else 0
-    return expression(above + below)

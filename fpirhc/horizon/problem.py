@@ -56,7 +56,6 @@ class OptimalControl:
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
-        soft_end: (s, theta) -> what soft limits of states add to T, by term of the stage cost; None where nothing does.
     """
 
     stages: int
@@ -84,7 +83,6 @@ class OptimalControl:
     inner: tuple[tuple[int, float], ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
-    soft_end: ca.Function | None = None
 
     @property
     def scale(self) -> np.ndarray:

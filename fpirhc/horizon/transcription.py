@@ -14,14 +14,10 @@ from fpirhc.horizon.constraint_states import (
     ConstraintState,
     check_feedforward,
     check_names,
-    hard,
-    hard_state_bounds,
     inside,
     limited,
     measured,
     read_before,
-    soft_names,
-    softened,
     state_prices,
 )
 from fpirhc.horizon.cost import Cost, Linearisation, View, read_by_cost
@@ -76,38 +72,34 @@ def _transcribed(
         }
         limits = replace(limits, states={**limits.states, **inside_by})
     same = plant.equations, reference, cost, whole
-
-    def expressed() -> tuple[_Stage, tuple[ca.Function, ...]]:
-        stage = _stage_expressions(plant, reference, horizon, cost, limits)
-        return stage, _stage_functions(stage)
-
-    stage, functions_of_stage = _STAGES.of(same, (horizon,), expressed)
-    binding, free = stage.binding, stage.before.numel()
-    dynamics, stage_cost, terminal_cost, soft_end = functions_of_stage
+    stage = _STAGES.of(same, (horizon,), lambda: _stage(plant, reference, horizon, cost, limits))
+    binding, free = stage.binding, stage.before
     table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
-    settings = tuple(s.name() for s in stage.settings)
     bounds = limits.input_bounds(plant)
     values = {path: number_of(number) for path, number in open_numbers(cost, limits).items()}
-    if settings:
-        nodes = (*nodes[:2], with_rows(nodes[2], [values[path] for path in settings]))
-    _check_finite_limits(dynamics, binding, nodes)
-    _check_finite(tuple(stage.terms), stage_cost, terminal_cost, nodes)
+    if stage.settings:
+        nodes = (*nodes[:2], with_rows(nodes[2], [values[path] for path in stage.settings]))
+    _check_finite_limits(stage, nodes)
+    _check_finite(stage, nodes)
     functions: dict[object, ca.Function] = {}
-    along = expand_along(dynamics, stage_cost, terminal_cost, nodes, functions)
-    lower, upper = hard_state_bounds(limits, plant, horizon.measured)
+    along = expand_along(stage.dynamics, stage.cost, stage.terminal_cost, nodes, functions)
+    elsewhere = np.isin(plant.state.elements, horizon.measured)  # in entries of their own
+    lower, upper = (
+        np.where(elsewhere, side, ends)
+        for side, ends in zip((-np.inf, np.inf), limits.state_bounds(plant), strict=True)
+    )
     state = _stage_state(plant, bool(free), binding)
     return OptimalControl(
         stages=horizon.stages,
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant, horizon) + setting_rows(settings),
-        dynamics=dynamics,
-        stage_cost=stage_cost,
-        terminal_cost=terminal_cost,
-        terms=tuple(stage.terms),
-        soft_end=soft_end,
+        data=data_layout(plant, horizon) + setting_rows(stage.settings),
+        dynamics=stage.dynamics,
+        stage_cost=stage.cost,
+        terminal_cost=stage.terminal_cost,
+        terms=stage.terms,
         start=_start(plant, free, len(binding)),
         state_lower=np.concatenate([lower, np.full(free, -np.inf), [w.lower for w in binding]]),
         state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
@@ -118,7 +110,7 @@ def _transcribed(
         along=along,
         written=len(binding),
         state_price=state_prices(limits, state, plant, horizon.step),
-        settings=settings,
+        settings=stage.settings,
         inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.longest, nodes[0][: plant.state.size, :-1], nodes[1]
@@ -131,26 +123,19 @@ def _transcribed(
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """Symbols of one stage, and its expressions; `before` is empty unless the input is part of the state, settings end theta."""
-
-    x: Expression
-    before: Expression
-    u: Expression
-    applied: Expression
-    theta: Expression
-    x_next: Expression
-    terms: dict[str, Expression]
-    final: Expression
-    soft_end: list[Expression]  # what soft limits of states add to it, by term
+    dynamics: ca.Function
+    cost: ca.Function
+    terminal_cost: ca.Function
+    terms: tuple[str, ...]
     binding: list[ConstraintState]
-    settings: list[ca.SX]
-    length: Expression | float
+    settings: tuple[str, ...]
+    before: int  # entries of the input before in the state; 0 unless it is a part of it
 
 
-_STAGES: Latest[tuple[_Stage, tuple[ca.Function, ...]]] = Latest(8)  # whatever signals they meet
+_STAGES: Latest[_Stage] = Latest(8)  # whatever signals they meet
 
 
-def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
+def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
     layout = data_layout(plant, horizon)
     read = read_by_cost(plant, cost)
     keeps_input = "input_before" in read or bool(horizon.blocks) or read_before(limits, plant, horizon.step)
@@ -172,43 +157,32 @@ def _stage_expressions(plant: Plant, reference: Reference, horizon: Horizon, cos
             x_next = advance(x, applied, view.parameters.vector)
         check_feedforward(limits, plant, cost)
         written = _written(plant, horizon, limits, limited_view, x_next, data)
-        soft = softened(written, limits, plant, _seen(plant, horizon, x, data))
-        terms = _joined(_scalar_terms(cost.stage(view)), soft, horizon)
+        terms = _scalar_terms(cost.stage(view))
         if horizon.blocks:
+            if "held" in terms:
+                raise InvalidProblem(
+                    "cost: term 'held' has the name of the term of the inputs that Horizon(blocks=...) holds; choose another"
+                )
             # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
             terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
         end = _end_view(plant, view, x, before if keeps_input else ca.SX.nan(plant.input.size))
         terminal = cost.terminal_cost(end, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
-        at_end = {f"soft {e}": soft[f"soft {e}"] for e in limits.soft if e in limits.states}
-        soft_states = sum(at_end.values(), start=ca.SX(0))
-        final = _scalar_terms({"terminal": terminal})["terminal"] + horizon.last * soft_states
-        soft_end = [horizon.last * at_end.get(name, ca.SX(0)) for name in terms]
+        final = _scalar_terms({"terminal": terminal})["terminal"]
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
-    binding = hard(written, soft_names(limits, plant))
     _check_entries(plant, keeps_input, written)
-    settings = open_in(x_next, *terms.values(), final, *(w.expression for w in binding))
-    if settings:
-        theta = ca.vertcat(theta, *settings)
-
+    settings = open_in(x_next, *terms.values(), final, *(w.expression for w in written))
+    theta, s = ca.vertcat(theta, *settings), ca.vertcat(x, before, ca.SX.sym("z", len(written)))
+    s_next = ca.vertcat(x_next, *([applied] if keeps_input else []), *(w.expression for w in written))
+    costs = horizon.step * length * ca.vertcat(*terms.values())
     return _Stage(
-        x, before, u, applied, theta, x_next, terms, final, soft_end, binding, settings, horizon.step * length
-    )
-
-
-def _stage_functions(stage: _Stage) -> tuple[ca.Function, ...]:
-    """Functions of the dynamics, the stage cost, the terminal cost, and what soft limits add to it."""
-    u, theta, binding = stage.u, stage.theta, stage.binding
-    s = ca.vertcat(stage.x, stage.before, ca.SX.sym("z", len(binding)))
-    s_next = ca.vertcat(
-        stage.x_next, *([stage.applied] if stage.before.numel() else []), *(w.expression for w in binding)
-    )
-    costs = stage.length * ca.vertcat(*stage.terms.values())
-    return (
         ca.Function("fpirhc_dynamics", [s, u, theta], [ca.densify(s_next)]),
         ca.Function("fpirhc_stage_cost", [s, u, theta], [ca.sum1(costs), ca.densify(costs)]),
-        ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(stage.final)]),
-        ca.Function("fpirhc_soft_end", [s, theta], [ca.densify(ca.vertcat(*stage.soft_end))]),
+        ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)]),
+        tuple(terms),
+        written,
+        tuple(one.name() for one in settings),
+        before.numel(),
     )
 
 
@@ -217,16 +191,6 @@ def _reach(limits: Limits, plant: Plant) -> ca.DM:
     lower, upper = limits.input_bounds(plant)
     half = 0.5 * (upper - lower)
     return ca.DM(np.where(np.isfinite(half) & (half > 0), half, 1.0))
-
-
-def _joined(terms: Mapping[str, Expression], soft: Mapping[str, Expression], horizon: Horizon) -> dict[str, Expression]:
-    """The terms of the cost and of soft limits; a name that stands for two would drop one of them."""
-    mistakes = Mistakes("cost")
-    for name in sorted(terms.keys() & {*soft, *(["held"] if horizon.blocks else [])}):
-        of = "the inputs that Horizon(blocks=...) holds" if name == "held" else "a soft limit"
-        mistakes.add(f"term '{name}' has the name of the term of {of}; choose another")
-    mistakes.raise_if_any()
-    return {**terms, **soft}
 
 
 def _check_entries(plant: Plant, keeps_input: bool, written: list[ConstraintState]) -> None:
@@ -264,8 +228,7 @@ def _written(
         state = Named(plant.state.elements, _seen(plant, horizon, earlier.state.vector, data), "state")
         entries += inside(limits, plant, earlier, state, k)
     seen_next = _seen(plant, horizon, x_next, data)
-    hard_ones = [name for name in horizon.measured if name not in limits.soft]
-    entries += measured(hard_ones, limits, plant, seen_next)
+    entries += measured(horizon.measured, limits, plant, seen_next)
     return entries
 
 
@@ -386,15 +349,13 @@ def _nodes(
     return states, inputs[:, : horizon.stages], data
 
 
-def _check_finite_limits(
-    dynamics: ca.Function, binding: list[ConstraintState], nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
-) -> None:
+def _check_finite_limits(stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     """Raise where a limited expression is no number along the reference, about which plans are made."""
-    states, inputs, data = nodes
+    (states, inputs, data), binding = nodes, stage.binding
     if not binding or not np.isfinite(states).all():
         return  # `_check_finite` says that the states grow without bound
     count = inputs.shape[1]
-    values = np.asarray(dynamics.map(count)(states[:, :count], inputs, data[:, :count]).full())[-len(binding) :]
+    values = np.asarray(stage.dynamics.map(count)(states[:, :count], inputs, data[:, :count]).full())[-len(binding) :]
     mistakes = Mistakes("limits")
     for entry, row in zip(binding, values, strict=True):
         bad = np.flatnonzero(~np.isfinite(row))
@@ -406,16 +367,11 @@ def _check_finite_limits(
     mistakes.raise_if_any()
 
 
-def _check_finite(
-    names: tuple[str, ...],
-    stage_cost: ca.Function,
-    terminal_cost: ca.Function,
-    nodes: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> None:
+def _check_finite(stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     states, inputs, data = nodes
-    values = stage_cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
-    final = float(terminal_cost(states[:, -1], data[:, -1]))
-    terms = [(name, value, "at t = 0") for name, value in zip(names, values, strict=True)]
+    values = stage.cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
+    final = float(stage.terminal_cost(states[:, -1], data[:, -1]))
+    terms = [(name, value, "at t = 0") for name, value in zip(stage.terms, values, strict=True)]
     mistakes = Mistakes("cost")
     for name, value, where in [*terms, ("terminal", final, "at the end of the horizon")]:
         if not np.isfinite(value):

@@ -102,7 +102,7 @@ _REMEDIES = {
     "inputs": "serves problems without limits only (it is a baseline); for limits use FixedPoint()",
     "states": "keeps input limits only; for state limits use FixedPoint(), Ipopt(), Fatrop() or SequentialQuadratic(), or remove "
     "them from Problem(limits=...)",
-    "prices": "keeps limits or weighs them (soft), but takes no prices ({}); use FixedPoint()",
+    "prices": "keeps limits, but takes no prices ({}); use FixedPoint()",
 }
 
 

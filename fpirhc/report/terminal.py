@@ -270,7 +270,7 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
         for text in one.plan.violations():
             say(f"{one.name}: {text}")
         for name, price in one.plan.slacks().items():
-            say(f"{one.name}: soft limit '{name}' costs {number(price)}")
+            say(f"{one.name}: the limit of '{name}' costs {number(price)}")
         if one.plan.overflow():
             say(f"{one.name}: {one.plan.overflow()}")
         if one.plan.status != Status.OK:

@@ -47,11 +47,11 @@ class Followed:
 
 
 def hard_limits(problem: Problem, run: Run) -> list[Followed]:
-    """Return the limits of states, rates and paths that are neither soft nor priced, along a run; none without cycles.
+    """Return the limits of states, rates and paths that have no price, along a run; none without cycles.
 
     A change of the command counts from cycle to cycle. Limits of states that a reality does not have are not known.
     """
-    plant, weighed = problem.plant, {*problem.limits.soft, *problem.limits.prices}
+    plant, weighed = problem.plant, problem.limits.prices.keys()
     limits = {**problem.limits.boxes(plant), **problem.limits.written(plant, problem.period)}
     rates = {f"{name} rate": name for name in problem.limits.rates if name not in plant.state.elements}
     hard = {name: one for name, one in limits.items() if not {name, rates.get(name, name)} & weighed}

@@ -159,6 +159,6 @@ def check_values(plant: Plant, limits: Limits, values: Mapping[str, Sequence[flo
 def _ranges(plant: Plant, limits: Limits, name: str) -> dict[str, tuple[float, float]]:
     """What a set-point of the coordinate must not leave: its physical range, and a limit that has no price."""
     ranges = {"physical range": plant.ranges[name]} if name in plant.ranges else {}
-    if name in limits.states and name not in {*limits.soft, *limits.prices}:
+    if name in limits.states and name not in limits.prices:
         ranges["limits"] = limits.states[name]
     return ranges

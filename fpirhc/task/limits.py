@@ -76,19 +76,16 @@ class Limits(Checked):
         rates: intervals of the change of inputs per second, from stage to stage of a plan and from cycle to cycle of the command,
             by name of the input.
         paths: named limits on expressions of state and input in stages 0 ... N-1.
-        soft: weights, in cost per second and unit squared, of limits that may be violated at that price, by name of a state or
-            path, or by name of an input for its rate ("NAME rate" where a state has that name). The cost then has the term
-            'soft NAME'.
-        prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1);
-            by the same names. Such a limit is kept exactly while its multiplier is below the price. The price is not part of the
-            cost's terms; `Plan.slacks` gives what was paid.
+        prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1),
+            by name of a state or path, or by name of an input for its rate ("NAME rate" where a state has that name). Such a limit
+            is kept exactly while its multiplier is below the price. The price is not part of the cost's terms; `Plan.slacks` gives
+            what was paid.
     """
 
     inputs: Mapping[str, Interval] = field(default_factory=dict)
     states: Mapping[str, Interval] = field(default_factory=dict)
     rates: Mapping[str, Interval] = field(default_factory=dict)
     paths: Mapping[str, PathConstraint] = field(default_factory=dict)
-    soft: Mapping[str, Positive] = field(default_factory=dict)
     prices: Mapping[str, Positive] = field(default_factory=dict)
 
     def check(self, plant: Plant) -> None:
@@ -107,7 +104,6 @@ class Limits(Checked):
         rates = [f"{name} rate" if name in plant.state.elements else name for name in self.rates]
         for name in sorted(self.paths.keys() & {f"{name} rate" for name in self.rates}):
             mistakes.add(f"paths: '{name}' is already the name of the limit in rates; choose another")
-        mistakes.unknown("soft: limit of", self.soft, [*self.states, *self.paths, *rates])
         for name, interval in [*self.inputs.items(), *self.states.items(), *self.rates.items()]:
             _check_interval(name, interval, mistakes)
         for name, path in self.paths.items():
@@ -115,8 +111,6 @@ class Limits(Checked):
                 mistakes.add(f"paths: '{name}' is already the name of a state or input; choose another")
             _check_interval(name, (path.lower, path.upper), mistakes)
         mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *rates])
-        for name in sorted(self.prices.keys() & self.soft.keys()):
-            mistakes.add(f"'{name}' is both soft and priced; choose one")
         mistakes.raise_if_any()
 
     def boxes(self, plant: Plant) -> dict[str, PathConstraint]:
@@ -140,12 +134,11 @@ class Limits(Checked):
         return _bounds(self.inputs, plant.input.elements)
 
     def rate_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bound of the change of every input, shape (nu,) each; infinite where free, soft or priced."""
-        weighed = {*self.soft, *self.prices}
+        """Lower and upper bound of the change of every input, shape (nu,) each; infinite where free or priced."""
         rates = {
             name: ends
             for name, ends in self.rates.items()
-            if (f"{name} rate" if name in plant.state.elements else name) not in weighed
+            if (f"{name} rate" if name in plant.state.elements else name) not in self.prices
         }
         return _bounds(rates, plant.input.elements)
 

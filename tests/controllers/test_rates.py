@@ -52,9 +52,8 @@ def test_no_command_moves_faster_than_its_limit(name):
     assert fp.measure(PROBLEM, run).at_limit > 0.01
 
 
-@pytest.mark.parametrize("weighed", [{"soft": {"F": 1e-3}}, {"prices": {"F": 1e-3}}])
-def test_a_rate_that_is_weighed_may_be_passed(weighed):
-    soft = replace(PROBLEM, limits=replace(PROBLEM.limits, **weighed))
+def test_a_rate_that_has_a_price_may_be_passed():
+    soft = replace(PROBLEM, limits=replace(PROBLEM.limits, prices={"F": 1e-3}))
     assert fastest(fp.simulate(soft, CONTROLLERS["CTC+FPI"], seed=0, compiled=False)) > 1.5
 
 

@@ -59,8 +59,8 @@ def test_what_cannot_be_kept_is_named_by_how_much(case):
     assert "soften state limits, or lengthen the horizon" in plan._repr_html_()
 
 
-def test_a_soft_limit_lets_the_plan_pass_and_come_back():
-    plan = plan_of((0.9, 1.0), {"y": (-5.0, 1.0)}, 25, soft={"y": 1e4})
+def test_a_price_lets_the_plan_pass_and_come_back():
+    plan = plan_of((0.9, 1.0), {"y": (-5.0, 1.0)}, 25, prices={"y": 1e2})
     assert plan.status == fp.Status.OK
     assert plan.violations() == ()
     assert plan.states[0, 10] == pytest.approx(1.4, abs=1e-3)

@@ -57,22 +57,6 @@ def test_limits_are_kept_at_the_same_optimum_as_ipopt(case):
     assert plan.violations() == ()
 
 
-def test_soft_limits_are_violated_at_their_price():
-    """More weight, less violation; the price stands in the cost by name; hard where heavy."""
-    lowest, prices = [], []
-    for weight in (1e0, 1e2, 1e4):
-        ocp, data, first = limited(fp.Limits(states={"angle'": (-0.5, 0.5)}, soft={"angle'": weight}))
-        plan = fp.solve(ocp, FIXED, first, data)
-        assert plan.status == fp.Status.OK
-        lowest.append(plan.states[1].min())
-        prices.append(plan.slacks()["angle'"])
-    assert lowest[0] < lowest[1] < lowest[2] < -0.5 + 1e-12
-    assert lowest[2] > -0.51
-    assert all(p > 0 for p in prices)
-    parts, data, first = limited(fp.Limits(states={"angle'": (-50.0, 50.0)}, soft={"angle'": 10.0}))
-    assert fp.solve(parts, FIXED, first, data).slacks() == {"angle'": 0.0}
-
-
 def swapped(arguments):
     ocp, data, first = arguments
     return ocp, FIXED, first, data
@@ -114,7 +98,7 @@ def test_limits_are_kept_in_every_unit(optimiser):
         (fp.Limits(paths={"angle": fp.PathConstraint(lambda v: v.state.angle)}), "already the name"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.angel, upper=1.0)}), "angle"),
         (fp.Limits(paths={"mix": fp.PathConstraint(lambda v: v.state.vector, upper=1.0)}), "one scalar"),
-        (fp.Limits(soft={"angle": 1.0}), "soft: limit of"),
+        (fp.Limits(prices={"angle": 1.0}), "prices: limit of"),
         (
             fp.Limits(rates={"torque": (-1.0, 1.0)}, paths={"torque rate": fp.PathConstraint(speed_and_angle)}),
             "'torque rate' is already the name of the limit in rates",
@@ -175,19 +159,8 @@ def test_priced_limits_have_the_optimum_of_a_problem_with_slacks():
     assert known(plan.cost) + plan.slacks()["angle'"] == pytest.approx(total.fun, rel=1e-5)
 
 
-def test_the_price_of_a_soft_state_counts_the_end_too():
-    """What a soft limit adds to the cost of a plan is what it is said to cost."""
-    soft = limited(fp.Limits(states={"angle": (-0.1, 0.1)}, soft={"angle": 7.0}))
-    free = limited(fp.Limits())
-    plan = fp.solve(soft[0], FIXED, soft[2], soft[1])
-    costs = [rolled(ocp, first, plan.inputs, data).cost for ocp, data, first in (soft, free)]
-    assert plan.slacks()["angle"] == pytest.approx(costs[0] - costs[1], rel=1e-9)
-
-
 def test_prices_are_refused_by_who_cannot_take_them():
     """A solver that keeps limits must not turn a priced one into a hard one."""
     ocp, data, first = priced(1.0)
     with pytest.raises(NotSupported, match="takes no prices"):
         fp.solve(ocp, IPOPT, first, data)
-    with pytest.raises(FpirhcError, match="both soft and priced"):
-        limited(fp.Limits(states={"angle": (0, 1)}, soft={"angle": 1.0}, prices={"angle": 1.0}))

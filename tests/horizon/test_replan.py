@@ -190,7 +190,7 @@ LIMITED = fp.Limits(inputs={"torque": (-6.0, 6.0)}, states={"angle": (-0.5, 0.5)
 TASKS = {
     "Euler": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.Euler(2), replan="cycle")),
     "limits of rates": lambda: task(limits=replace(LIMITED, rates={"torque": (-FASTEST, FASTEST)}), replan=2),
-    "soft limits": lambda: task(limits=replace(LIMITED, soft={"angle": 100.0})),
+    "prices": lambda: task(limits=replace(LIMITED, prices={"angle": 10.0})),
     "blocks": lambda: task(horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle")),
     "lengths, limits": lambda: task(limits=LIMITED, horizon=fp.Horizon(STAGES, STEP, replan=2, lengths=GROWING)),
     "lengths, blocks": lambda: task(

@@ -32,7 +32,6 @@ LIMITED = {
     "state": fp.Limits(states={"a": (-1.0, MOST)}),
     "path": fp.Limits(paths={"swing": fp.PathConstraint(lambda v: v.state.a, upper=MOST, unit="m")}),
     "output": fp.Limits(paths={"swing": fp.PathConstraint(lambda v: v.output.a, upper=MOST, unit="m")}),
-    "soft": fp.Limits(states={"a": (-1.0, MOST)}, soft={"a": 1e3}),
     "priced": fp.Limits(states={"a": (-1.0, MOST)}, prices={"a": 1e6}),
 }
 
@@ -61,6 +60,5 @@ def test_hard_limits_hold_at_every_step(name, lengths):
     assert largest(LIMITED[name], lengths) == pytest.approx(MOST, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["soft", "priced"])
-def test_soft_and_priced_limits_hold_at_the_nodes_alone(name):
-    assert largest(LIMITED[name]) > 1.5 * MOST
+def test_priced_limits_hold_at_the_nodes_alone():
+    assert largest(LIMITED["priced"]) > 1.5 * MOST

@@ -42,9 +42,8 @@ def test_limits_of_states_behind_outputs_hold_for_the_measured_state(believed: f
     assert fastest(free) > 1.5
 
 
-@pytest.mark.parametrize("settings", [{"soft": {"speed": 1e3}}, {"prices": {"speed": 1e2}}])
-def test_so_do_soft_limits_and_priced_ones(settings: dict[str, Any]) -> None:
-    run = simulated(servo(0.7, **settings), fp.RecedingHorizon(SOLVED, ADAPTIVE))
+def test_so_do_priced_limits() -> None:
+    run = simulated(servo(0.7, prices={"speed": 1e2}), fp.RecedingHorizon(SOLVED, ADAPTIVE))
     assert 0.9 < fastest(run) < 1.1
 
 

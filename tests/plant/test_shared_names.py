@@ -16,7 +16,7 @@ CONTROLLER = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.
 
 
 def joints(motors: tuple[str, str], keys: tuple[str, str, str], **changes) -> fp.Problem:
-    """Two joints with these motors; disturbances of the first motor and of the first joint, and the soft rate of that motor."""
+    """Two joints with these motors; disturbances of the first motor and joint, and the price of the rate of that motor."""
 
     def response(q, v, u, p):
         first, second = (getattr(u, name) for name in motors)
@@ -38,7 +38,7 @@ def joints(motors: tuple[str, str], keys: tuple[str, str, str], **changes) -> fp
             inputs=dict.fromkeys(motors, (-5.0, 5.0)),
             states={"shoulder": (-2.0, 2.0)},
             rates={motors[0]: (-60.0, 60.0)},
-            soft={"shoulder": 10.0, rate: 1e-3},
+            prices={"shoulder": 10.0, rate: 1e-3},
         ),
         **changes,
     }
@@ -113,8 +113,8 @@ def test_disturbances_act_where_they_are_said_to():
         ),
         ({"disturbances": {"input elbo": fp.Step(at=0.1, size=1.0)}}, "Did you mean 'input elbow'"),
         (
-            {"limits": fp.Limits(rates={"elbow": (-1.0, 1.0)}, soft={"elbow": 1.0})},
-            "soft: limit of 'elbow' is unknown. Did you mean 'elbow rate'",
+            {"limits": fp.Limits(rates={"elbow": (-1.0, 1.0)}, prices={"elbow": 1.0})},
+            "prices: limit of 'elbow' is unknown. Did you mean 'elbow rate'",
         ),
     ],
 )

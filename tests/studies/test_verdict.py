@@ -275,12 +275,12 @@ def test_what_the_cost_weighs_is_judged(name, judged):
 
 
 def test_a_hard_limit_that_a_run_breaks_is_told():
-    """The mass begins faster than its hard limit: the note says how fast; with a soft limit there is none, and none inside."""
+    """The mass begins faster than its hard limit: the note says how fast; with a price there is none, and none inside."""
     mass = fp.Plant({"q": "m"}, {"u": "N"}, {"m": fp.Parameter(1.0, 1.0, "kg")}, lambda q, v, u, p: {"q": u.u / p.m})
     horizon, cost = fp.Horizon(stages=10, step=0.05), fp.Quadratic(states={"q": 1.0, "q'": 0.1}, effort={"u": 1e-2})
 
-    def notes(limit: float, size: float = 1.0, **soft: float) -> list[str]:
-        limits, still = fp.Limits(states={"q'": (-limit, limit)}, soft=soft), fp.Trajectory(lambda t: {"q": 0 * t})
+    def notes(limit: float, size: float = 1.0, **prices: float) -> list[str]:
+        limits, still = fp.Limits(states={"q'": (-limit, limit)}, prices=prices), fp.Trajectory(lambda t: {"q": 0 * t})
         planned = {"period": 0.05, "duration": 1.0, "limits": limits, "horizon": horizon, "cost": cost}
         one = fp.Problem(mass, still, {"q": 0.0, "q'": -1.5 * size}, **planned)
         plan = fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))

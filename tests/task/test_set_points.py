@@ -174,7 +174,7 @@ def test_bad_references():
     limited = replace(tasks.two_mass.problem.limits, states={"q1": (2.0, 2.3)})
     with pytest.raises(InvalidProblem, match=r"'q1' is 2\.4, outside its limits of 2 to 2\.3"):
         replace(two_mass(), limits=limited)
-    replace(two_mass(), limits=replace(limited, soft={"q1": 1.0}))  # a limit with a price may be passed
+    replace(two_mass(), limits=replace(limited, prices={"q1": 1.0}))  # a limit with a price may be passed
     with pytest.raises(InvalidName, match="a Trajectory, has no set-points"):
         fp.simulate(
             tasks.two_mass.problem, tasks.two_mass.controllers["CTC"], seed=0, compiled=False, setpoints={"q1": 1.0}
