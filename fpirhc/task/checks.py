@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, view_of_symbols
-from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import check_time, over
@@ -23,41 +23,35 @@ from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.open import nominal
-from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
-from fpirhc.task.reality import Reality
 from fpirhc.task.reference import Steps, pairs
 
+if TYPE_CHECKING:
+    from fpirhc.task.problem import Problem
 
-def settled_maps(
-    plant: Plant,
-    reality: Reality | ExternalPlant | None,
-    period: float,
-    integrator: Integrator,
-    horizon: Horizon | None,
-    sensing: Sensing,
-    mistakes: Mistakes,
-) -> dict[str, object]:
+
+def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
     """Return the fields of a problem that follow from its maps, by name, and add to `mistakes` what does not fit their steps."""
     settled: dict[str, object] = {}
     with mistakes.caught():
-        settled["plant"] = over(plant, period)
-        if reality is not None:
-            settled["reality"] = reality.over(period)
+        plant = settled["plant"] = over(problem.plant, problem.period)
+        settled["reality"] = problem.reality and problem.reality.over(problem.period)
     if not mistakes.none:
         return {}
     if plant.step is not None:
-        settled["integrator"] = _steps("integrator", integrator, mistakes)
-        if horizon is not None:
-            discretisation = _steps("horizon: discretisation", horizon.discretisation, mistakes)
-            settled["horizon"] = replace(horizon, discretisation=discretisation)
-            if any(length % 1 for length in horizon.lengths):
-                mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {horizon.lengths}")
-        if sensing.estimator.measures_all and not _instant(plant):
+        settled["integrator"] = _steps("integrator", problem.integrator, mistakes)
+        if problem.horizon is not None:
+            discretisation = _steps("horizon: discretisation", problem.horizon.discretisation, mistakes)
+            settled["horizon"] = replace(problem.horizon, discretisation=discretisation)
+            if any(length % 1 for length in problem.horizon.lengths):
+                mistakes.add(
+                    f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}"
+                )
+        if problem.sensing.estimator.measures_all and not _instant(plant):
             from fpirhc.sensing.positions import StepDifference  # of maps alone
 
-            settled["sensing"] = replace(sensing, estimator=StepDifference())
-    elif integrator.steps_maps:
+            settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
+    elif problem.integrator.steps_maps:
         settled["integrator"] = USUAL
     return settled
 

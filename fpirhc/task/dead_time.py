@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import casadi as ca
 
@@ -37,15 +37,6 @@ class DeadTime(Checked):
     inputs: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"structure": True})
     measurement: NotNegative = field(default=0.0, metadata={"structure": True})
 
-    def over(self, period: float) -> DeadTime:
-        """Return it without dead times that are below the rounding of a cycle, as .3 - .1 - .2 is."""
-        least = WHOLE * period
-        inputs = {n: late for n, late in self.inputs.items() if not 0 < late < least}
-        measurement = 0.0 if 0 < self.measurement < least else self.measurement
-        if len(inputs) == len(self.inputs) and measurement is self.measurement:
-            return self
-        return replace(self, inputs=inputs, measurement=measurement)
-
     @property
     def longest(self) -> float:
         """From a command of the slowest input to its measured response."""
@@ -67,11 +58,7 @@ class DeadTime(Checked):
         return self.wait(MEASUREMENT, period) if MEASUREMENT in self.queued else None
 
     def check(self, plant: Plant, period: float) -> None:
-        """Raise if a name is unknown, or a dead time is negative, not finite, or too long.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
+        """Raise if a name is unknown, or a dead time is too long."""
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
         for name, value in {**self.inputs, MEASUREMENT: self.measurement}.items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -104,7 +104,7 @@ def as_known(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogen
 
 
 def not_held(signals: Mapping[str, Exogenous], names: Sequence[str]) -> tuple[str, ...]:
-    """Return those of some signals that change between jumps, as functions of time and lines between samples do."""
+    """Return those of some signals that change between jumps, as functions of time do."""
     courses = {name: signals[name].values for name in names if name in signals}
     return tuple(name for name, one in courses.items() if callable(one) and not getattr(one, "held", False))
 
@@ -142,11 +142,9 @@ def check_signals(
 
 
 def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistakes) -> None:
-    first, last = getattr(course, "span", (-math.inf, math.inf))
-    if first > times[0] or last < times[-1]:
-        mistakes.add(
-            f"{what} are stated from {first:g} to {last:g}, the run is from {times[0]:g} to {times[-1]:g}; add samples"
-        )
+    first = getattr(course, "first", -math.inf)
+    if first > times[0]:
+        mistakes.add(f"{what} are stated from {first:g} on, and the run begins at {times[0]:g}; add a sample")
         return
     with mistakes.caught(f"{what}: "):
         values = np.asarray(_course_function([course]).map(times.size)(times[None, :]).full()).ravel()
@@ -164,59 +162,43 @@ def _filling(elements: Sequence[str], courses: Mapping[str, Course]) -> ca.Funct
 
 @dataclass(frozen=True, eq=False)
 class Samples(Checked):
-    """Samples of a quantity over time.
-
-    Before the first and after the last sample the nearest one holds; a run needs samples that cover it (see `span`).
+    """Samples of a quantity over time, each held until the next one; `lambda t: ca.pw_lin(t, times, values)` joins them by lines.
 
     Args:
-        times: increasing times of the samples, shape (m,), in the plant's unit of time.
+        times: increasing times of the samples, shape (m,), in the plant's unit of time; a run needs the first one at its start.
         values: the samples, shape (m,).
-        hold: "zero": a sample holds until the next one; "linear": lines join the samples.
 
     Raises:
-        InvalidValue: times that do not increase, numbers that are not finite, an unknown hold.
-        InvalidShape: lengths that differ, or too few samples.
+        InvalidValue: times that do not increase, or numbers that are not finite.
+        InvalidShape: lengths that differ, or no sample.
     """
 
     times: Sequence[float] | np.ndarray
     values: Sequence[float] | np.ndarray
-    hold: Literal["zero", "linear"] = "zero"
 
     def __post_init__(self) -> None:
         times, values = (np.asarray(v, dtype=float) for v in (self.times, self.values))
-        least = 1 if self.hold == "zero" else 2
-        if times.ndim != 1 or times.size < least or values.shape != times.shape:
+        if times.ndim != 1 or not times.size or values.shape != times.shape:
             raise InvalidShape(
-                f"Samples: times have shape {times.shape} and values {values.shape}; expected one value per time, at least {least}"
+                f"Samples: times have shape {times.shape} and values {values.shape}; expected one value per time, at least 1"
             )
         if not (np.isfinite(times).all() and np.isfinite(values).all()) or np.any(np.diff(times) <= 0):
             raise InvalidValue("Samples: times and values must be finite, and the times must increase")
 
     opaque = True
+    held = True
 
     @property
-    def held(self) -> bool:
-        """Whether the values are constant between jumps."""
-        return self.hold == "zero"
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """First and last time with a stated value; a last sample that is held goes on for ever."""
-        times = np.asarray(self.times, dtype=float)
-        return float(times[0]), math.inf if self.hold == "zero" else float(times[-1])
+    def first(self) -> float:
+        """First time with a stated value; the last sample goes on for ever."""
+        return float(self.times[0])
 
     def __call__(self, t: Expression) -> Expression:
         """Return the value at a time."""
         times, values = (np.asarray(v, dtype=float) for v in (self.times, self.values))
-        at = graph(t)
-        if self.hold == "zero":
-            # `low` never returns the last entry, so one more entry makes the last sample reachable.
-            place = ca.low(ca.DM(np.append(times, times[-1] + 1.0)), at)
-            return expression(ca.MX(ca.DM(values))[place])
-        place, slopes = ca.low(ca.DM(times), at), np.diff(values) / np.diff(times)
-        inside = ca.fmin(ca.fmax(at, times[0]), times[-1])
-        begin, value, slope = (ca.MX(ca.DM(v))[place] for v in (times[:-1], values[:-1], slopes))
-        return expression(value + slope * (inside - begin))
+        # `low` never returns the last entry, so one more entry makes the last sample reachable.
+        place = ca.low(ca.DM(np.append(times, times[-1] + 1.0)), graph(t))
+        return expression(ca.MX(ca.DM(values))[place])
 
 
 Course: TypeAlias = Samples | Callable[[Expression], Expression] | float

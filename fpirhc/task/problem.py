@@ -102,10 +102,8 @@ class Problem(Checked):
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")
-        known = self.plant, self.reality, self.period, self.integrator, self.horizon, self.sensing
-        for name, value in settled_maps(*known, mistakes).items():
+        for name, value in settled_maps(self, mistakes).items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "dead_time", self.dead_time.over(self.period))
         mistakes.raise_if_any()
         _check_times(self, mistakes)
         _check_start(self, mistakes)
@@ -320,24 +318,25 @@ class Problem(Checked):
         values = [self.input_before.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
         return np.array(values, dtype=float)
 
+    def _at_start(self, quantities: Sequence[str], *, seen: bool) -> np.ndarray:
+        """Values of quantities of the model, of the plant that moves, as they are judged or measured at the start."""
+        at = self.real_start, self.inputs_before, self.real_parameters, np.zeros(len(self.real_plant.names))
+        return np.asarray(self.truth.function(quantities, seen=seen)(*at).full()).ravel()
+
     @cached_property
     def start_output(self) -> np.ndarray:
         """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state."""
-        if not self.plant.outputs:
-            return self.start_state
-        function, calm = self.truth.function(self.plant.output.elements), np.zeros(len(self.real_plant.names))
-        return np.asarray(function(self.real_start, self.inputs_before, self.real_parameters, calm).full()).ravel()
+        outputs = self.plant.output.elements
+        return self._at_start(outputs, seen=False) if self.plant.outputs else self.start_state
 
     @cached_property
     def first_shown(self) -> Mapping[str, float]:
         """What sensors without noise show at the start, by name; of states that what moves does not have, the model's value."""
-        plant, truth = self.plant, self.truth
-        motion = truth.shown((*plant.state.elements, *plant.output.elements))
+        plant = self.plant
+        motion = self.truth.shown((*plant.state.elements, *plant.output.elements))
         names = tuple(dict.fromkeys((*motion, *response_names(plant))))
-        at = self.real_start, self.inputs_before, self.real_parameters, np.zeros(len(self.real_plant.names))
-        values = np.asarray(truth.function(names, seen=True)(*at).full()).ravel()
-        believed = dict(zip(plant.state.elements, map(float, self.start_state), strict=True))
-        return believed | dict(zip(names, map(float, values), strict=True))
+        believed = dict(zip(plant.state.elements, self.start_state.tolist(), strict=True))
+        return believed | dict(zip(names, self._at_start(names, seen=True).tolist(), strict=True))
 
     @property
     def first_output(self) -> np.ndarray:

@@ -54,7 +54,7 @@ def test_an_output_of_order_zero_may_depend_on_a_signal() -> None:
     assert run["output.loss"][1:] == pytest.approx(expected[1:], abs=1e-9)
 
 
-@pytest.mark.parametrize("course", [lambda t: 280 + ca.sin(t), fp.Samples([0.0, 300.0], [280.0, 285.0], "linear")])
+@pytest.mark.parametrize("course", [lambda t: 280 + ca.sin(t), lambda t: ca.pw_lin(t, [0.0, 300.0], [280.0, 285.0])])
 def test_an_output_whose_derivative_has_that_of_a_smooth_signal_is_refused(course: Any) -> None:
     difference = room(outputs={"d": fp.Output("K", lambda q, p: q.T - p.ambient)})
     problem = heated(room(), "T", rising)
