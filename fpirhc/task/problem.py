@@ -110,14 +110,6 @@ class Problem(Checked):
         plant = self.plant
         _check_input_before(self, mistakes)
         mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), followed_units(plant))
-        shared = [n for n in self.disturbances if n in plant.inputs and n in self._pushed]
-        for name in shared:
-            mistakes.add(
-                f"disturbances: '{name}' names both an input and a coordinate; write 'input {name}' or 'coordinate {name}'"
-            )
-        names = [*self.disturbable, *shared]
-        what = "input, coordinate or output" if plant.outputs else "input or coordinate"
-        mistakes.unknown(f"disturbances: {what}", self.disturbances, names)
         check_signals(
             dict.fromkeys((plant, self.real_plant)), self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes
         )
@@ -280,8 +272,10 @@ class Problem(Checked):
         return rows_of(real_values(plant, self.signals), np.array([middle]), plant.exact)[0]
 
     def _check_disturbances(self) -> None:
-        """Raise if a disturbance has no values, or one of an output not the derivatives that are needed."""
+        """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
         mistakes, instants = Mistakes("disturbances"), np.array([0.0, self.period])
+        what = "input, coordinate or output" if self.plant.outputs else "input or coordinate"
+        mistakes.unknown(what, self.disturbances, self.disturbable)
         for name, one in self.disturbances.items():
             with mistakes.caught(f"'{name}': "):
                 one.values(instants, np.random.default_rng(0))

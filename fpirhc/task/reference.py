@@ -23,7 +23,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import Count, Finite, Positive, described, real_number
+from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.chain import response_units
 from fpirhc.plant.maps import time_derivatives
@@ -108,29 +108,17 @@ class Reference(Checked, ABC):
 class Trajectory(Reference):
     """A nominal motion given as expressions of time: Trajectory(lambda t: {"q1": ca.sin(2 * t)}).
 
-        y(t) = m(0) + s (m(t) - m(0)),  y^(k)(t) = s m^(k)(t)       for every coordinate y with its motion m
-
     Args:
         motion: function of the time in seconds that returns {coordinate: expression}.
-        scale: s; how far the motion goes from its first point.
     """
 
     motion: Callable[[Expression], Mapping[str, Expression]]
-    scale: Finite = field(default=1.0, kw_only=True, metadata={"setting": "where given", "structure": True})
 
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
-        def of(time: Expression) -> dict[str, Expression]:
-            named = named_results("reference", called("reference", self.motion, time))
-            return {
-                str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(time,))
-                for name, value in named.items()
-            }
-
-        if self.scale == 1:
-            return of(t)
-        still = ca.SX.sym("t")
-        first = {name: ca.substitute(value, still, 0) for name, value in of(still).items()}
-        return {name: first[name] + self.scale * (value - first[name]) for name, value in of(t).items()}
+        return {
+            str(name): scalar_expression(f"reference: coordinate '{name}'", value, of=self.motion, symbols=(t,))
+            for name, value in named_results("reference", called("reference", self.motion, t)).items()
+        }
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,15 +18,6 @@ def test_derivatives_up_to_the_order():
     np.testing.assert_allclose(result, expected, rtol=1e-12, equal_nan=False)
 
 
-def test_a_scale_goes_from_the_first_point():
-    """For y = 3 + sin 2t and the scale s: y = 3 + s sin 2t, and all derivatives are s times those of sin 2t."""
-    scaled = fp.Trajectory(lambda t: {"y": 3 + ca.sin(2 * t)}, scale=-1.5)
-    state, response = scaled.function(chain(2))(0.3)
-    wanted = [3 - 1.5 * np.sin(0.6), -3 * np.cos(0.6), 6 * np.sin(0.6)]
-    np.testing.assert_allclose(np.append(state.full().ravel(), float(response)), wanted, rtol=1e-12)
-    np.testing.assert_allclose(float(ca.evalf(scaled.coordinates(ca.SX(0.3))["y"])), wanted[0], rtol=1e-12)
-
-
 def test_missing_and_unknown_coordinates():
     with pytest.raises(InvalidProblem, match=r"(?s)'z' is unknown.*'y' has no nominal motion"):
         fp.Trajectory(lambda t: {"z": t}).function(chain(2))
