@@ -8,7 +8,7 @@ output itself, and measured. What is believed, nobody measures; a reality need n
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,6 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.open import nominal
 from fpirhc.task.limits import Limits
-from fpirhc.task.reference import Steps, pairs
 
 if TYPE_CHECKING:
     from fpirhc.task.problem import Problem
@@ -129,30 +128,20 @@ def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> Mistakes:
     return mistakes
 
 
-def check_steps(plant: Plant, limits: Limits, set_points: Mapping[str, Steps]) -> None:
-    """Raise if some set-points are no steps, or can never be reached."""
-    known = {name: steps for name, steps in set_points.items() if name in plant.chains}
-    check_values(plant, limits, {name: [v for _, v in pairs(name, steps)] for name, steps in known.items()})
-
-
-def check_values(plant: Plant, limits: Limits, values: Mapping[str, Sequence[float]]) -> None:
+def check_values(plant: Plant, limits: Limits, values: Mapping[str, Iterable[float]]) -> None:
     """Raise if a set-point is not finite, or can never be reached."""
     mistakes = []
     for name, numbers in values.items():
+        hard = {} if name in limits.prices else limits.states
+        ranges = {
+            what: ends[name] for what, ends in (("physical range", plant.ranges), ("limits", hard)) if name in ends
+        }
         for value in dict.fromkeys(numbers):
             if not math.isfinite(value):
                 mistakes.append(f"'{name}' is {value}, expected a finite number")
                 continue
-            for what, (low, high) in _ranges(plant, limits, name).items():
+            for what, (low, high) in ranges.items():
                 if not low <= value <= high:
                     mistakes.append(f"'{name}' is {value:g}, outside its {what} of {low:g} to {high:g}")
     if mistakes:
         raise InvalidValue(f"set-points: {'; '.join(mistakes)}")
-
-
-def _ranges(plant: Plant, limits: Limits, name: str) -> dict[str, tuple[float, float]]:
-    """What a set-point of the coordinate must not leave: its physical range, and a limit that has no price."""
-    ranges = {"physical range": plant.ranges[name]} if name in plant.ranges else {}
-    if name in limits.states and name not in limits.prices:
-        ranges["limits"] = limits.states[name]
-    return ranges

@@ -29,14 +29,14 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Signal
-from fpirhc.task.checks import check_maps, check_stage, check_steps, needed_names, settled_maps
+from fpirhc.task.checks import check_maps, check_stage, check_values, needed_names, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
 from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
-from fpirhc.task.reference import Reference
+from fpirhc.task.reference import Reference, pairs
 
 _WHOLE = 1e-6  # cycles by which a duration may miss a whole number of them
 MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
@@ -113,12 +113,14 @@ class Problem(Checked):
         check_signals(
             dict.fromkeys((plant, self.real_plant)), self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes
         )
+        set_points = {n: one for n, one in self.reference.set_points.items() if n in plant.chains}
+        steps = {name: [value for _, value in pairs(name, one)] for name, one in set_points.items()}
         checks = (
             lambda: self._check_disturbances(),
             lambda: self.limits.check(plant),
             lambda: check_names(self.horizon, self.limits) if self.horizon else None,
             lambda: _check_reference(self),
-            lambda: check_steps(plant, self.limits, self.reference.set_points),
+            lambda: check_values(plant, self.limits, steps),
             lambda: self.dead_time.check(plant, self.period),
             lambda: self.sensing.check(plant),
             lambda: (
