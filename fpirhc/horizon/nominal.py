@@ -42,18 +42,16 @@ def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
     hidden = [e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0]
     require_reference_of_states(
         plant,
-        f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs and do not follow from "
-        "them by linear equations, and so have no reference; weigh the rate of the input, Quadratic(rate=...), in place of "
+        f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs, and so have no "
+        "reference; weigh the rate of the input, Quadratic(rate=...), in place of "
         "its deviation from a feedforward",
     )
     return outputs[list(plant.equations.known_by_outputs)]
 
 
 def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> Matrix:
-    """Return the input that the model needs along the reference, where every state follows from the outputs."""
-    follows = None if plant.equations.known_on_reference else followed_state(plant)
-    state = reference_state(plant, outputs) if follows is None else follows(outputs, p)
-    return plant.equations.inverse(state, nominal_responses(plant, outputs, responses), p)
+    """Return the input that the model needs along the reference, where every state is an output."""
+    return plant.equations.inverse(reference_state(plant, outputs), nominal_responses(plant, outputs, responses), p)
 
 
 def output_feedback(plant: Plant, x: Matrix, outputs: Matrix, p: Matrix, rate: float) -> Matrix:
@@ -94,61 +92,6 @@ def nominal_motion(
 
 def _sizes(plant: Plant) -> dict[str, int]:
     return {"x": plant.state.size, "outputs": plant.output.size, "r": len(plant.chains)}
-
-
-def followed_state(plant: Plant) -> ca.Function | None:
-    """Return the Function (y, y', ... below each relative order; parameters) -> state; None where some state does not follow."""
-    x, u, p = plant.symbols()
-    y = ca.SX.sym("y", plant.output.size)
-    residuals = ca.vertsplit(plant.equations.output(x, ca.SX.zeros(u.numel()), p, ca.SX.zeros(len(plant.names))) - y)
-    known = {i: y[place] for i, place in enumerate(plant.equations.known_by_outputs) if place >= 0}
-    left = [i for i in range(x.numel()) if i not in known]
-    rows = [_with(r, x, known) for k, r in enumerate(residuals) if k not in plant.equations.known_by_outputs]
-    while left:
-        one = next(((r, i) for r in rows for i in left if _alone(r, x, i, left)), None)
-        if one is None:
-            break
-        row, i = one
-        known[i] = _root(row, x[i])
-        left.remove(i)
-        rows = [_with(r, x, {i: known[i]}) for r in rows if r is not row]
-    if left and not _linear_system(rows, x, left):
-        return None
-    if left:
-        hidden = ca.vertcat(*(x[i] for i in left))
-        known |= dict(zip(left, ca.vertsplit(_root(ca.vertcat(*rows), hidden)), strict=True))
-    return ca.Function("fpirhc_followed_state", [y, p], [ca.densify(ca.vertcat(*(known[i] for i in range(x.numel()))))])
-
-
-def _with(expression: ca.SX, x: ca.SX, known: dict[int, ca.SX]) -> ca.SX:
-    return (
-        ca.substitute(expression, ca.vertcat(*(x[i] for i in known)), ca.vertcat(*known.values()))
-        if known
-        else expression
-    )
-
-
-def _alone(row: ca.SX, x: ca.SX, i: int, left: list[int]) -> bool:
-    """Whether this entry is the only one that is left in the row, and the row is affine in it."""
-    others = [x[j] for j in left if j != i]
-    return (
-        ca.depends_on(row, x[i])
-        and ca.is_linear(row, x[i])
-        and not (others and ca.depends_on(row, ca.vertcat(*others)))
-    )
-
-
-def _linear_system(rows: list[ca.SX], x: ca.SX, left: list[int]) -> bool:
-    hidden = ca.vertcat(*(x[i] for i in left))
-    if len(rows) != len(left) or not ca.is_linear(ca.vertcat(*rows), hidden):
-        return False
-    return bool(ca.sprank(ca.jacobian(ca.vertcat(*rows), hidden)) == len(left))
-
-
-def _root(rows: ca.SX, unknown: ca.SX) -> ca.SX:
-    """The zero of rows that are affine in the unknown."""
-    at_zero = ca.substitute(rows, unknown, ca.SX.zeros(unknown.numel()))
-    return -ca.solve(ca.densify(ca.jacobian(rows, unknown)), at_zero)
 
 
 Bounds: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
