@@ -43,17 +43,44 @@ class View:
     outside: Named  # signals from outside at this stage, as the controllers know them, view.outside.price
 
 
+def view_of(
+    plant: Plant,
+    x: Expression,
+    u: Expression,
+    p: Expression,
+    t: Expression,
+    *,
+    before: Expression | None = None,
+    reference: Expression | None = None,
+    feedforward: Expression | None = None,
+    output: Expression | None = None,
+) -> View:
+    """Return the view of a stage; the output is the model's where it is not given, and what else is not given is NaN."""
+
+    def named(signal: Signal, vector: Expression | None, what: str = "") -> Named:
+        return Named(signal.elements, ca.SX.nan(signal.size) if vector is None else vector, what or signal.name)
+
+    now, past, known = (named(plant.input, v, "input") for v in (u, before, feedforward))
+    state, wanted, given = (
+        named(plant.state, x, "state"),
+        named(plant.output, reference),
+        named(plant.parameter, p, "parameter"),
+    )
+    shown = named(plant.output, outputs_of(plant, x, u, p) if output is None else output)
+    return View(state, wanted, now, past, known, given, t, shown, outside_of(plant, p))
+
+
+def outputs_of(plant: Plant, x: Expression, u: Expression, p: Expression) -> Expression:
+    """The model's outputs and their derivatives at a stage; the state without outputs."""
+    return plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
+
+
 def view_of_symbols(plant: Plant) -> View:
     """Return a view whose entries are symbols."""
-    state, output, inputs, p = plant.state, plant.output, plant.input, ca.SX.sym("p", plant.parameter.size)
-
-    def named(signal: Signal, symbol: str) -> Named:
-        return Named(signal.elements, ca.SX.sym(symbol, signal.size), signal.name)
-
-    x, y, reference = named(state, "x"), named(output, "y"), named(output, "reference")
-    u, before, feedforward = (named(inputs, name) for name in ("u", "before", "feedforward"))
-    parameters, t = Named(plant.parameter.elements, p, "parameter"), ca.SX.sym("t")
-    return View(x, reference, u, before, feedforward, parameters, t, y, outside_of(plant, p))
+    (x, u, p), output = plant.symbols(), plant.output.size
+    others = {name: ca.SX.sym(name, u.numel()) for name in ("before", "feedforward")}
+    others |= {name: ca.SX.sym(name, output) for name in ("reference", "output")}
+    return view_of(plant, x, u, p, ca.SX.sym("t"), **others)
 
 
 def read_by(plant: Plant, values: Callable[[View], Iterable[Value]]) -> frozenset[str]:

@@ -55,7 +55,7 @@ class ExactHessian(HessianModel):
 
 def linear_stage(ocp: OptimalControl) -> ca.Function:
     """Function (s, u, theta) -> (s+, l, A (ns, ns), B (ns, nu), l_s, l_u)."""
-    s, u, theta = stage_symbols(ocp)
+    s, u, theta = ocp.dynamics.sx_in()
     next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
     jacobians = [ca.jacobian(next_state, s), ca.jacobian(next_state, u)]
     gradients = [ca.gradient(cost, s), ca.gradient(cost, u)]
@@ -64,7 +64,7 @@ def linear_stage(ocp: OptimalControl) -> ca.Function:
 
 def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
     """Function (s, u, theta, lambda of s+) -> (Q (ns, ns), S (nu, ns), R (nu, nu))."""
-    s, u, theta = stage_symbols(ocp)
+    s, u, theta = ocp.dynamics.sx_in()
     costate = ca.SX.sym("lambda", ocp.state.size)
     curved = hessian.curved(ocp.stage_cost(s, u, theta)[0], ocp.dynamics(s, u, theta), costate)
     slope = ca.gradient(curved, u)
@@ -74,15 +74,10 @@ def hessian_stage(ocp: OptimalControl, hessian: HessianModel) -> ca.Function:
 
 def hessian_end(ocp: OptimalControl) -> ca.Function:
     """Function (s_N, theta_N) -> (T, T_s, T_ss)."""
-    s, _, theta = stage_symbols(ocp)
+    s, _, theta = ocp.dynamics.sx_in()
     final = ocp.terminal_cost(s, theta)
     hessian, slope = ca.hessian(final, s)
     return _dense("fpirhc_hessian_end", [s, theta], [final, slope, hessian])
-
-
-def stage_symbols(ocp: OptimalControl) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Symbols (s, u, theta) of one stage."""
-    return ca.SX.sym("s", ocp.state.size), ca.SX.sym("u", ocp.input.size), ca.SX.sym("theta", ocp.data.size)
 
 
 def _dense(name: str, arguments: list[ca.SX], results: list[ca.SX]) -> ca.Function:
@@ -122,7 +117,7 @@ def _kept(matrix: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
 
 def _split(ocp: OptimalControl) -> _Parts:
     ns = ocp.state.size
-    s, u, theta = stage_symbols(ocp)
+    s, u, theta = ocp.dynamics.sx_in()
     next_state, (cost, _) = ocp.dynamics(s, u, theta), ocp.stage_cost(s, u, theta)
     values, symbols, jacobian = _kept(ca.jacobian(ca.vertcat(next_state, cost), ca.vertcat(s, u)))
     after = ca.SX.sym("lambda", ns)
@@ -139,7 +134,7 @@ def _split(ocp: OptimalControl) -> _Parts:
 
 def _bent(ocp: OptimalControl, hessian: HessianModel) -> _Parts:
     ns = ocp.state.size
-    s, u, theta = stage_symbols(ocp)
+    s, u, theta = ocp.dynamics.sx_in()
     after, variables = ca.SX.sym("lambda", ns), ca.vertcat(s, u)
     cost = ocp.stage_cost(s, u, theta)[0]
     curved = ca.hessian(hessian.curved(cost, ocp.dynamics(s, u, theta), after), variables)[0]

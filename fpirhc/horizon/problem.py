@@ -207,7 +207,7 @@ def expand_along(
     """Return the quadratic model along nodes (states, inputs, data); `functions` keeps its Functions for the next call."""
     functions = {} if functions is None else functions
     if "linearised" not in functions:
-        functions |= {"linearised": _linearised(dynamics, stage_cost), "final": _final(terminal_cost)}
+        functions |= {"linearised": _linearised(dynamics, stage_cost), "final": _curved_end(terminal_cost)}
     states, inputs, data = nodes
     stages = inputs.shape[1]
     linearised = functions["linearised"]
@@ -284,7 +284,7 @@ def steepest_curvature(along: _ReferenceExpansion, scale: np.ndarray) -> float:
 
 def _linearised(dynamics: ca.Function, stage_cost: ca.Function) -> ca.Function:
     """Function (s, u, theta) -> (dF/ds, dF/du, d2l/ds2, d2l/duds, d2l/du2)."""
-    s, u, theta = (ca.SX.sym(n, dynamics.size1_in(k)) for k, n in enumerate(("s", "u", "theta")))
+    s, u, theta = dynamics.sx_in()
     next_state, cost = dynamics(s, u, theta), stage_cost(s, u, theta)[0]
     slope = ca.gradient(cost, u)
     second = [ca.hessian(cost, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
@@ -292,17 +292,18 @@ def _linearised(dynamics: ca.Function, stage_cost: ca.Function) -> ca.Function:
     return ca.Function("fpirhc_linearised", [s, u, theta], [ca.densify(r) for r in results])
 
 
-def _final(terminal_cost: ca.Function) -> ca.Function:
+def _curved_end(terminal_cost: ca.Function) -> ca.Function:
     """Function (s, theta) -> d2T/ds2."""
-    s, theta = (ca.SX.sym(n, terminal_cost.size1_in(k)) for k, n in enumerate(("s", "theta")))
+    s, theta = terminal_cost.sx_in()
     return ca.Function("fpirhc_final", [s, theta], [ca.densify(ca.hessian(terminal_cost(s, theta), s)[0])])
 
 
 def rollout(ocp: OptimalControl) -> ca.Function:
     """Function (s0, U (nu, N), data (ntheta, N + 1)) -> (S (ns, N + 1), V, cost by term summed over the stages)."""
-    n = ocp.stages
+    n, (s, u, theta) = ocp.stages, ocp.dynamics.sx_in()
+    one = ca.Function("fpirhc_forward_stage", [s, u, theta], [ocp.dynamics(s, u, theta), *ocp.stage_cost(s, u, theta)])
     s0, inputs, data = _symbols(ocp)
-    states, costs, terms = _forward(ocp).mapaccum("fpirhc_rollout_stages", n)(s0, inputs, data[:, :n])
+    states, costs, terms = one.mapaccum("fpirhc_rollout_stages", n)(s0, inputs, data[:, :n])
     total = ca.sum2(costs) + ocp.terminal_cost(states[:, -1], data[:, n])
     results = [ca.horzcat(s0, states), total, ca.sum2(terms)]
     return ca.Function("fpirhc_rollout", [s0, inputs, data], results, ["s0", "U", "data"], ["S", "V", "terms"])
@@ -313,15 +314,21 @@ def reduced_gradient(ocp: OptimalControl) -> ca.Function:
 
     M are multipliers of state bounds: g is then the gradient of V + sum_i M_i' s_{i+1}. Zero without state bounds.
     """
-    n = ocp.stages
+    n, (s, u, theta) = ocp.stages, ocp.dynamics.sx_in()
+    costate, multiplier = ca.SX.sym("lambda", ocp.state.size), ca.SX.sym("m", ocp.state.size)
+    weighted = ocp.stage_cost(s, u, theta)[0] + ca.dot(costate, ocp.dynamics(s, u, theta))
+    slopes = [ca.densify(ca.gradient(weighted, s) + multiplier), ca.densify(ca.gradient(weighted, u))]
+    backward = ca.Function("fpirhc_backward_stage", [costate, s, u, theta, multiplier], slopes)
+    slope = ca.densify(ca.gradient(ocp.terminal_cost(s, theta), s))
+    end = ca.Function("fpirhc_terminal_gradient", [s, theta], [slope])
     s0, inputs, data = _symbols(ocp)
     multipliers = ca.MX.sym("M", ocp.state.size, n)
     states, total, _ = rollout(ocp)(s0, inputs, data)
-    last = _terminal_gradient(ocp)(states[:, n], data[:, n]) + multipliers[:, n - 1]
+    last = end(states[:, n], data[:, n]) + multipliers[:, n - 1]
     # Stage 0 has no state multiplier: its state is given.
     stage_multipliers = ca.horzcat(ca.MX.zeros(ocp.state.size, 1), multipliers[:, : n - 1])
     order = list(range(n - 1, -1, -1))
-    sweep = _backward(ocp).mapaccum("fpirhc_adjoint_stages", n)
+    sweep = backward.mapaccum("fpirhc_adjoint_stages", n)
     costates, gradient = sweep(last, states[:, order], inputs[:, order], data[:, order], stage_multipliers[:, order])
     results = [total, gradient[:, order], states, ca.horzcat(costates[:, order], last)]
     names = ["V", "g", "S", "costates"]
@@ -329,32 +336,6 @@ def reduced_gradient(ocp: OptimalControl) -> ca.Function:
 
 
 def _symbols(ocp: OptimalControl) -> tuple[ca.MX, ca.MX, ca.MX]:
-    return (
-        ca.MX.sym("s0", ocp.state.size),
-        ca.MX.sym("U", ocp.input.size, ocp.stages),
-        ca.MX.sym("data", ocp.data.size, ocp.stages + 1),
-    )
-
-
-def _forward(ocp: OptimalControl) -> ca.Function:
-    s, u, theta = (ca.SX.sym(n, k) for n, k in (("s", ocp.state.size), ("u", ocp.input.size), ("t", ocp.data.size)))
-    cost, terms = ocp.stage_cost(s, u, theta)
-    return ca.Function("fpirhc_forward_stage", [s, u, theta], [ocp.dynamics(s, u, theta), cost, terms])
-
-
-def _backward(ocp: OptimalControl) -> ca.Function:
-    s, u, theta = (ca.SX.sym(n, k) for n, k in (("s", ocp.state.size), ("u", ocp.input.size), ("t", ocp.data.size)))
-    costate, multiplier = ca.SX.sym("lambda", ocp.state.size), ca.SX.sym("m", ocp.state.size)
-    cost, _ = ocp.stage_cost(s, u, theta)
-    weighted = cost + ca.dot(costate, ocp.dynamics(s, u, theta))
-    by_state = ca.gradient(weighted, s) + multiplier
-    by_input = ca.gradient(weighted, u)
-    results = [ca.densify(by_state), ca.densify(by_input)]
-    return ca.Function("fpirhc_backward_stage", [costate, s, u, theta, multiplier], results)
-
-
-def _terminal_gradient(ocp: OptimalControl) -> ca.Function:
-    s, theta = ca.SX.sym("s", ocp.state.size), ca.SX.sym("t", ocp.data.size)
-    return ca.Function(
-        "fpirhc_terminal_gradient", [s, theta], [ca.densify(ca.gradient(ocp.terminal_cost(s, theta), s))]
-    )
+    sizes = {"s0": (ocp.state.size, 1), "U": (ocp.input.size, ocp.stages), "data": (ocp.data.size, ocp.stages + 1)}
+    s0, inputs, data = (ca.MX.sym(name, *size) for name, size in sizes.items())
+    return s0, inputs, data

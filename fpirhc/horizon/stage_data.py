@@ -65,40 +65,29 @@ def stage_data(
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
     matrix = kind(plant.equations.inverse_opaque or looked_up)
-    t, of_cycle = matrix.sym("t"), matrix.sym("p", plant.parameter.size)
-    half = matrix.sym("half") if horizon.lengths else horizon.step / 2
+    t, half, of_cycle = matrix.sym("t"), matrix.sym("half"), matrix.sym("p", plant.parameter.size)
     p = of_cycle if signals is None else signals(t + half, of_cycle)
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.chains))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
     needed = feedforward(plant, state, response, p) if "feedforward" in read_by_cost(plant, cost) else zero
-    # These rows come out of the same call where they follow these rows: joining tables would copy both.
-    plain = not (horizon.blocks or horizon.measured) and not hastened(horizon)
-    joined = bool(settings) and plain
-    rows = [matrix.sym("settings", settings)] if joined else []
-    stage = ca.densify(ca.vertcat(t, state, needed, p, *rows))
-    one = ca.Function("fpirhc_stage_data", [t, *motion, of_cycle, *rows, *([half] if horizon.lengths else [])], [stage])
-    start, parameters = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size)
+    one = ca.Function("fpirhc_stage_data", [t, half, of_cycle, *motion], [ca.densify(ca.vertcat(t, state, needed, p))])
+    start, parameters, count = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size), horizon.stages + 1
     columns = dict(zip(("states", "responses"), motion, strict=False))
-    tables = [ca.MX.sym(name, m.numel(), horizon.stages + 1) for name, m in columns.items()]
+    tables = [ca.MX.sym(name, m.numel(), count) for name, m in columns.items()]
     given = [ca.MX.sym("settings", settings)] if settings else []
-    nodes = horizon.stages + 1
-    times = start + ca.DM(horizon.nodes).T
-    halves = [ca.DM(0.5 * np.append(np.diff(horizon.nodes), horizon.last)).T] if horizon.lengths else []
-    repeated = [ca.repmat(v, 1, nodes) for v in (parameters, *(given if joined else ()))]
-    table = one.map(nodes)(times, *tables, *repeated, *halves)
-    if horizon.blocks:
-        free = np.zeros((1, nodes))
-        free[0, [0, *np.cumsum(horizon.blocks)]] = 1.0
-        table = ca.vertcat(table, free)
-    if horizon.measured:
-        table = ca.vertcat(table, np.zeros((len(horizon.measured), nodes)))
-    if hastened(horizon):
-        table = ca.vertcat(table, 1 / np.array([[horizon.share, *horizon.relative_lengths]]))
-    if horizon.lengths:
-        table = ca.vertcat(table, np.array([[*horizon.lengths, horizon.lengths[-1]]]))
-    if settings and not joined:
-        table = ca.vertcat(table, ca.repmat(given[0], 1, nodes))
+    lasting = np.append(np.diff(horizon.nodes), horizon.last) if horizon.lengths else np.full(count, horizon.step)
+    times, halves = start + ca.DM(horizon.nodes).T, ca.DM(0.5 * lasting).T
+    rows: list[np.ndarray] = []
+    rows += [np.isin(np.arange(count), [0, *np.cumsum(horizon.blocks)])[None, :]] if horizon.blocks else []
+    rows += [np.zeros((len(horizon.measured), count))] if horizon.measured else []
+    rows += [1 / np.array([[horizon.share, *horizon.relative_lengths]])] if hastened(horizon) else []
+    rows += [np.array([[*horizon.lengths, horizon.lengths[-1]]])] if horizon.lengths else []
+    table = ca.vertcat(
+        one.map(count)(times, halves, ca.repmat(parameters, 1, count), *tables),
+        *(ca.DM(row.astype(float)) for row in rows),
+        *(ca.repmat(v, 1, count) for v in given),
+    )
     names = ["t", *columns, "p", *(["settings"] if settings else [])]
     return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *given], [table], names, ["data"])
 

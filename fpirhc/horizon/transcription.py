@@ -20,14 +20,14 @@ from fpirhc.horizon.constraint_states import (
     read_before,
     state_prices,
 )
-from fpirhc.horizon.cost import Cost, Linearisation, View, read_by_cost
+from fpirhc.horizon.cost import Cost, Linearisation, View, outputs_of, read_by_cost, view_of
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data, with_rows
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
-from fpirhc.plant.motion import outside_of, sampling
+from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named, Signal
@@ -143,7 +143,16 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
     data = layout.split(theta)
     applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
-    view = limited_view = _view(plant, ca.vertcat(x, before), applied, data, read, keeps_input)
+    view = limited_view = view_of(
+        plant,
+        x,
+        applied,
+        data["parameters"],
+        data["time"],
+        before=before if keeps_input else None,
+        reference=data["reference"],
+        feedforward=data["feedforward"] if "feedforward" in read else None,
+    )
     length = data["length"] if horizon.lengths else 1.0
     if hastened(horizon) and keeps_input:
         # A rate is limited as such; its square costs for as long as the change takes, which leaves the root of the haste.
@@ -244,7 +253,8 @@ def _steps_inside(
         later = one.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))
         x = later if k < per_stage else ca.if_else(k < per_stage * data["length"], later, x)
         state = Named(plant.state.elements, x, "state")
-        views.append(replace(view, state=state, output=_outputs(plant, x, u, p), time=view.time + k * sampling(one)))
+        output = Named(plant.output.elements, outputs_of(plant, x, u, p), plant.output.name)
+        views.append(replace(view, state=state, output=output, time=view.time + k * sampling(one)))
     return views
 
 
@@ -254,29 +264,10 @@ def _seen(plant: Plant, horizon: Horizon, x: Expression, data: Mapping[str, Expr
     return ca.vertcat(*(x[k] + offset[e] if e in offset else x[k] for k, e in enumerate(plant.state.elements)))
 
 
-def _view(
-    plant: Plant, s: Expression, u: Expression, data: Mapping[str, Expression], read: frozenset[str], keeps_input: bool
-) -> View:
-    nx, inputs = plant.state.size, plant.input.elements
-    before = s[nx:] if keeps_input else ca.SX.nan(len(inputs))
-    feedforward = data["feedforward"] if "feedforward" in read else ca.SX.nan(len(inputs))
-    return View(
-        state=Named(plant.state.elements, s[:nx], "state"),
-        reference=Named(plant.output.elements, data["reference"], plant.output.name),
-        input=Named(inputs, u, "input"),
-        input_before=Named(inputs, before, "input"),
-        feedforward=Named(inputs, feedforward, "input"),
-        parameters=Named(plant.parameter.elements, data["parameters"], "parameter"),
-        time=data["time"],
-        output=_outputs(plant, s[:nx], u, data["parameters"]),
-        outside=outside_of(plant, data["parameters"]),
-    )
-
-
 def _end_view(plant: Plant, view: View, x: Expression, before: Expression) -> View:
     """The view of the end of the horizon, whose input is NaN, because there is none; the one before is that of the last stage."""
     inputs, none = tuple(view.input), ca.SX.nan(plant.input.size)
-    output = _outputs(plant, x, none, view.parameters.vector)
+    output = Named(plant.output.elements, outputs_of(plant, x, none, view.parameters.vector), plant.output.name)
     return replace(view, output=output, input=Named(inputs, none, "input"), input_before=Named(inputs, before, "input"))
 
 
@@ -284,13 +275,6 @@ def _hastened(view: View, factor: Expression) -> View:
     """The view with so many times the change of the input."""
     u, before = view.input, view.input_before
     return replace(view, input_before=Named(tuple(before), u.vector - factor * (u.vector - before.vector), "input"))
-
-
-def _outputs(plant: Plant, x: Expression, u: Expression, p: Expression) -> Named:
-    """The model's outputs and their derivatives at a stage; the state without outputs."""
-    return Named(
-        plant.output.elements, plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names))), plant.output.name
-    )
 
 
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage, stage_symbols
+from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import clip, sane
 from fpirhc.symbolic.expression import FINITE, TINY, is_finite, kind
@@ -119,7 +119,7 @@ def _wanted(anchor: Anchor, most: ca.MX, fall: ca.MX) -> ca.MX:
 def _trial(ocp: OptimalControl) -> ca.Function:
     """Function (s0, data, lower, upper, U, X, v, K, T, tau) -> (U, X (ns, N + 1), costs, A, B, l_s, l_u) of the next plan."""
     n, ns, nu = ocp.stages, ocp.state.size, ocp.input.size
-    s, _, theta = stage_symbols(ocp)
+    s, _, theta = ocp.dynamics.sx_in()
     inputs, move, plain = (ca.SX.sym(name, nu) for name in ("u", "v", "t"))
     planned, gain, step = ca.SX.sym("x", ns), ca.SX.sym("K", nu, ns), ca.SX.sym("tau")
     low, high = ca.SX.sym("low", nu), ca.SX.sym("high", nu)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.cost import View
+from fpirhc.horizon.cost import view_of
 from fpirhc.plant.motion import with_space
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
-from fpirhc.symbolic.layout import Named, Signal
 from fpirhc.task.problem import Problem
 
 TOLERANCE = 1e-3  # of its range: a run that is further beyond has left a limit
@@ -61,18 +60,8 @@ def hard_limits(problem: Problem, run: Run) -> list[Followed]:
     unknown = np.full(run.cycles, np.nan)
     states = np.column_stack([run[f"plant_state.{n}"] if n in shown else unknown for n in plant.state.elements])
     x, u, p = (ca.SX.sym(one.name, one.size) for one in (plant.state, plant.input, plant.parameter))
-    before, t, calm = ca.SX.sym("before", plant.input.size), ca.SX.sym("t"), ca.SX.zeros(len(plant.names))
-    view = View(
-        state=_named(plant.state, x),
-        reference=_named(plant.output, ca.SX.nan(plant.output.size)),
-        input=_named(plant.input, u),
-        input_before=_named(plant.input, before),
-        feedforward=_named(plant.input, ca.SX.nan(plant.input.size)),
-        parameters=_named(plant.parameter, p),
-        time=t,
-        output=_named(plant.output, plant.equations.output(x, u, p, calm)),
-        outside=Named((), ca.SX(0, 1), "outside"),
-    )
+    before, t = ca.SX.sym("before", plant.input.size), ca.SX.sym("t")
+    view = view_of(plant, x, u, p, t, before=before)
     column = ca.vertcat(*(one.named_value(name, view) for name, one in hard.items()))
     sent = run["command"].reshape(run.cycles, -1)
     past = np.vstack([problem.inputs_before, sent[:-1]])
@@ -86,7 +75,3 @@ def limits_left(problem: Problem, run: Run) -> tuple[Followed, ...]:
     """Return the hard limits that a run has left by more than the tolerance, the worst first; arguments as in `hard_limits`."""
     worst = {one: float(one.beyond.max()) for one in hard_limits(problem, run)}
     return tuple(sorted((one for one in worst if worst[one] > TOLERANCE), key=lambda one: -worst[one]))
-
-
-def _named(signal: Signal, value: ca.SX) -> Named:
-    return Named(signal.elements, value, signal.name)
