@@ -204,20 +204,6 @@ class Quadratic(Cost):
             "rate": (self.rate, plant.input.elements),
             "terminal": (terminal, plant.output.elements),
         }
-        self._check_kind(plant, mistakes)
-        for what, (weights, valid) in groups.items():
-            mistakes.unknown(f"{what}:", weights, valid)
-        if not any(w for weights, _ in groups.values() for w in weights.values()):
-            mistakes.add("every weight is zero, so every plan is optimal; weigh at least one state")
-        for name in terminal:
-            if plant.equations.output_orders.get(name) == 0:
-                mistakes.add(
-                    f"terminal: the command moves '{name}' at once (order 0), and the end of a horizon has none; leave it out"
-                )
-        mistakes.raise_if_any()
-
-    def _check_kind(self, plant: Plant, mistakes: Mistakes) -> None:
-        """Add a mistake where weights of errors are not those of what has a reference."""
         if self.outputs and self.states:
             mistakes.add(
                 "states and outputs: both weigh errors of what has a reference; give all weights in one of them"
@@ -232,6 +218,16 @@ class Quadratic(Cost):
                 f"terminal: {type(self.terminal).__name__} weighs the whole state, which has no reference on a plant with outputs; "
                 "give weights by the name of an output"
             )
+        for what, (weights, valid) in groups.items():
+            mistakes.unknown(f"{what}:", weights, valid)
+        if not any(w for weights, _ in groups.values() for w in weights.values()):
+            mistakes.add("every weight is zero, so every plan is optimal; weigh at least one state")
+        for name in terminal:
+            if plant.equations.output_orders.get(name) == 0:
+                mistakes.add(
+                    f"terminal: the command moves '{name}' at once (order 0), and the end of a horizon has none; leave it out"
+                )
+        mistakes.raise_if_any()
 
     @property
     def _errors(self) -> Mapping[str, float]:
@@ -267,47 +263,29 @@ class Quadratic(Cost):
 class LQRTerminal(Terminal):
     """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
 
-    Near the reference a short horizon then acts like an infinite one. The package `control` solves the equation. With weights of
-    rates the equation is that of (x, u before), and P is its least value over the input before the end,
-    P_xx - P_xu P_uu^-1 P_ux: the remaining cost where that input is chosen best.
+    Near the reference a short horizon then acts like an infinite one. The package `control` solves the equation.
     """
 
     def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
         """Return P.
 
         Raises:
-            InvalidProblem: no input is weighed, or the linearised model cannot be stabilised.
+            InvalidProblem: no input is weighed, or its rate is, or the linearised model cannot be stabilised.
         """
         import control
 
         h = linearisation.step
         q = np.diag([h * cost.states.get(e, 0.0) for e in plant.state.elements])
         r = np.diag([h * (cost.effort.get(i, 0.0) + cost.deviation.get(i, 0.0)) for i in plant.input.elements])
-        rates = np.diag([h * cost.rate.get(i, 0.0) for i in plant.input.elements])
-        if np.any(np.diag(r + rates) <= 0):
-            raise InvalidProblem("LQRTerminal needs a positive effort, correction or rate weight for every input")
+        if np.any(np.diag(r) <= 0) or cost.rate:
+            raise InvalidProblem(
+                "LQRTerminal needs a positive effort or deviation weight for every input, and none of a rate"
+            )
         try:
-            if rates.any():
-                return _least_over_inputs(linearisation, q, r, rates)
             weight, _, _ = control.dare(linearisation.a, linearisation.b, q, r)
         except (np.linalg.LinAlgError, control.ControlArgument, ValueError) as error:
             raise InvalidProblem(f"LQRTerminal: the linearised model has no stabilising solution ({error})") from None
         return np.asarray(weight)
-
-
-def _least_over_inputs(model: Linearisation, q: np.ndarray, r: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Solve the equation of (x, u before) and minimise over the input before."""
-    import control
-
-    nx, nu = model.b.shape
-    a = np.zeros((nx + nu, nx + nu))
-    a[:nx, :nx] = model.a
-    b = np.vstack([model.b, np.eye(nu)])
-    both = np.block([[q, np.zeros((nx, nu))], [np.zeros((nu, nx)), rates]])
-    cross = np.vstack([np.zeros((nx, nu)), -rates])
-    weight, _, _ = control.dare(a, b, both, r + rates, cross)
-    p = np.asarray(weight)
-    return np.asarray(p[:nx, :nx] - p[:nx, nx:] @ np.linalg.lstsq(p[nx:, nx:], p[nx:, :nx], rcond=None)[0])
 
 
 @dataclass(frozen=True, eq=False)

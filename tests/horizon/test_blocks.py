@@ -49,27 +49,3 @@ def test_inputs_are_held_over_blocks_at_the_best_values(limits):
     assert plan.cost == pytest.approx(best.fun, rel=1e-6)
     without = fp.solve(free, fp.FixedPoint(iterations=1, tolerance=1e-7), np.array([0.4, 0.0]), free_data)
     assert known(plan.cost) > known(without.cost)
-
-
-def test_terminal_weight_with_rates_is_what_is_left_to_pay():
-    """On a linear plant: the value of a long horizon, minimised over the input before, which the weight makes a short one equal."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        order=2,
-        response=lambda q, v, u, p: {"y": -p.k * q.y - 0.1 * v.y + u.u},
-        parameters={"k": fp.Parameter(1.0, 1.0, "1/s^2")},
-    )
-    still = fp.Trajectory(lambda t: {"y": 0 * t})
-    rates = fp.Quadratic(states={"y": 2.0}, rate={"u": 0.3}, terminal=fp.LQRTerminal())
-    ocp, theta = horizon_of(plant, still, fp.Horizon(stages=1, step=0.1), rates, fp.Limits())
-    weighed = float(ocp.terminal_cost([0.7, -0.4, 0.0], theta[:, 0]))
-    far = fp.Horizon(stages=300, step=0.1)
-    free = replace(rates, terminal=None)
-    long, data = horizon_of(plant, still, far, free, fp.Limits())
-    values = []
-    for before in (-1.0, 0.0, 1.0):
-        plan = fp.solve(long, fp.FixedPoint(iterations=1, tolerance=1e-8), np.array([0.7, -0.4, before]), data)
-        values.append(known(plan.cost))
-    fit = np.polyfit([-1.0, 0.0, 1.0], values, 2)
-    assert weighed == pytest.approx(np.polyval(fit, -fit[1] / (2 * fit[0])), rel=1e-4)
