@@ -220,4 +220,7 @@ def _course_function(courses: Sequence[Course]) -> ca.Function:
 def _value(course: Course, t: Expression) -> Expression:
     if not callable(course):
         return scalar_expression("signal", course)
+    if isinstance(t, ca.MX) and not _opaque([course]):  # it may use what is there for scalar expressions alone
+        own = ca.SX.sym("t")
+        return ca.Function("fpirhc_course", [own], [_value(course, own)])(t)
     return scalar_expression("signal", called("signal", course, t), of=course, symbols=(t,))
