@@ -56,7 +56,7 @@ class Built:
     judged: tuple[int, ...]  # their places among the outputs
     warm_up: float  # number of the first cycle whose response may be used
     sample: tuple[Signal, ...]  # what a step is given
-    planned: Problem | None  # the problem as plans have it, with their cost, margins and limits
+    planned: Problem | None  # the problem as plans have it, with their cost and limits
     every: int  # control cycles from plan to plan
     opened: bool  # whether some numbers are open
 

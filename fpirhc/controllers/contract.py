@@ -61,8 +61,6 @@ class Planner:
     restarts: bool  # whether every plan starts from the measured state
     # the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired one
     tracking: Tracking | None
-    # distances that plans keep from limits of states; None: those of the problem's horizon
-    margins: Mapping[str, float] | None = None
     # whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response is
     # corrected
     consistent: bool | None = False
@@ -86,13 +84,11 @@ class Planner:
         )
 
     def planned(self, problem: Problem) -> Problem:
-        """Return the problem with the plans' cost, margins and share of a stage, and limits that hold for the measured state."""
+        """Return the problem with the plans' cost and share of a stage, and limits that hold for the measured state."""
         costed = problem if self.cost is None else replace(problem, cost=self.cost)
         if costed.horizon is None:
             return costed
         horizon, measured = costed.horizon, self._measured(problem)
-        if self.margins is not None:
-            horizon = replace(horizon, margins=self.margins)
         if measured:
             horizon = replace(horizon, measured=measured)
         cycles, stage = (count(horizon, problem.period) for count in (cycles_per_plan, cycles_per_stage))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -24,7 +24,6 @@ from fpirhc.controllers.replanning import (
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
-from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
@@ -55,7 +54,6 @@ class RecedingHorizon(Controller):
         deformation: the map between desired response and request; Identity() is plain receding-horizon control.
         replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromPlan).
         cost: of the plan; None: the problem's.
-        margins: by name of a state, the distance that plans keep from the state's limits; see `Horizon`. None: the horizon's.
         follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
             `fpirhc.controllers.replanning` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
@@ -64,13 +62,12 @@ class RecedingHorizon(Controller):
     deformation: Deformation = field(default_factory=Identity)
     replanning: Replanning = field(default_factory=FromMeasurement)
     cost: Cost | None = None
-    margins: Mapping[str, NotNegative] | None = field(default=None, hash=False, metadata={"setting": "where given"})
     follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def planner(self) -> Planner:
         ways = self.replanning
-        facts = (self.margins, ways.consistent, self.deformation.adapts, self.follows_model, ways.room is not None)
+        facts = (ways.consistent, self.deformation.adapts, self.follows_model, ways.room is not None)
         return Planner(self.optimiser, self.cost, ways.restarts, ways.law, *facts)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
@@ -100,7 +97,7 @@ class RecedingHorizon(Controller):
         assert problem is not None
         before, after, late, remembered = self.replanning.parts(built)
         room = _room(problem, self.replanning)
-        same = built.problem, self.optimiser, self.replanning, self.cost, self.margins
+        same = built.problem, self.optimiser, self.replanning, self.cost
         others = self.deformation.adapts, self.follows_model, plans_are_compiled()
         plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
         closing, delays = closing_blocks(built, self.deformation, [scalar("_solve_status")])

@@ -84,11 +84,9 @@ def _transcribed(
     _check_finite(stage, nodes)
     functions: dict[object, ca.Function] = {}
     along = expand_along(stage.dynamics, stage.cost, stage.terminal_cost, nodes, functions)
-    elsewhere = np.isin(plant.state.elements, horizon.measured)  # in entries of their own
-    lower, upper = (
-        np.where(elsewhere, side, ends)
-        for side, ends in zip((-np.inf, np.inf), limits.state_bounds(plant), strict=True)
-    )
+    lower, upper = limits.state_bounds(plant)
+    elsewhere = [e in horizon.measured for e in plant.state.elements]  # in entries of their own
+    lower, upper = np.where(elsewhere, -np.inf, lower), np.where(elsewhere, np.inf, upper)
     state = _stage_state(plant, bool(free), binding)
     return OptimalControl(
         stages=horizon.stages,

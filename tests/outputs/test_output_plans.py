@@ -49,8 +49,9 @@ def test_so_do_priced_limits() -> None:
 
 def test_so_do_limits_with_margins() -> None:
     """A tenth of the limit is kept free, of the measured speed."""
-    margins = {"speed": 0.1}
-    run = simulated(servo(0.7), fp.RecedingHorizon(SOLVED, ADAPTIVE, margins=margins))
+    problem = servo(0.7)
+    inside = replace(problem, horizon=replace(problem.horizon, margins={"speed": 0.1}))
+    run = simulated(inside, fp.RecedingHorizon(SOLVED, ADAPTIVE))
     assert 0.88 < fastest(run) < 0.93
 
 
