@@ -107,15 +107,25 @@ class Cases(Checked):
         """Return the problem with all changes of a case but those of exact parameters, which are data of a loop."""
         if name not in self.changes:
             raise InvalidName(f"case '{name}' is unknown.{nearest(name, self.names)}")
-        changes, mistakes = self.changes[name], Mistakes(f"case {name!r}")
-        for path in (p for p in changes if p not in (_GROUP, _SEED)):
-            with mistakes.caught(f"'{path}': "):
-                check_change(problem, changes, path)
-        mistakes.raise_if_any()
+        self.check(problem, name)
+        mistakes = Mistakes(f"case {name!r}")
         with mistakes.caught():
-            problem = _changed(problem, changes)
+            problem = _changed(problem, self.changes[name])
         mistakes.raise_if_any()
         return problem
+
+    def check(self, problem: Problem, *names: str) -> None:
+        """Raise where a path or a number of some cases, or of all, does not fit the problem.
+
+        Raises:
+            InvalidProblem: all mistakes together, each with its case and path.
+        """
+        mistakes = Mistakes("cases")
+        for name in names or self.names:
+            for path in (p for p in self.changes[name] if p not in (_GROUP, _SEED)):
+                with mistakes.caught(f"case {name!r}, '{path}': "):
+                    check_change(problem, self.changes[name], path)
+        mistakes.raise_if_any()
 
     def exactly(self, name: str, built: Problem) -> Problem:
         """Return what `build` returned, with the exact parameters of a case; what is known is exact where what moves has it too."""

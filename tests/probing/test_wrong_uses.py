@@ -93,7 +93,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "a parameter of a plant outside that has none": (
         lambda: case({"exact.mass": 2.0}),
-        "case 'heavy': 'exact.mass': 'exact.NAME' has a parameter of what moves, and there is no 'mass'.",
+        "cases: case 'heavy', 'exact.mass': 'exact.NAME' has a parameter of what moves, and there is no 'mass'. "
+        "No names are valid here.",
     ),
     "a negative amplitude": (
         lambda: probed(amplitude=-1.0),

@@ -237,12 +237,12 @@ def test_what_is_wrong_is_named(wrong, task):
 
 
 def test_all_wrong_cases_are_told_at_once(task):
-    """At the first use of any; a wrong path once, however many cases have it."""
+    """Where a file is read; one that is asked for tells its own."""
     cases = {name: {"exact.c": 1.0, "exact.b": b} for name, b in {"weak": 9.0, "stiff": -1.0, "far": 1.0}.items()}
     with pytest.raises(InvalidProblem) as told:
-        fp.Cases({**cases, "right": {}}).problem("right", task.problem)
-    assert str(told.value).count("exact.c") == 1
-    assert [f"case '{name}'" in str(told.value) for name in cases] == [True, True, False]
+        fp.Cases({**cases, "right": {}}).check(task.problem)
+    assert [str(told.value).count(f"case '{name}'") for name in cases] == [2, 2, 1]
+    assert fp.Cases({**cases, "right": {}}).problem("right", task.problem).plant is task.problem.plant
     name: Any = "right"
     with pytest.raises(InvalidField, match="the values of 'name' and 'problem' are swapped"):
         fp.Cases(cases).problem(task.problem, name)
