@@ -18,7 +18,7 @@ import casadi as ca
 from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
 from fpirhc.controllers.path import Pairs, Path, Told, believed_path
-from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals
+from fpirhc.controllers.reference_states import largest_response
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import refuse
@@ -110,7 +110,7 @@ def build(problem: Problem, controller: Controller, *, opened: bool = False) -> 
 def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
-    own, before = own_signals(problem), tuple(map(float, problem.inputs_before))
+    own, before = problem.own_signals, tuple(map(float, problem.inputs_before))
     units = followed_units(plant)
     return Built(
         problem=problem,
@@ -124,9 +124,9 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         output=replace(plant.output, start=tuple(map(float, problem.start_output))),
         pairs=Pairs(problem, problem.dead_time),
         own=own,
-        given=given_signals(problem),
-        motion=motion_of(problem),
-        later=motion_of(problem, ahead=problem.period),
+        given=problem.given_signals,
+        motion=problem.motion(),
+        later=problem.motion(ahead=problem.period),
         aim=problem.reference.block(plant, problem.period) if own else None,
         error=vector("error", problem.judged_names, [units[name] for name in problem.judged_names]),
         judged=tuple(plant.output.elements.index(name) for name in problem.judged_names),

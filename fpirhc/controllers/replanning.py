@@ -201,22 +201,11 @@ def _planned(problem: Problem) -> Signal:
 _LATEST: Latest[np.ndarray] = Latest(8)
 
 
-def built_first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
-    """Return `first_memory` with the numbers of the build; the data are those of this horizon at this start."""
-    start = problem.start_state.tobytes(), np.asarray(problem.inputs_before, dtype=float).tobytes()
-    memory = _LATEST.of(
-        (ocp, optimiser), (*start, plans_are_compiled()), lambda: first_memory(problem, optimiser, ocp, data_of)
-    )
-    return memory.copy()
+def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl) -> np.ndarray:
+    """Return the optimiser's memory before the run, with the numbers of the build."""
+    state, inputs = problem.start_state, np.asarray(problem.inputs_before, dtype=float)
 
+    def made() -> np.ndarray:
+        return optimiser.first_memory(ocp, np.asarray(ocp.start(state, inputs).full()).ravel(), ocp.nodes[2])
 
-def first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
-    """Return the optimiser's memory before the run.
-
-    `data_of`: Function (time, parameters, settings) -> data of the horizon.
-    """
-    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
-    settings = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None
-    arguments = (0.0, problem.plant.approximate)
-    table = data_of(*arguments) if settings is None else data_of(*arguments, settings)
-    return optimiser.first_memory(ocp, first, np.asarray(table.full()))
+    return _LATEST.of((ocp, optimiser), (state.tobytes(), inputs.tobytes(), plans_are_compiled()), made).copy()

@@ -14,7 +14,6 @@ from fpirhc.controllers.built import Built
 from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
-from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
@@ -72,7 +71,7 @@ class Predicted(ControllerWrapper):
                 "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
                 "error leaves an offset; write Estimating(Predicted(controller, ...), ...)",
             )
-        if not given_signals(problem) or not cycles:
+        if not problem.given_signals or not cycles:
             return notes
         late = f"{cycles * problem.period:g} {problem.time_unit}"
         return (*notes, f"Predicted follows set-points {late} late; give one that is known ahead so much earlier")
