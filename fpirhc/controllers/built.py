@@ -163,7 +163,6 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
 
 
 def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
-    refuse(_against_outputs(problem))
     ready = resolved(problem, controller)
     if numbers_only and ready.inner is None and ready.planner is not None:
         ready.planner.check_weights(problem)
@@ -175,16 +174,6 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
     if ready.deforms not in ("target", "turns") and _REFUSES.get():  # their own checks judge gains
         require_converging(problem, ready.deformation)
     return ready
-
-
-def _against_outputs(problem: Problem) -> Iterator[str]:
-    """Reasons against outputs; those of order 0 have a response that is measured."""
-    instant = [name for name, order in problem.plant.response_orders.items() if not order]
-    if instant and not problem.sensing.estimator.measures_all:
-        yield (
-            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) "
-            "need none; leave the estimator out: Sensing(sensors=...)"
-        )
 
 
 def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
