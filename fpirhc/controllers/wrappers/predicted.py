@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built
-from fpirhc.controllers.composed import compose_controller, embedded
+from fpirhc.controllers.built import Built, compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
 from fpirhc.errors import InvalidValue, require
