@@ -20,7 +20,7 @@ from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser
+from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser, worked
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
@@ -141,10 +141,6 @@ class _Horizon:
     def step(self) -> ca.Function:
         return self.optimiser.step(self.ocp)
 
-    @cached_property
-    def converging(self) -> ca.Function:
-        return self.optimiser.converging(self.ocp)
-
     def shifted(self, memory: Array) -> Array:
         """The memory one stage later."""
         later = self.optimiser.shifted(self.ocp, ca.MX(ca.DM(memory)))
@@ -156,20 +152,25 @@ class _Horizon:
         memory[self.layout.slice("plan_inputs")] = plan
         return memory
 
-    def called(self, state: Array, memory: Array | None = None, step: ca.Function | None = None, **given: Any) -> _Plan:
+    def called(self, state: Array, memory: Array | None = None, **given: Any) -> _Plan:
         """One call of the step, as in a control loop; `given`: other data, lower or upper bounds."""
         known = {"data": self.data, "lower": self.ocp.input_lower, "upper": self.ocp.input_upper} | given
         before = self.layout.start() if memory is None else memory
-        inputs, numbers, after = (np.asarray(v.full()) for v in (step or self.step)(state, *known.values(), before))
+        inputs, numbers, after = (np.asarray(v.full()) for v in self.step(state, *known.values(), before))
         return _Plan(state, inputs, numbers[:, 0], after[:, 0])
 
     def solved(self, state: Array, memory: Array | None = None, most: int = _CALLS) -> _Plan:
-        """Calls of the converging step until the status is OK, at most so many."""
-        plan = self.called(state, memory, self.converging)
-        for _ in range(most - 1):
+        """Calls of an open-loop solve until the status is OK, at most so many."""
+        before, given = (
+            self.layout.start() if memory is None else memory,
+            (self.data, self.ocp.input_lower, self.ocp.input_upper),
+        )
+        for _ in range(most):
+            inputs, numbers, after = worked(self.optimiser, self.ocp, (state, *given, before))
+            plan = _Plan(state, inputs, numbers[:, 0], after[:, 0])
             if plan.status not in (Status.NOT_CONVERGED, Status.INFEASIBLE):
                 break
-            plan = self.called(state, plan.memory, self.converging)
+            before = plan.memory
         return plan
 
     def states(self, state: Array, inputs: Array) -> list[Array]:

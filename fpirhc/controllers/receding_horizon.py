@@ -11,13 +11,14 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Planner
+from fpirhc.controllers.reference_states import own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import (
     FromMeasurement,
     Replanning,
     as_planned,
     at_consistent_start,
     consistent_start,
-    first_memory,
+    first_memory_of,
     held_model,
 )
 from fpirhc.deformation.base import Deformation, Identity
@@ -29,7 +30,6 @@ from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_da
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
@@ -169,19 +169,19 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     optimiser, restarts = controller.optimiser, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     count = len(ocp.settings)
-    preview = problem.reference.preview(plant, horizon.nodes)
-    ahead, previewed = previewed_values(plant, problem.signals), preview is not None
-    data_of = stage_data(plant, problem.reference, horizon, problem.cost, count, ahead, previewed=previewed)
-    memory = optimiser.memory(ocp).starting_at(first_memory(problem, optimiser, ocp))
-    solve = built(optimiser, ocp, "step")
+    data_of = _stage_data(problem, count)
+    preview = preview_of(problem)
+    running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
+    memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp, data_of))
+    solve = built(optimiser, ocp, optimiser.step)
     low, high = problem.limits.input_ends(plant)
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)), discrete("_solve_status"))
 
     def step(s: Signals) -> dict[str, Value]:
-        own = [getattr(s, one.name) for one in problem.own_signals]
+        own = own_values(problem, s)
         motion = () if preview is None else preview(s.time, *own)
-        data = data_of(s.time, *motion, s.parameters, *_open_rows(problem, ocp, s))
-        for seen in measured_signals(plant)[1:] if restarts else ():  # outputs that are given beside the state
+        data = running_data(s.time, *motion, s.parameters, *_open_rows(problem, ocp, s))
+        for seen in plant.beside if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=controller.planner.feeds_back(plant))
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
         if horizon.measured:
@@ -213,13 +213,21 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     return Block("plan", _plan_reads(problem, room), Layout(writes), step, own, opaque=True)
 
 
+def _stage_data(problem: Problem, settings: int, *, previewed: bool = False) -> ca.Function:
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    ahead = previewed_values(problem.plant, problem.signals)
+    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, settings, ahead
+    return stage_data(*arguments, previewed=previewed)
+
+
 def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
     """Time, start of the plan, parameters, last command and its shift or last plan, outputs, own signals."""
     plant = problem.plant
     names = ("_command_shift_last", "_command_before") if room is None else (_PLANNED_BEFORE,)
     last = tuple(like(plant.input, name) for name in names)
     assert problem.horizon is not None
-    own, outputs = problem.own_signals, measured_signals(plant)[1:]
+    own, outputs = own_signals(problem), plant.beside
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
     return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *own))

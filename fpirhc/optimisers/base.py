@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Literal, TypeAlias, cast
 
 import casadi as ca
@@ -23,7 +22,7 @@ from fpirhc.symbolic.native import find_compiler, native, why_no_compiler
 FEASIBLE = 1e-4  # largest violation of a state bound, as a share of its unit, that still counts as kept
 KEPT = 1e-6  # the same for an optimiser that keeps limits more closely
 Columns: TypeAlias = Sequence[np.ndarray]
-_ITERATIONS = "iterations", "most_iterations"  # settings of an optimiser that bound its work
+_FIRST_CALLS = 5  # of `improve`, before a run
 UNKNOWN_ITERATIONS = -1.0  # a solver that is called inside a graph does not report its iterations
 _PATIENCE = 4  # calls in a row that may leave the violation as it is
 _AT_LIMIT = 1e-9  # of the range of an input, within which it stands at a limit
@@ -33,31 +32,21 @@ _SHRINKING = 0.9  # a violation counts as shrinking below this share of the last
 class Optimiser(Checked, ABC):
     """Contract: one improvement of a warm-started plan as a Function, with a fixed amount of work where possible."""
 
-    cannot_keep: ClassVar[tuple[str, ...]] = ()
-    """Limits that it cannot keep: of "inputs", of "states", those of states with "prices"."""
+    improve: ClassVar[Callable[..., Columns] | None] = None
+    """Function (optimiser, horizon, arguments of a step) -> results of a call that may work longer than a step does, for the first
+    plan of a run and for open-loop solves; None: it has no such, and a run begins with the memory's start."""
 
     @property
     def unbounded(self) -> str:
         """Why a call may take any time, with a remedy; empty where its work is bounded."""
         return ""
 
-    def longer(self, times: int) -> Optimiser | None:
-        """The same optimiser with so many times the iterations per call; None where it has no such setting."""
-        counts = {name: getattr(self, name, None) for name in _ITERATIONS}
-        more = {name: times * count for name, count in counts.items() if count is not None}
-        return replace(self, **more) if more else None  # type: ignore[type-var]
-
     def check(self, ocp: OptimalControl) -> None:
-        """Raise if the optimiser cannot serve the problem.
+        """Raise if the optimiser cannot serve the problem, as with what `refuse_limits` finds.
 
         Raises:
             NotSupported: the problem has something that this optimiser cannot keep.
         """
-        priced = [e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard]
-        inputs = np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any()
-        limited = {"inputs": inputs or ocp.bounds_states, "states": ocp.bounds_states, "prices": priced}
-        for limit in self.cannot_keep:
-            require(not limited[limit], f"{type(self).__name__} {_REMEDIES[limit].format(', '.join(priced))}")
 
     @abstractmethod
     def memory(self, ocp: OptimalControl) -> Layout:
@@ -79,24 +68,6 @@ class Optimiser(Checked, ABC):
         the remembered plan is returned in its place, with the status NON_FINITE.
         """
 
-    def converging(self, ocp: OptimalControl) -> ca.Function:
-        """Function like `step`, for open-loop solves: it may stop where the plan is converged, and it may work longer."""
-        return self.step(ocp)
-
-    def rescued(self, ocp: OptimalControl, call: Columns, results: Columns) -> Columns:  # noqa: ARG002
-        """Return better results than those of a call of `converging` that did not end OK, or the same."""
-        return results
-
-    def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:  # noqa: ARG002
-        """Return the memory with which a run begins; the memory's start unless an optimiser overrides it.
-
-        Args:
-            ocp: the problem.
-            state: the first state of the first horizon, shape (ns,).
-            data: of the first horizon, shape (ntheta, N + 1).
-        """
-        return self.memory(ocp).start()
-
 
 _REMEDIES = {
     "inputs": "serves problems without limits only (it is a baseline); for limits use FixedPoint()",
@@ -106,11 +77,19 @@ _REMEDIES = {
 }
 
 
-def built(optimiser: Optimiser, ocp: OptimalControl, form: Literal["step", "converging"]) -> ca.Function:
-    """Return the Function `step` or `converging`, built once: horizons that differ in numbers of settings only share it."""
-    key = form, plans_are_compiled(), Same(optimiser)
+def refuse_limits(optimiser: Optimiser, ocp: OptimalControl, kind: Literal["inputs", "states", "prices"]) -> None:
+    """Raise where there are limits of a kind that an optimiser cannot keep: of "inputs", of "states", of states with "prices"."""
+    priced = [e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard]
+    inputs = np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any()
+    limited = {"inputs": inputs or ocp.bounds_states, "states": ocp.bounds_states, "prices": priced}
+    require(not limited[kind], f"{type(optimiser).__name__} {_REMEDIES[kind].format(', '.join(priced))}")
+
+
+def built(optimiser: Optimiser, ocp: OptimalControl, make: Callable[[OptimalControl], ca.Function]) -> ca.Function:
+    """Return a Function of an optimiser, built once: horizons that differ in numbers of settings only share it."""
+    key = make.__name__, plans_are_compiled(), Same(optimiser)
     if key not in ocp.functions:
-        ocp.functions[key] = getattr(optimiser, form)(ocp)
+        ocp.functions[key] = make(ocp)
     return ocp.functions[key]
 
 
@@ -285,17 +264,11 @@ def improved(
     calls: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Improve a plan until it is OK or its violation stays; return the plan, diagnostics of all calls, memory, number of calls."""
-    step, fixed = (
-        built(optimiser, ocp, "converging"),
-        (np.asarray(ca.DM(data).full()), ocp.input_lower, ocp.input_upper),
-    )
+    fixed = np.asarray(ca.DM(data).full()), ocp.input_lower, ocp.input_upper
     status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
     inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
     while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
-        call = state, *fixed, memory
-        results: Columns = [np.asarray(v.full()) for v in step(*call)]
-        if results[1][4, 0] != Status.OK:
-            results = optimiser.rescued(ocp, call, results)
+        results = worked(optimiser, ocp, (state, *fixed, memory))
         inputs, diagnostics, memory = results[0], results[1].ravel(), results[2].ravel()
         iterations += diagnostics[3]
         status, count = Status(int(diagnostics[4])), count + 1
@@ -303,6 +276,20 @@ def improved(
         stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
     diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
     return inputs, diagnostics, memory, count
+
+
+def worked(optimiser: Optimiser, ocp: OptimalControl, call: Columns) -> Columns:
+    """Return the results of a call of `improve` or, where there is none, of a step."""
+    if optimiser.improve is not None:
+        return optimiser.improve(ocp, call)
+    return [np.asarray(v.full()) for v in built(optimiser, ocp, optimiser.step)(*call)]
+
+
+def first_memory(optimiser: Optimiser, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
+    """Return the memory with which a run begins, at the first state (ns,) and data (ntheta, N + 1) of its first horizon."""
+    start = optimiser.memory(ocp).start()
+    memory = start if optimiser.improve is None else first_plan(optimiser, ocp, state, data, calls=_FIRST_CALLS)[2]
+    return memory if np.isfinite(memory).all() else start
 
 
 def first_plan(

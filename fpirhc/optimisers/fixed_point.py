@@ -19,7 +19,7 @@ from fpirhc.errors import CompileError, InvalidValue, NotInstalled, require
 from fpirhc.fields.kinds import Count, NotNegative, Positive
 from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Columns, Optimiser, first_plan, paid, require_compiler
+from fpirhc.optimisers.base import Columns, Optimiser, built, paid, require_compiler
 from fpirhc.optimisers.plain import CLOSE, PlainSettings, plain_memory, plain_step, shifted_plain
 from fpirhc.optimisers.state_limits import MU_WARM, LimitedSettings, limited_memory, limited_step, shifted_limited
 from fpirhc.status import Status
@@ -27,7 +27,6 @@ from fpirhc.symbolic.layout import Layout
 
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states
-_FIRST_CALLS = 5  # of `converging`, before a run
 _GROWTH = 1e12  # of a motion of the model over the horizon, beyond which rollouts of plans leave their gradients too few digits
 _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
@@ -102,25 +101,24 @@ class FixedPoint(Optimiser):
         return self._begun(ocp, plain_step(ocp, self._plain(ocp, converging=False)))
 
     def converging(self, ocp: OptimalControl) -> ca.Function:
+        """Return a Function like `step` that goes on until the tolerance is met."""
         if ocp.bounds_states:
             return self._begun(ocp, limited_step(ocp, self._limited(ocp, _MOST_LIMITED)))
         return self._begun(ocp, plain_step(ocp, self._plain(ocp, converging=True)))
 
-    def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
-        return _of_two_starts(ocp, one, self.memory(ocp)) if self.second_start else one
-
-    def rescued(self, ocp: OptimalControl, call: Columns, results: Columns) -> Columns:
+    def improve(self, ocp: OptimalControl, call: Columns) -> Columns:
+        """Return the results of a call of `converging`, or better ones where it does not end OK."""
+        results: Columns = [np.asarray(v.full()) for v in built(self, ocp, self.converging)(*call)]
         state, data, lower, upper, _ = call
         posed = np.isfinite(state).all() and np.isfinite(data).all() and (lower <= upper).all()
-        with contextlib.suppress(NotInstalled, CompileError):
-            if posed and not ocp.bounds_states:
+        if results[1][4, 0] != Status.OK and posed and not ocp.bounds_states:
+            with contextlib.suppress(NotInstalled, CompileError):
                 limited = limited_step(ocp, self._limited(ocp, _MOST_LIMITED))
                 return _better(ocp, self.memory(ocp), limited, call, results)
         return results
 
-    def first_memory(self, ocp: OptimalControl, state: np.ndarray, data: np.ndarray) -> np.ndarray:
-        memory = first_plan(self, ocp, state, data, calls=_FIRST_CALLS)[2]
-        return memory if np.isfinite(memory).all() else self.memory(ocp).start()
+    def _begun(self, ocp: OptimalControl, one: ca.Function) -> ca.Function:
+        return _of_two_starts(ocp, one, self.memory(ocp)) if self.second_start else one
 
     def _plain(self, ocp: OptimalControl, *, converging: bool) -> PlainSettings:
         hessian = self.hessian or GaussNewton()

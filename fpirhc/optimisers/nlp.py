@@ -25,6 +25,7 @@ from fpirhc.optimisers.base import (
     clip,
     counted,
     judge,
+    refuse_limits,
     remembered_plan,
     sane,
     shift,
@@ -45,8 +46,6 @@ _OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
 class MultipleShooting(Optimiser):
     """What all solvers share: the program, the warm start, and the judgement."""
 
-    cannot_keep = ("prices",)
-
     tolerance: Positive = 1e-3  # of the stationarity, in the unit of the inputs, below which a plan is converged
 
     @property
@@ -57,6 +56,10 @@ class MultipleShooting(Optimiser):
     @abstractmethod
     def options(self, ocp: OptimalControl) -> Options:
         """CasADi's options of the solver."""
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if limits of states have prices."""
+        refuse_limits(self, ocp, "prices")
 
     def memory(self, ocp: OptimalControl) -> Layout:
         variables, constraints = sizes(ocp)

@@ -21,7 +21,7 @@ from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout, steepest_curvature
-from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, remembered_plan, shift
+from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, refuse_limits, remembered_plan, shift
 from fpirhc.symbolic.expression import TINY, expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, discrete
 
@@ -60,8 +60,6 @@ class FullSpaceFixedPoint(Optimiser):
         scaled: iterate on variables that make the rows of H of the same size (Ruiz), which helps by orders of magnitude.
     """
 
-    cannot_keep = ("inputs",)
-
     iterations: Count
     tolerance: Positive
     map: Deformation | None = None
@@ -74,7 +72,7 @@ class FullSpaceFixedPoint(Optimiser):
             NotSupported: some input or state has limits.
             NotContractive: a gain outside (0, 2 / sigma_max(H)^2).
         """
-        super().check(ocp)
+        refuse_limits(self, ocp, "inputs")
         if self.map is not None:
             _require_gain("FullSpaceFixedPoint", self.map, 2 / _scaling(ocp, self.scaled)[1] ** 2)
 
@@ -190,8 +188,6 @@ class GradientFixedPoint(Optimiser):
         map: the deformation; None chooses the affine map with 0.95 of the gain 1/L, L the largest curvature along the reference.
     """
 
-    cannot_keep = ("states",)
-
     iterations: Count
     tolerance: Positive
     map: Deformation | None = None
@@ -203,7 +199,7 @@ class GradientFixedPoint(Optimiser):
             NotSupported: projection keeps bounds of inputs only.
             NotContractive: a gain outside (0, 2 / L).
         """
-        super().check(ocp)
+        refuse_limits(self, ocp, "states")
         _require_gain("GradientFixedPoint", self._map(ocp), 2 / _steepest(ocp))
 
     def memory(self, ocp: OptimalControl) -> Layout:
@@ -257,10 +253,12 @@ class ReducedGradient(Optimiser):
         tolerance: of the stationarity, in the unit of the inputs, below which a plan is converged.
     """
 
-    cannot_keep = ("states",)
-
     iterations: Count
     tolerance: Positive
+
+    def check(self, ocp: OptimalControl) -> None:
+        """Raise if states are bounded: projection keeps bounds of inputs only."""
+        refuse_limits(self, ocp, "states")
 
     def memory(self, ocp: OptimalControl) -> Layout:
         return Layout((_plan(ocp), discrete("plan_step_length")))

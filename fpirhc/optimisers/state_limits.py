@@ -238,8 +238,7 @@ def _guess(ocp: OptimalControl) -> ca.Function:
     """Function theta -> (reference as a stage's state (ns), that of the nodes where there is none, feedforward (nu))."""
     theta = ca.SX.sym("theta", ocp.data.size)
     reference, forward = (theta[ocp.data.slice(name)] for name in ("reference", "feedforward"))
-    if ocp.inner:
-        reference = ca.vertcat(*(reference[k] if k >= 0 else value for k, value in ocp.inner))
+    reference = ocp.state_of(reference)
     rest = ocp.state.size - reference.numel() - ocp.written
     state = ca.vertcat(reference, *([forward] if rest else []), ca.SX.zeros(ocp.written))
     return ca.Function("fpirhc_guess", [theta], [ca.densify(state), ca.densify(forward)])

@@ -35,7 +35,8 @@ def warm(name):
     case = FOREIGN[name]()
     ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, case.limits)
     first = case.first(ocp, np.array([case.start.get(e, 0.0) for e in case.plant.state.elements]))
-    return ocp, first, data, OPTIMISER.first_memory(ocp, first, data)
+    call = first, data, ocp.input_lower, ocp.input_upper, OPTIMISER.memory(ocp).start()
+    return ocp, first, data, OPTIMISER.improve(ocp, call)[2].ravel()
 
 
 @pytest.mark.parametrize("iterations", [1, pytest.param(3, marks=pytest.mark.slow)])
