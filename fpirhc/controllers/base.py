@@ -104,16 +104,14 @@ def deform_block(
         sane = _sane(s.realised - s.desired, largest) if memory.names else None
         learns = valid if sane is None else ca.logic_and(valid, sane)
         next_values = {f"{m}_next": ca.if_else(learns, next_memory[m], remembered[m]) for m in memory.names}
-        shown = {name: next_values[f"{source}_next"] for name, source in deformation.shown().items()}
         if sane is not None and request_before == _REQUEST:
             deformed = ca.if_else(sane, deformed, getattr(s, _REQUEST))
             learns = valid
         next_request = ca.if_else(learns, deformed, s.desired)
-        return {"_deformed_unclipped": next_request, "_deformation": next_request - s.desired, **shown, **next_values}
+        return {"_deformed_unclipped": next_request, "_deformation": next_request - s.desired, **next_values}
 
     written = [plant.response_signal(name) for name in ("_deformed_unclipped", "_deformation")]
-    logged = [scalar(name) for name in deformation.shown()]
-    return Block("deform", Layout(reads), Layout((*written, *logged)), step, memory)
+    return Block("deform", Layout(reads), Layout(tuple(written)), step, memory)
 
 
 def _sane(error: Expression, largest: Sequence[float]) -> Expression | None:

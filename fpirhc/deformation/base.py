@@ -8,11 +8,10 @@ first order every map here is r+ = r - a (f - d) with one number a, its effectiv
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast, final
 
 import casadi as ca
 import numpy as np
@@ -115,9 +114,10 @@ class Deformation(Checked, ABC):
         else:
             yield from unnamed_inner(self, Deformation)
 
+    @final
     @property
     def adapts(self) -> bool:
-        """Whether the response changes the request at all."""
+        """Whether the response changes the request at all, as its gain says."""
         return not stays(self.effective_gain(), 0.0)
 
     @property
@@ -129,10 +129,6 @@ class Deformation(Checked, ABC):
         """What the map remembers besides the pair (request, desired); by default nothing."""
         del elements
         return Layout()
-
-    def shown(self) -> Mapping[str, str]:
-        """Signals to log: name of the signal -> name of the scalar in the memory."""
-        return {} if self.inner is None else self.inner.shown()
 
     @abstractmethod
     def step(
@@ -156,10 +152,6 @@ class Deformation(Checked, ABC):
     def secant_gain(self) -> float:
         """Largest step per unit of response error at any size, with the sign of the effective gain, which it is by default."""
         return self.effective_gain() if self.inner is None else self.inner.secant_gain()
-
-    def largest_step(self) -> float:
-        """Bound of |r+ - r| in one cycle, in units of the response; infinite, the default, where the step has no bound."""
-        return math.inf if self.inner is None else self.inner.largest_step()
 
     @abstractmethod
     def with_effective_gain(self, gain: float) -> Self:
@@ -189,8 +181,8 @@ def automatic(deformation: Deformation) -> tuple[str, ...]:
 def scaled_for(deformation: Deformation, request: RequestChange) -> Deformation:
     """Return the map whose open scale is at least 1 and fits how much the desired response changes; a given one stays.
 
-    The largest step covers a sudden change. For a change that goes on from cycle to cycle the scale is twice the change. In both
-    cases the largest step covers the recovery.
+    The map's `largest_step` covers a sudden change. For a change that goes on from cycle to cycle the scale is twice the change. In
+    both cases the largest step covers the recovery.
     """
     if deformation.inner is not None:
         return with_inner(deformation, scaled_for(deformation.inner, request))

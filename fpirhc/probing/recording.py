@@ -38,7 +38,6 @@ class Excitation(Identity):
     amplitude: tuple[float, ...]  # A of every channel, in the unit of the response; 0 only listens
     cycles: int  # length of the sequence; after it the request is the desired response
     seed: int = 0  # of the sequence
-    adapts = True  # without adaptation no loop passes its response on
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         del elements
@@ -54,7 +53,7 @@ class Excitation(Identity):
         return desired + added(ca.fmin(cycle, self.cycles - 1)), {"excitation_cycle": cycle + 1}
 
     def effective_gain(self) -> float:
-        return 1e-9  # next to nothing
+        return 1e-9  # next to nothing, but without adaptation no loop passes its response on
 
 
 @dataclass(frozen=True, eq=False)

@@ -152,13 +152,8 @@ class Simulator:
         logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress, force.patches)
         layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)
-        step_limit = controller.deformation.largest_step()
-        planner = controller.planner
-        cost = (planner.cost or problem.cost) if planner else None
         model = controller.plant_model(problem)
         facts: dict[str, object] = {
-            "weighs_effort": cost is not None and cost.weighs_effort,
-            "step_limit": step_limit if np.isfinite(step_limit) else None,
             "effective_gain": float(controller.deformation.effective_gain()),
             "parameters": [float(v) for v in model.parameters(model.plant)],
             "controller": _DESCRIBED.of((controller,), (), lambda: describe(controller)),

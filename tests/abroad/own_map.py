@@ -8,7 +8,6 @@ section 7.1). The plant is a cart with friction and a late force; the numbers ar
 be if its author had not known of the dead time: the response is taken for that of the last request.
 """
 
-import math
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -30,9 +29,6 @@ class InverseTangent(Deformation):
 
     def effective_gain(self):
         return self.gain
-
-    def largest_step(self):
-        return abs(self.gain) * self.width * math.pi / 2
 
     def with_effective_gain(self, gain):
         return replace(self, gain=gain)

@@ -1,6 +1,5 @@
 """Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it."""
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -37,9 +36,6 @@ class ExternalPlant(Deformation):
 
     def secant_gain(self):
         return 0.0
-
-    def largest_step(self):
-        return math.inf
 
     def with_effective_gain(self, gain):
         del gain

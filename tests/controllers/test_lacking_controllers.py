@@ -78,7 +78,7 @@ class Doubled(Deformation):
     def effective_gain(self):
         return 2 * self.map.effective_gain()
 
-    secant_gain = largest_step = effective_gain
+    secant_gain = effective_gain
 
     def with_effective_gain(self, gain):
         return Doubled(self.map.with_effective_gain(gain / 2))

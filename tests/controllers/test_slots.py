@@ -166,11 +166,17 @@ def test_a_deformation_starts_afresh_with_every_slot():
     sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=10.0)
     tuned = fp.Tuned(sigmoid, largest_gain=3 * sigmoid.effective_gain())
     slots = SHIPPED.crane_slots.controllers["slots+FPI"].with_deformation(tuned)
-    result = run(crane({"cart": -1.0}, duration=10.6), slots)
+    problem = crane({"cart": -1.0}, duration=10.6)
+    result, stepper = run(problem, slots), fp.Stepper(problem, slots, compiled=False)
+    memory, factors = stepper.start(), [list[float](), list[float]()]
+    for time, state, realised in zip(result.time, result["state"], result["realised"], strict=True):
+        _, memory = stepper.step(time, state, realised, memory)
+        for k, remembered in enumerate(factors):
+            remembered.append(stepper.memory.unpack(memory)[f"_{k}_tuner_factor"].item())
     assert len(result.spans()) == 4
     for start, end, slot in result.spans():
         first, last = round(start / result.period), round(end / result.period) - 1
-        active, other = (result[f"gain_factor_{('cart', 'angle')[k]}"][:, 0] for k in (slot, 1 - slot))
+        active, other = (np.array(factors[k]) for k in (slot, 1 - slot))
         assert active[first] == 1
         assert active[last] > 1.5
         assert (other[first : last + 1] == 1).all()

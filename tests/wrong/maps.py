@@ -23,18 +23,8 @@ class Softsign(Deformation):
     def effective_gain(self):
         return self.gain
 
-    def largest_step(self):
-        return abs(self.gain) * self.size
-
     def with_effective_gain(self, gain):
         return replace(self, gain=gain)
-
-
-class HalfTheStep(Softsign):
-    """Steps are twice as long as it says."""
-
-    def largest_step(self):
-        return 0.5 * super().largest_step()
 
 
 class HalfTheSecant(Softsign):
@@ -73,14 +63,6 @@ class Kinked(Softsign):
         error = response - desired
         bent = ca.if_else(error > 0, error, 2 * error)
         return request - self.gain * bent / ca.sqrt(1 + ca.sumsqr(error) / self.size**2), {}
-
-
-class LouderFarOut(Softsign):
-    """Has a larger gain for large requests and does not tell their reach."""
-
-    def step(self, request, response, desired, memory):
-        step = super().step(request, response, desired, memory)[0] - request
-        return request + step * (1 + 0.2 * ca.tanh(ca.sumsqr(request) / 1e6)), {}
 
 
 class Wavelet(Softsign):
@@ -146,12 +128,6 @@ class SaysItIncrements(Softsign):
     """Says that it passes a change of the desired response on."""
 
     form = Form("increment")
-
-
-class SaysItDoesNotAdapt(Softsign):
-    """Adapts."""
-
-    adapts = False
 
 
 class FiltersTwice(Softsign):

@@ -86,22 +86,19 @@ class ForceMRAC(Controller):
             recalculated = ca.if_else(running, inverse(s.state, s.realised, s.parameters), desired)
             deformed, next_memory = self.deformation.step(s._command_before, recalculated, desired, remembered)
             next_values = {f"{m}_next": ca.if_else(running, next_memory[m], remembered[m]) for m in memory.names}
-            shown = {name: next_values[f"{source}_next"] for name, source in self.deformation.shown().items()}
             command = ca.if_else(running, deformed, desired)
             return {
                 "force_desired": desired,
                 "force_recalculated": recalculated,
                 "command_unclipped": command,
                 "_deformed_unclipped": response(s.state, command, s.parameters),
-                **shown,
                 **next_values,
             }
 
         responses = [plant.response_signal(n) for n in ("desired", "realised")]
         reads = (plant.state, plant.parameter, *responses, like(plant.input, "_command_before"), scalar("warm_up"))
         forces = [like(plant.input, n) for n in ("force_desired", "force_recalculated", "command_unclipped")]
-        shown = [scalar(name) for name in self.deformation.shown()]
-        writes = Layout((*forces, plant.response_signal("_deformed_unclipped"), *shown))
+        writes = Layout((*forces, plant.response_signal("_deformed_unclipped")))
         return Block("force", Layout(reads), writes, step, memory, opaque=plant.equations.inverse_opaque)
 
 

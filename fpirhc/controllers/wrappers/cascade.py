@@ -15,14 +15,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, reference_block
-from fpirhc.controllers.built import Built, compose_controller, embedded
+from fpirhc.controllers.built import Built
+from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
-from fpirhc.deformation.base import Deformation
+from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import InvalidValue, NotContractive, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
@@ -183,8 +183,11 @@ class Cascade(Controller):
             InvalidValue: see `ThroughModel`; a scale that is not stated.
         """
         self.controller.check(self.inner_problem(problem))
-        self.deformation.largest_step()  # raises where a scale is not set
         form, name = self.deformation.form, type(self.deformation).__name__
+        if automatic(self.deformation):
+            raise InvalidValue(
+                f"Cascade: the scale of {name} is that of shifts, of which the reference says nothing; give it: scale=..."
+            )
         require(
             not form.modelled,
             "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself",
@@ -255,7 +258,7 @@ class Cascade(Controller):
             }
 
         commands = (like(plant.input, name) for name in _COMMANDS)
-        measured = (*measured_signals(plant), plant.parameter)
+        measured = (*plant.motion, plant.parameter)
         reads = Layout((Signal("reference", seen.elements), *measured, scalar("clipped_last"), *commands))
         writes = Layout((_shift_signal(plant, SHIFT), _shift_signal(plant, "shift")))
         return Block("shift", reads, writes, step, Layout(last) + own)

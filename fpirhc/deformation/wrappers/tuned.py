@@ -64,9 +64,6 @@ class Tuned(Wrapper):
         own = (scalar("tuner_factor", start=1.0), *counts, *errors)
         return Layout(own).adapted() + self.map.memory(elements)
 
-    def shown(self) -> Mapping[str, str]:
-        return {"gain_factor": "tuner_factor", **self.map.shown()}
-
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
     ) -> tuple[Expression, dict[str, Expression]]:
@@ -98,9 +95,6 @@ class Tuned(Wrapper):
         floor = ca.if_else(factor < 1, _SMALLEST, 1)
         largest = self.largest_gain / self.map.effective_gain()
         return ca.fmin(ca.fmax(factor * ca.exp(_RATE * rise), floor), largest)
-
-    def largest_step(self) -> float:
-        return self.map.largest_step() * self.largest_gain / self.map.effective_gain()
 
     def with_effective_gain(self, gain: float) -> Self:
         return replace(
