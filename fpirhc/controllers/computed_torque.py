@@ -14,8 +14,7 @@ from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import NotInvertible
-from fpirhc.horizon.nominal import reference_state, require_reference_of_states
+from fpirhc.errors import NotInvertible, require
 from fpirhc.members import Example
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
@@ -59,10 +58,10 @@ class FeedforwardOnly(Undeformed):
         plant = problem.plant
         if len(plant.controlled_names) != len(plant.inputs):
             raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
-        slow = ", ".join(name for name, order in plant.response_orders.items() if order)
+        slow = ", ".join(name for name in plant.controlled_names if name not in plant.at_once)
         if slow:
-            require_reference_of_states(
-                plant,
+            require(
+                not plant.equations.hidden,
                 f"FeedforwardOnly does not cover outputs that are expressions of the state ({slow}): without feedback their "
                 "errors would add up; use a controller with a tracking law",
             )
@@ -75,10 +74,9 @@ class FeedforwardOnly(Undeformed):
         """Block (reference, state, parameters) -> command, and the response that the model expects of it."""
         plant, wanted = built.plant, built.plant.response_signal("_reference_response")
         inverse, response = plant.equations.inverse, plant.equations.controlled_response
-        known = plant.equations.known_on_reference
 
         def step(s: Signals) -> dict[str, Expression]:
-            nominal = reference_state(plant, s.reference) if known else s.state
+            nominal = plant.equations.state_of(s.reference, s.state)
             command = inverse(nominal, s._reference_response, s.parameters)
             # A bad measurement changes no command here, and is a bad measurement all the same.
             finite = is_finite(s.state)

@@ -16,11 +16,11 @@ import numpy as np
 
 from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, automatic, scaled_for, with_inner
-from fpirhc.errors import refuse, require
+from fpirhc.errors import require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
-from fpirhc.plant.chain import measured_signals, rateless, without_disturbances
+from fpirhc.plant.chain import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.dead_time import whole
@@ -79,9 +79,7 @@ class Planner:
 
     def starts_consistent(self, plant: Plant) -> bool:
         """Return whether plans start where the model has the measured outputs (`fpirhc.horizon.nominal`)."""
-        return len(measured_signals(plant)) > 1 and (
-            self.corrects(plant) if self.consistent is None else self.consistent
-        )
+        return bool(plant.beside) and (self.corrects(plant) if self.consistent is None else self.consistent)
 
     def planned(self, problem: Problem) -> Problem:
         """Return the problem with the plans' cost and share of a stage, and limits that hold for the measured state."""
@@ -107,8 +105,7 @@ class Planner:
         plant = problem.plant
         if not (self.restarts and self.starts_consistent(plant)):
             return ()
-        pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
-        return tuple(e for e, place in pairs if place < 0 and e in problem.limits.states)
+        return tuple(e for e in plant.equations.hidden if e in problem.limits.states)
 
 
 class Controller(Checked, ABC):
@@ -333,24 +330,3 @@ def name_in_task(controller: Controller) -> str:
 def without_deformation(controller: Controller) -> Controller:
     """Return the controller of the same settings that does not adapt, beside which a comparison judges this one."""
     return controller.with_deformation(Identity()) if controller.deformation.adapts else controller
-
-
-def check_chains(problem: Problem, law: str) -> None:
-    """Raise for an output of order 0, which has no derivative below its response.
-
-    `law`: what needs such a derivative, as the beginning of a sentence.
-    """
-    refuse(
-        f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver"
-        for name, order in problem.plant.response_orders.items()
-        if not order
-    )
-
-
-def check_derivatives(problem: Problem, law: str) -> None:
-    """Raise for a map or an output of order 0, where a law has no meaning.
-
-    `law`: what the law does with derivatives, as the beginning of a sentence.
-    """
-    what = rateless(problem.plant)
-    require(not what, f"{law} a derivative with respect to time, and {what}; use ComputedTorque with a deformation")

@@ -24,7 +24,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import Integrator, RungeKutta4
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import time_signal
@@ -38,8 +37,6 @@ from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
 from fpirhc.task.problem import Problem
 
 ACTED, NOW = "_signals_acted", "_parameters_now"  # what a model is told of the last cycle, and of this one
-# What is measured, where a controller may act on what is predicted.
-MEASURED, MEASURED_OUTPUT, MEASURED_TIME = "_measured_state", "_measured_output", "_measured_time"
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +167,7 @@ def stated_path(problem: Problem) -> Path:
 
 def model_block(path: Path) -> Block:
     """Block that writes '_modelled', the response that a model-referenced map reads in place of its last request."""
-    estimator = path.problem.sensing.estimator
-    return answer_block(path) if estimator.of_steps or estimator.measures_all else _twin(path)
+    return _twin(path) if path.problem.sensing.spreads(path.problem.plant) else answer_block(path)
 
 
 def answer_block(path: Path) -> Block:
@@ -182,16 +178,16 @@ def answer_block(path: Path) -> Block:
     """
     plant, modelled = path.problem.plant, path.problem.plant.response_signal("_modelled")
     age, start = response_age(plant), tuple(map(float, path.problem.start_state))
-    before = replace(plant.state, name=f"{path.name}_state_before", start=start)
+    before, seen = replace(plant.state, name=f"{path.name}_state_before", start=start), measured(plant.state)
     waits = [Queue(age * (plant.chains[name] - 1)) for name in plant.controlled_names]
     names = [f"{path.name}_{name}" for name in plant.controlled_names]
     queues = [w.memory(queue, (e,), (0.0,)) for queue, w, e in zip(names, waits, modelled.elements, strict=True)]
 
     def step(s: Signals) -> dict[str, Expression]:
         acted = path.acted(s)
-        at = getattr(s, before.name if age else MEASURED)
+        at = getattr(s, before.name if age else seen.name)
         shown: list[Expression] = []
-        later = {f"{before.name}_next": getattr(s, MEASURED)} if age else {}
+        later = {f"{before.name}_next": getattr(s, seen.name)} if age else {}
         values = ca.vertsplit(plant.equations.controlled_response(at, acted.end, acted.parameters))
         for name, wait, value in zip(names, waits, values, strict=True):
             arrived, queue = wait.arrived(s, name, value)
@@ -199,13 +195,14 @@ def answer_block(path: Path) -> Block:
         return {modelled.name: ca.vertcat(*shown), **acted.later, **later}
 
     memory = (*path.memory, *((before,) * age), *(signal for queue in queues for signal in queue))
-    return Block(path.name, Layout((measured_state(plant), *path.reads)), Layout((modelled,)), step, Layout(memory))
+    return Block(path.name, Layout((seen, *path.reads)), Layout((modelled,)), step, Layout(memory))
 
 
 def _twin(path: Path) -> Block:
     """Block (what is measured, last command, parameters) -> the model's response behind sensors and estimator."""
     problem, plant, estimator = path.problem, path.problem.plant, path.problem.sensing.estimator
-    names, calm, given = estimator.measures(plant), np.zeros(len(plant.names)), measured_output(plant)
+    names, calm = estimator.measures(plant), np.zeros(len(plant.names))
+    given, given_state = measured(plant.output), measured(plant.state)
     estimate = estimator.block(plant, problem.period, problem.start_output, Signal("_seen", names))
     own = tuple(replace(m, name=f"mirror_{m.name}") for m in estimate.memory.signals)
     moves, ahead = _memory_moves(problem, names), ca.DM(_drift(plant.output, problem.period))
@@ -215,7 +212,6 @@ def _twin(path: Path) -> Block:
     first = outputs(problem.start_state, problem.inputs_before, plant.approximate).full().ravel()
     state = replace(plant.state, name="mirror_state", start=tuple(map(float, problem.start_state)))
     offsets = replace(plant.output, name="mirror_offset", start=tuple(map(float, problem.start_output - first)))
-    shown_by = list(enumerate(plant.equations.known_by_outputs))
 
     def step(s: Signals) -> dict[str, Expression]:
         end, mean, parameters, age, later = path.acted(s)
@@ -224,19 +220,20 @@ def _twin(path: Path) -> Block:
         offset = ca.if_else(age < 0.5, s.mirror_offset, ahead @ s.mirror_offset)
         past = [getattr(s, m.name) for m in own]
         shown, response, *memories = estimate.function(seen(at, end, parameters, offset), *past)
-        measured, away = getattr(s, MEASURED), getattr(s, given.name) - shown
+        believed, away = getattr(s, given_state.name), getattr(s, given.name) - shown
         # What separates the outputs moves the offset and what the estimator remembers, so the samples stay on one path.
         move = ca.if_else(is_finite(away), away, 0)  # what is not finite must not be remembered
-        told = ca.if_else(is_finite(measured), measured, at)
+        told = ca.if_else(is_finite(believed), believed, at)
         # The next cycle begins at the state that is given. One that outputs show is estimated, so it is late and noisy: there the
         # model keeps its own, put where the sensors show it, and an exact model answers as the plant does, to rounding.
-        begins = ca.vertcat(*(told[k] if place < 0 else at[k] + offset[place] + move[place] for k, place in shown_by))
-        turn = outputs(at, end, parameters) - outputs(begins, end, parameters)
+        of_model = outputs(at, end, parameters)
+        begins = plant.equations.state_of(of_model + offset + move, told)
+        turn = of_model - outputs(begins, end, parameters)
         later |= {"mirror_state_next": begins, "mirror_offset_next": offset + move + turn}
         moved = zip(own, memories, moves, strict=True)
         return {"_modelled": response, **later, **{f"{m.name}_next": v + matrix @ move for m, v, matrix in moved}}
 
-    reads = {signal.name: signal for signal in (given, measured_state(plant), *path.reads)}
+    reads = {signal.name: signal for signal in (given, given_state, *path.reads)}
     memory, writes = (*path.memory, state, offsets, *own), (plant.response_signal("_modelled"),)
     return Block(
         "mirror", Layout(tuple(reads.values())), Layout(writes), step, Layout(memory), problem.integrator.opaque
@@ -302,7 +299,7 @@ def believe_block(problem: Problem, raw: Signal, shown: np.ndarray) -> Block:
         return results | {f"{m}_next": value for m, value in following.items()}
 
     reads, memory = Layout((raw, *path.reads)), Layout((*path.memory, *own.signals)) + estimate.memory
-    writes = Layout((*measured_signals(plant), plant.response_signal("realised")))
+    writes = Layout((*plant.motion, plant.response_signal("realised")))
     return Block("believe", reads, writes, step, memory)
 
 
@@ -343,12 +340,12 @@ class Pairs:
     @property
     def state(self) -> Signal:
         """The signal of the measured state; behind dead time a controller may act on a predicted one."""
-        return measured_state(self.problem.plant) if self.waiting else self.problem.plant.state
+        return measured(self.problem.plant.state) if self.waiting else self.problem.plant.state
 
     @property
     def seen(self) -> Signal:
         """The signal of the measured outputs."""
-        return measured_output(self.problem.plant) if self.waiting else self.problem.plant.output
+        return measured(self.problem.plant.output) if self.waiting else self.problem.plant.output
 
     @property
     def cycles(self) -> float:
@@ -397,13 +394,6 @@ class Pairs:
         return Queue(tuple(whole(wait / period + self._delay) for wait in waits))
 
 
-def measured_state(plant: Plant) -> Signal:
-    """Return the signal of the measured state, which the response belongs to."""
-    return Signal(MEASURED, plant.state.elements, plant.state.units)
-
-
-def measured_output(plant: Plant) -> Signal:
-    """Return the signal of the outputs of the same instant; without outputs that of the state."""
-    return (
-        Signal(MEASURED_OUTPUT, plant.output.elements, plant.output.units) if plant.outputs else measured_state(plant)
-    )
+def measured(signal: Signal) -> Signal:
+    """Return the signal of what is measured of state, outputs or time, where a controller may act on what is predicted."""
+    return Signal(f"_measured_{signal.name}", signal.elements, signal.units)

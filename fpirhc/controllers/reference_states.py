@@ -16,15 +16,44 @@ import numpy as np
 
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.nominal import filled
+from fpirhc.horizon.nominal import reference_state
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.evaluate import Evaluator
+from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, one_rate
 
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}  # a whole turn by unit
 _NEAR = 0.05  # share of a turn that a jump of whole turns may be off, because the reference moves within a cycle
 _OWN = 0.25  # share of a turn per cycle, up to which an angle moves by itself
+
+
+def given_signals(problem: Problem) -> tuple[Signal, ...]:
+    """Return what a controller reads from outside for the reference."""
+    return problem.reference.given(problem.plant)
+
+
+def own_signals(problem: Problem) -> tuple[Signal, ...]:
+    """Return the reference's own signals, which its block writes."""
+    return problem.reference.own(problem.plant)
+
+
+def own_values(problem: Problem, s: Signals) -> list[Expression]:
+    """Return the own signals inside a step."""
+    return [getattr(s, signal.name) for signal in own_signals(problem)]
+
+
+def motion_of(problem: Problem, ahead: float = 0.0) -> ca.Function:
+    """Function (t, own signals) -> (state, response) of the reference, now or after some time."""
+    return problem.reference.motion_now(problem.plant, ahead)
+
+
+def preview_of(problem: Problem) -> ca.Function | None:
+    """Function (t, own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
+    if problem.horizon is None:
+        return None
+    return problem.reference.preview(problem.plant, problem.horizon.nodes)
 
 
 def nominal_motion(problem: Problem) -> ca.Function:
@@ -37,10 +66,9 @@ def nominal_motion(problem: Problem) -> ca.Function:
 def reference_states(problem: Problem, count: int) -> np.ndarray:
     """Return states at evenly spaced instants of a run, shape (nx, count); NaN after a nominal run that does not stay finite."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
-    if plant.equations.known_on_reference:
-        referenced = np.asarray(problem.reference.function(plant).map(count)(times[None, :])[0].full())
-        return referenced[list(plant.equations.known_by_outputs)]
-    return _of_nominal_run(problem, count)[0]
+    if plant.equations.hidden:
+        return _of_nominal_run(problem, count)[0]
+    return np.asarray(reference_state(plant, problem.reference.function(plant).map(count)(times[None, :])[0]).full())
 
 
 def _of_nominal_run(problem: Problem, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +84,7 @@ def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np
     Those before the run stand for a model with more or fewer inputs than controlled coordinates.
     """
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
-    if not plant.equations.known_on_reference:
+    if plant.equations.hidden:
         return _of_nominal_run(problem, count)[1]
     if len(plant.controlled_names) != len(plant.inputs):
         return np.repeat(problem.inputs_before[:, None], count, axis=1)
@@ -92,9 +120,8 @@ def needed_commands(problem: Problem, run: np.ndarray, *, exact: bool = False) -
     """Return the inputs that the model needs along the reference, shape (cycles, nu); states without one are those of a run."""
     plant, count = problem.plant, min(problem.cycles, len(run))
     outputs, responses = (rows[:count] for rows in reference(problem))
-    states = filled(plant, outputs)
-    if run.shape[1] == plant.state.size:
-        states = np.where(np.isfinite(states), states, run[:count])
+    known = run[:count] if run.shape[1] == plant.state.size else np.full((count, plant.state.size), np.nan)
+    states = np.asarray(plant.equations.state_of(ca.DM(outputs.T), ca.DM(known.T)).full()).T
     given = plant.exact if exact else plant.approximate
     [table] = Evaluator(plant.equations.inverse.map(count))(states, responses, np.tile(given, (count, 1)))
     return table.reshape(count, -1)
@@ -107,7 +134,7 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
     reference are not known before a run.
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
-    largest = _largest_response(problem) if problem.plant.equations.known_on_reference else free
+    largest = free if problem.plant.equations.hidden else _largest_response(problem)
     return tuple(_rounded_up(value) if 0 < value < math.inf else value for value in largest)
 
 

@@ -122,11 +122,6 @@ class Cost(Checked, ABC):
     """Contract: named stage terms and a terminal cost, as CasADi expressions."""
 
     @property
-    def weighs_effort(self) -> bool:
-        """Whether a term weighs the inputs themselves, and not their difference from a feedforward; False where unknown."""
-        return False
-
-    @property
     def tracked(self) -> Mapping[str, float] | None:
         """Weights of the squared errors of states along the horizon or at its end, by name; None where unknown."""
         return None
@@ -178,10 +173,6 @@ class Quadratic(Cost):
     outputs: Weights = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
 
     @property
-    def weighs_effort(self) -> bool:
-        return bool(self.effort)
-
-    @property
     def tracked(self) -> Mapping[str, float]:
         """The weights of `states` or `outputs`; those of `terminal` for what only the end of the horizon weighs."""
         at_end = self.terminal if isinstance(self.terminal, Mapping) else {}
@@ -213,7 +204,7 @@ class Quadratic(Cost):
                 f"states: the states of a plant with outputs have no reference; weigh {', '.join(plant.output.elements)}, "
                 "Quadratic(outputs=...), or write a CustomCost"
             )
-        if plant.output.elements != plant.state.elements and isinstance(self.terminal, Terminal):
+        if isinstance(self.terminal, Terminal) and not plant.equations.follows_state:
             mistakes.add(
                 f"terminal: {type(self.terminal).__name__} weighs the whole state, which has no reference on a plant with outputs; "
                 "give weights by the name of an output"

@@ -26,27 +26,16 @@ _DECAYS = 20.0  # times in a run, by which the error of the start decays
 _FASTEST = 0.1  # of the cycle, the rate of this decay
 
 
-def require_reference_of_states(plant: Plant, refusal: str) -> None:
-    """Raise with the refusal where the reference does not give the whole state."""
-    require(plant.equations.known_on_reference, refusal)
-
-
-def filled(plant: Plant, outputs: np.ndarray) -> np.ndarray:
-    """Return states that are known by their outputs, shape (m, nx), from the outputs, shape (m, ny); NaN where they are not."""
-    places = np.array(plant.equations.known_by_outputs)
-    return np.where(places >= 0, outputs[:, places], np.nan)
-
-
 def reference_state(plant: Plant, outputs: Matrix) -> Matrix:
-    """Return the state on the reference, from the nominal outputs and their derivatives, or the nominal state without outputs."""
-    hidden = [e for e, place in zip(plant.state.elements, plant.equations.known_by_outputs, strict=True) if place < 0]
-    require_reference_of_states(
-        plant,
+    """Return the state on the reference, from the nominal outputs and their derivatives."""
+    hidden = plant.equations.hidden
+    require(
+        not hidden,
         f"the input along the reference needs the states {', '.join(hidden)}, which are no outputs, and so have no "
         "reference; weigh the rate of the input, Quadratic(rate=...), in place of "
         "its deviation from a feedforward",
     )
-    return outputs[list(plant.equations.known_by_outputs)]
+    return plant.equations.state_of(outputs, outputs)
 
 
 def feedforward(plant: Plant, outputs: Matrix, responses: Matrix, p: Matrix) -> Matrix:
@@ -76,11 +65,7 @@ def nominal_motion(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return states (nx, m) and inputs (nu, m) of the model on its outputs' reference; errors decay as (d/dt + rate)^r e = 0."""
     x, outputs, r = (ca.MX.sym(n, size) for n, size in _sizes(plant).items())
-    known = [(k, place) for k, place in enumerate(plant.equations.known_by_outputs) if place >= 0]
-    entries = ca.vertsplit(x)
-    for k, place in known:
-        entries[k] = outputs[place]
-    at, p = ca.vertcat(*entries), ca.MX(ca.DM(plant.approximate))
+    at, p = plant.equations.state_of(outputs, x), ca.MX(ca.DM(plant.approximate))
     wanted = nominal_responses(plant, outputs, r)
     needed = plant.equations.inverse(at, wanted + output_feedback(plant, at, outputs, p, rate), p)
     command = ca.fmin(ca.fmax(needed, ca.DM(bounds[0])), ca.DM(bounds[1]))

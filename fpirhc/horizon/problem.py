@@ -47,12 +47,12 @@ class OptimalControl:
             units of the inputs.
         nodes: states, inputs and data along the reference from t = 0.
         along: quadratic model of the cost along the reference.
+        state_of: gives the model's state on the reference; a state that has none there has a value of its own.
         written: number of the last entries of the state, which are limits of rates and paths; they are zero in s_0.
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
         settings: paths of the open settings, whose numbers are among the data.
-        inner: of a plant with outputs, for every state its place in the reference, or -1 and a value of its own; else empty.
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
@@ -75,12 +75,12 @@ class OptimalControl:
     curvature: np.ndarray
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
     along: _ReferenceExpansion
+    state_of: Callable[[ca.SX], ca.SX]
     written: int
     state_price: np.ndarray
     node_times: np.ndarray
     shares: np.ndarray
     settings: tuple[str, ...] = ()
-    inner: tuple[tuple[int, float], ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
 

@@ -109,7 +109,7 @@ def _transcribed(
         written=len(binding),
         state_price=state_prices(limits, state, plant, horizon.step),
         settings=stage.settings,
-        inner=tuple(zip(plant.equations.known_by_outputs, map(float, nodes[0][:, -1]), strict=False)),
+        state_of=lambda outputs: plant.equations.state_of(outputs, ca.SX(nodes[0][:, -1])),
         runaway=lambda: spurious_growth(
             plant, horizon.discretisation, horizon.longest, nodes[0][: plant.state.size, :-1], nodes[1]
         ),
@@ -321,12 +321,12 @@ def _nodes(
     layout = data_layout(plant, horizon)
     along = {name: data[layout.slice(name)] for name in ("reference", "feedforward")}
     states, inputs = along["reference"], along["feedforward"]
-    if not plant.equations.known_on_reference:
+    if plant.equations.hidden:
         first = np.zeros(plant.state.size) if start is None else start
         bounds = limits.input_bounds(plant)
         states, inputs = nominal_motion(plant, reference, _advance(plant, horizon), first, bounds, data[0])
     else:
-        states = states[list(plant.equations.known_by_outputs)]
+        states = np.asarray(ca.DM(reference_state(plant, ca.DM(states))).full())
     states = np.vstack([states, inputs[: extra[0]], np.zeros((extra[1], data.shape[1]))])
     return states, inputs[:, : horizon.stages], data
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported
+from fpirhc.errors import NotSupported, refuse
 from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import (
@@ -31,7 +31,7 @@ from fpirhc.plant.motion import (
 )
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Matrix
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -132,11 +132,6 @@ def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
     return next((k for k, y in enumerate(chain) if ca.depends_on(y, u)), None)
 
 
-def measured_signals(plant: Plant) -> tuple[Signal, ...]:
-    """Return the signals of what a controller is given of the motion: the state, and the outputs where there are any."""
-    return tuple(dict.fromkeys((plant.state, plant.output)))
-
-
 def response_names(plant: Plant) -> tuple[str, ...]:
     """Names of the highest derivatives of the controlled coordinates: "q1''"; of order 0 it is the output's own name."""
     return tuple(name + "'" * order for name, order in plant.response_orders.items())
@@ -157,7 +152,7 @@ def nominal_responses(
         outputs: nominal outputs and their derivatives, in the order of `Plant.output`; without outputs the state.
         later: gives the outputs at the end of the cycle, where one is of order 0; None: `outputs`.
     """
-    instant = [name for name, order in plant.response_orders.items() if not order]
+    instant = plant.at_once
     if not instant:
         return responses[controlled_places(plant)]
     ahead = outputs if later is None else later()
@@ -175,11 +170,26 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))
 
 
-def rateless(plant: Plant) -> str:
-    """Return why a response is no derivative with respect to time; empty where every one is."""
-    if plant.step is not None:
-        return "a map has differences of its steps"
-    return next((f"{name} is of order 0" for name, order in plant.response_orders.items() if not order), "")
+def require_chains(plant: Plant, law: str) -> None:
+    """Raise for an output of order 0, which has no derivative below its response.
+
+    `law`: what needs such a derivative, as the beginning of a sentence.
+    """
+    refuse(
+        f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver" for name in plant.at_once
+    )
+
+
+def require_derivatives(plant: Plant, law: str) -> None:
+    """Raise for a map or an output of order 0, where a law has no meaning.
+
+    `law`: what the law does with derivatives, as the beginning of a sentence.
+    """
+    reasons = [*(["a map has differences of its steps"] * (plant.step is not None))]
+    reasons += [f"{name} is of order 0" for name in plant.at_once]
+    refuse(
+        f"{law} a derivative with respect to time, and {why}; use ComputedTorque with a deformation" for why in reasons
+    )
 
 
 def require_rates(plant: Plant, refusal: str) -> None:

@@ -12,7 +12,7 @@ from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.chain import Symbols, derivatives, output_order
 from fpirhc.plant.motion import arguments_of, believed_in, by_name, sampling, words
-from fpirhc.symbolic.expression import FINITE, Expression, expression, graph, nan_where
+from fpirhc.symbolic.expression import FINITE, Expression, Matrix, expression, graph, nan_where
 from fpirhc.symbolic.layout import Named
 
 if TYPE_CHECKING:
@@ -32,17 +32,17 @@ class Equations:
     def response(self) -> ca.Function:
         """Function (state, input, parameters) -> highest derivative of every coordinate (n)."""
         x, u, p = self.plant.symbols()
-        if self.plant.next is not None:
+        if self.plant.step is not None:
             responses = self.forced_rate(x, u, p, ca.SX.zeros(len(self.plant.names)))
         else:
-            responses = self._of_user(self.plant.response, 1.0, x, u, p)
+            responses = self._of_user(1.0, x, u, p)
         return ca.Function("fpirhc_response", [x, u, p], [responses], ["x", "u", "p"], ["r"])
 
     @cached_property
     def forced_rate(self) -> ca.Function:
         """Function (state, input, parameters, forcing) -> dx/dt, or of a map its divided differences."""
         x, u, p, w = symbols = self._forced()
-        if self.plant.next is not None:
+        if self.plant.step is not None:
             rates = (self.next(*symbols) - x) / sampling(self.plant)
         else:
             responses, elements = self.response(x, u, p) + w, self.plant.state.elements
@@ -66,14 +66,10 @@ class Equations:
         In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
         """
         assert self.plant.step is not None
-        x, u, p, w = symbols = self._forced()
-        after = x
-        if self.plant.next is None:
-            after = x + sampling(self.plant) * self.forced_rate(*symbols)
-        else:
-            one = ca.Function("fpirhc_step", [x, u, p], [self._of_user(self.plant.next, self.plant.step, x, u, p)])
-            for _ in range(self.plant.steps):
-                after = one(after, u, p) + self.plant.step * w
+        x, u, p, w = self._forced()
+        one, after = ca.Function("fpirhc_step", [x, u, p], [self._of_user(self.plant.step, x, u, p)]), x
+        for _ in range(self.plant.steps):
+            after = one(after, u, p) + self.plant.step * w
         return ca.Function("fpirhc_next", [x, u, p, w], [after], ["x", "u", "p", "w"], ["x_next"])
 
     @cached_property
@@ -104,10 +100,21 @@ class Equations:
         equal = [[k for k, e in enumerate(entries) if ca.is_equal(e, x[i], 1)] for i in range(x.numel())]
         return tuple(places[0] if places else -1 for places in equal)
 
-    @property
-    def known_on_reference(self) -> bool:
-        """Whether the reference gives the whole state."""
-        return min(self.known_by_outputs) >= 0
+    @cached_property
+    def hidden(self) -> tuple[str, ...]:
+        """Names of the states that are no output, and no derivative of one, so that they have no reference."""
+        pairs = zip(self.plant.state.elements, self.known_by_outputs, strict=True)
+        return tuple(e for e, place in pairs if place < 0)
+
+    def state_of(self, outputs: Matrix, otherwise: Matrix) -> Matrix:
+        """Return states, a column each, from columns of outputs and their derivatives; what these hide is that of `otherwise`."""
+        places = enumerate(self.known_by_outputs)
+        return ca.vertcat(*(outputs[place, :] if place >= 0 else otherwise[k, :] for k, place in places))
+
+    @cached_property
+    def follows_state(self) -> bool:
+        """Whether what has a reference is the state itself, entry by entry."""
+        return self.known_by_outputs == tuple(range(self.plant.state.size))
 
     @cached_property
     def controlled_response(self) -> ca.Function:
@@ -161,11 +168,9 @@ class Equations:
     def _forced(self) -> Symbols:
         return *self.plant.symbols(), ca.SX.sym("w", len(self.plant.names))
 
-    def _of_user(
-        self, function: Callable[..., Mapping[str, Expression]], share: float, x: ca.SX, u: ca.SX, p: ca.SX
-    ) -> Expression:
-        """What a user's function gives for every coordinate, with so large a share of what is believed to add to it."""
-        values = called(words(self.plant)[1], function, *arguments_of(self.plant, x, u, p))
+    def _of_user(self, share: float, x: ca.SX, u: ca.SX, p: ca.SX) -> Expression:
+        """What the user's function gives for every coordinate, with so large a share of what is believed to add to it."""
+        values = called(words(self.plant)[1], self.plant.response, *arguments_of(self.plant, x, u, p))
         entries = (ca.SX(values[name]) + share * believed_in(self.plant, name, p) for name in self.plant.names)
         return ca.densify(ca.vertcat(*entries))
 

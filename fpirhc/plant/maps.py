@@ -2,56 +2,24 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.motion import sampling
-from fpirhc.symbolic.layout import Expression, Named
+from fpirhc.symbolic.layout import Expression
 from fpirhc.symbolic.open import nominal
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
 
 _WHOLE = 1e-6  # share of a step by which a cycle may differ from a whole number of steps
-
-
-@dataclass(frozen=True, eq=False)
-class Differences:
-    """The divided differences of a map, as a function of (x, u, p) that returns {state: (f - x) / T}.
-
-    Args:
-        next: function of (x, u, p) that returns {state: its value one step later}.
-        states: names.
-        step: T.
-    """
-
-    next: Callable[..., Mapping[str, Expression]]
-    states: tuple[str, ...]
-    step: float
-
-    @property
-    def __signature__(self) -> inspect.Signature:
-        """The signature of the map, so that a wrong number of arguments is named as that of the map."""
-        return inspect.signature(self.next)
-
-    def __call__(self, x: Named, *others: Named) -> Mapping[str, Expression]:
-        """Return the differences; invalid results are returned unchanged, and validation reports them."""
-        values = self.next(x, *others)
-        if not isinstance(values, Mapping):
-            return cast(Mapping[str, Expression], values)
-        scalars = ca.SX | ca.MX | ca.DM | int | float
-        return {
-            name: (value - x[name]) / self.step if name in self.states and isinstance(value, scalars) else value
-            for name, value in values.items()
-        }
 
 
 def over(plant: Plant, cycle: float) -> Plant:

@@ -45,7 +45,7 @@ def derivatives_signal(name: str, units: Mapping[str, str], orders: Mapping[str,
 
 def words(plant: Plant) -> tuple[str, str]:
     """What a coordinate and the response are called: "state" and "rates", or "next", where the plant is given by its states."""
-    if plant.next is not None:
+    if plant.step is not None:
         return "state", "next"
     return ("state", "rates") if plant.outputs and set(plant.orders) == {1} else ("coordinate", "response")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +15,6 @@ from fpirhc.errors import Mistakes, NotInvertible
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.plant.equations import Equations
-from fpirhc.plant.maps import Differences
 from fpirhc.plant.motion import derivative_unit, derivatives_signal, followed_units
 from fpirhc.plant.parameter import Parameter, check_parameters
 from fpirhc.plant.plant_check import (
@@ -69,7 +69,8 @@ class Plant(Checked):
         outputs: name -> Output(unit, function of (q, q', ..., p)): the quantities that follow a reference, where these are not the
             coordinates themselves. Their relative orders are found from the symbols.
         time_unit: unit of time of the equations ('s', 'ms', 'day'), and so of every time and rate of the problem.
-        step: of a map, the time from one state to the next; None: differential equations. See `Plant.discrete`.
+        step: of a map, whose `response` gives the next state, the time until then; None: differential equations. See
+            `Plant.discrete`.
         steps: of a map, how many a control cycle has, with the command held; `Problem` counts them.
         believed: coordinate, output, or response of an output (y'') -> the parameter that a model believes to add to it, as
             estimators of disturbances do; the user's functions do not have it. That of an output's response is in the inverse,
@@ -176,8 +177,14 @@ class Plant(Checked):
         Raises:
             InvalidProblem: all mistakes together.
         """
-        given = (states, inputs, parameters, Differences(next, tuple(states), step), 1, controlled)
-        return cls(*given, ranges=ranges or {}, outputs=outputs or {}, time_unit=time_unit, step=step)
+        given = (states, inputs, parameters, next, 1, controlled)
+        return cls(
+            *given,
+            ranges=ranges or {},
+            outputs=outputs or {},
+            time_unit=time_unit,
+            step=math.nan if step is None else step,
+        )
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
@@ -196,11 +203,6 @@ class Plant(Checked):
         if self.controlled is not None:
             notes.append(f"Controlled: {', '.join(self.controlled)}.")
         return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
-
-    @property
-    def next(self) -> Callable[..., Mapping[str, Expression]] | None:
-        """Of a map its function (x, u, p) -> {state: its value one step later}."""
-        return vars(self.response).get("next") if isinstance(self.response, Differences) else None
 
     @cached_property
     def equations(self) -> Equations:
@@ -232,6 +234,16 @@ class Plant(Checked):
         return derivatives_signal("output", followed_units(self), self.chains, self.time_unit)
 
     @cached_property
+    def beside(self) -> tuple[Signal, ...]:
+        """The signal of the outputs, where they are given beside the state."""
+        return (self.output,) if self.outputs else ()
+
+    @property
+    def motion(self) -> tuple[Signal, ...]:
+        """The signals of what a controller is given of the motion: the state, and the outputs where there are any."""
+        return (self.state, *self.beside)
+
+    @cached_property
     def input(self) -> Signal:
         """The command's signal."""
         return vector("command", tuple(self.inputs), tuple(self.inputs.values()))
@@ -250,6 +262,11 @@ class Plant(Checked):
     def response_orders(self) -> dict[str, int]:
         """Relative orders of the controlled quantities."""
         return {name: self.equations.output_orders[name] for name in self.controlled_names}
+
+    @cached_property
+    def at_once(self) -> tuple[str, ...]:
+        """Names of the controlled quantities of order 0, which the command moves at once: each is its own response."""
+        return tuple(n for n in self.controlled or self.chains if not self.equations.output_orders[n])
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""

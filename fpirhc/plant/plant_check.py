@@ -25,7 +25,7 @@ _LOWER = ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
 def check_names(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
     outputs = {name: one.unit for name, one in plant.outputs.items()}
-    quantities = "states" if plant.next is not None or (plant.outputs and plant.order == 1) else "coordinates"
+    quantities = "states" if plant.step is not None or (plant.outputs and plant.order == 1) else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
         if not group and what != "outputs":
             static = plant.outputs and what == quantities
@@ -57,8 +57,6 @@ def check_map(plant: Plant, mistakes: Mistakes) -> None:
     """Add every mistake of the steps to `mistakes`."""
     if plant.step is not None and not (finite_number(plant.step) and plant.step > 0):
         mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {plant.step!r}")
-    if plant.step is None and (plant.next is not None or plant.steps != 1):
-        mistakes.add("step is missing: a map needs the length of its step; write Plant.discrete(..., step=...)")
 
 
 def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
@@ -86,7 +84,7 @@ def check_response(plant: Plant, mistakes: Mistakes) -> None:
         if c in response:
             with mistakes.caught():
                 scalar_expression(f"{function} of '{c}'", response[c], of=plant.response, symbols=[x, u, p])
-        elif plant.next is not None:
+        elif plant.step is not None:
             mistakes.add(f"next does not give the value of state '{c}' one step later; return it too")
         else:
             mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
@@ -146,7 +144,7 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
                 f"no input reaches coordinate '{name}', however often it is differentiated; use {' or '.join(plant.inputs)} in the "
                 f"{words(plant)[1]}, or control another {words(plant)[0]}"
             )
-        elif order != stated and plant.next is not None:
+        elif order != stated and plant.step is not None:
             mistakes.add(
                 f"an input reaches state '{name}' only after {order} steps; write it as an output, whose order is found: "
                 f"outputs={{'{name}': Output(unit, lambda x, p: x.{name})}}"

@@ -230,7 +230,7 @@ def estimated_problem(
         begin = min(begin, _BEGUN * duration)
         courses = {s: Unknown(Samples(times, w)) for s, w in zip(signals, drift.T, strict=True)}
     start: Mapping[str, float] = own.start
-    if own.plant.equations.known_on_reference:  # what is judged is what comes after the transient
+    if not own.plant.equations.hidden:  # what is judged is what comes after the transient
         start = dict(zip(own.plant.state.elements, map(float, reference_states(own, 2)[:, 0]), strict=True))
     sensing = own.sensing
     if noise and sensing.estimator.measures_all and sensing.observer is None:  # the response itself is measured

@@ -7,6 +7,7 @@ from colorsys import hsv_to_rgb
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.errors import OutputError
@@ -48,11 +49,12 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
     axes = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
     times = np.arange(plan.problem.stages + 1) * plan.problem.step
     reference = plan.data[plan.problem.data.slice("reference")]
-    known = plant.equations.known_by_outputs
+    unknown = np.full((plant.state.size, times.size), np.nan)
+    known = plant.equations.state_of(ca.DM(reference), ca.DM(unknown)).full()
     for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
         is_state = k < plant.state.size
-        if is_state and known[k] >= 0:
-            axis.plot(times, reference[known[k]], "--", color="#777777", label="reference")
+        if is_state and np.isfinite(known[k]).any():
+            axis.plot(times, known[k], "--", color="#777777", label="reference")
         for row, (one, colour) in enumerate(zip(solved, PALETTE, strict=False)):
             width = max(1.0, 3.0 - 0.7 * row)  # plans that agree lie on each other
             if is_state:

@@ -84,7 +84,7 @@ def _turns(case: Case) -> Fact | None:
 
 def _posed(case: Case) -> Fact | None:
     finite = np.isfinite(needed_commands(case.problem, case.bench.nominal["plant_state"])).all(axis=1)
-    by_run = min(case.problem.plant.equations.known_by_outputs) < 0  # it has states that are taken from the run
+    by_run = case.problem.plant.equations.hidden  # states that are taken from the run
     verdict = Verdict.YES if finite.all() else Verdict.CAUTION if by_run else Verdict.NO
     return Fact(verdict, {"share_finite": finite.mean()}) if len(finite) else None
 
@@ -136,7 +136,7 @@ def _saturates(case: Case) -> Fact | None:
     needed = max(of_limit(needed_commands(case.problem, run["plant_state"], exact=one))[at] for one in exact)
     sizes = {"largest": np.abs(run["command"][:, at]).max(), "share_of_the_limit": largest[at]}
     numbers = {"at_a_limit": held} | (sizes if largest[at] > ROUNDING else {})  # it may stand at a limit of zero
-    numbers |= {"needed": needed} if np.isfinite(needed) and min(plant.equations.known_by_outputs) >= 0 else {}
+    numbers |= {"needed": needed} if np.isfinite(needed) and not plant.equations.hidden else {}
     if held <= SATURATED and used[at] < UNUSED:
         change = "State the limits that the actuator has: tolerances of plans are shares of them."
         return Fact(Verdict.CAUTION, numbers, names[at], change)

@@ -16,6 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
+from fpirhc.plant.chain import require_rates
 from fpirhc.plant.chain import response_names as response_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -23,16 +24,12 @@ from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 Array: TypeAlias = np.ndarray
-_DIGITS = 9  # decimals of a delay in cycles, so that half a cycle is one
 
 
 class DerivativeEstimator(Checked, ABC):
     """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
 
     measures_all: ClassVar[bool] = False  # whether state and response are both measured, so that nothing is estimated
-    of_steps: ClassVar[bool] = (
-        False  # whether it takes differences of a map's steps, not derivatives with respect to time
-    )
 
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -58,17 +55,12 @@ class DerivativeEstimator(Checked, ABC):
         return 1
 
     def check(self, plant: Plant) -> None:
-        """Raise if the estimator cannot serve the plant.
-
-        Raises:
-            InvalidValue: with a remedy.
-        """
-
-
-def delay(estimator: DerivativeEstimator, order: int, period: float) -> float:
-    """Return how late the response of a coordinate of that order is, in cycles beyond the ideal pair: the weights' centre."""
-    weights = estimator.weights(order, period)
-    return round(float(weights @ np.arange(weights.size)), _DIGITS)
+        """Raise if the estimator cannot serve the plant; by default it estimates derivatives, which a map does not have."""
+        require_rates(
+            plant,
+            f"{type(self).__name__} estimates derivatives with respect to time, which a map does not have; leave the estimator "
+            "out, and differences of its steps are taken",
+        )
 
 
 def quantities(plant: Plant) -> tuple[str, ...]:
@@ -109,6 +101,9 @@ class Measured(DerivativeEstimator):
     """State and response as the sensors show them, without delay."""
 
     measures_all = True
+
+    def check(self, plant: Plant) -> None:
+        """Serve every plant: nothing is estimated."""
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))

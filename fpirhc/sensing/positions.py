@@ -107,7 +107,8 @@ class StepDifference(PositionDifference):
     those of s cycles ago; `fpirhc.controllers.seeing` brings them to this cycle by the model.
     """
 
-    of_steps = True
+    def check(self, plant: Plant) -> None:
+        """Serve every map."""
 
     def weights(self, order: int, period: float) -> Array:
         del period
@@ -153,6 +154,7 @@ class SavitzkyGolay(_Finite):
         Raises:
             InvalidValue: a degree below the plant's order.
         """
+        super().check(plant)
         highest = max(plant.chains.values())
         if self.degree < highest:
             raise InvalidValue(

@@ -18,8 +18,9 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
 from fpirhc.plant.chain import response_units
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, delay, quantities, response_names
+from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
@@ -59,6 +60,7 @@ class Sensor(Checked):
         return self.noise is not None or self.quantum is not None or self.dropout > 0
 
 
+_DIGITS = 9  # decimals of a delay in cycles, so that half a cycle is one
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
 
 
@@ -92,15 +94,15 @@ class Sensing(Checked):
         """Whether state or response are estimated, so that a controller's step begins with raw measurements."""
         return not self.estimator.measures_all or self.measured is not None or self.observer is not None
 
+    def spreads(self, plant: Plant) -> bool:
+        """Whether a response is a mean over time, and not that of one state and one command."""
+        return not (self.estimator.measures_all or response_age(plant))
+
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: states, outputs, and highest derivatives of controlled ones."""
         if self.measured is None:
             return self.estimator.measures(plant)
         return tuple(n for n in quantities(plant) if n in self.measured)
-
-    def believed(self, plant: Plant) -> tuple[str, ...]:
-        """State elements that a controller is given from the observer."""
-        return plant.state.elements if self.observer is not None else ()
 
     def believed_response(self, plant: Plant) -> tuple[str, ...]:
         """Quantities that the response follows from and no sensor shows."""
@@ -122,18 +124,12 @@ class Sensing(Checked):
         mistakes.unknown("sensors: quantity", self.sensors, every)
         for name in self.sensors:
             if name in every and name not in measures:
-                by = self.observer if name in self.believed(plant) else self.estimator
+                by = self.observer if self.observer and name in plant.state.elements else self.estimator
                 what = f"'{name}' is estimated by {type(by).__name__}, not measured"
                 mistakes.add(f"sensors: {what}; sensors are those of {', '.join(measures)}")
         mistakes.unknown("measured: quantity", self.measured or (), every)
         for mistake in self._uncovered(plant):
             mistakes.add(mistake)
-        instant = [name for name, order in plant.response_orders.items() if not order]
-        if instant and not self.estimator.measures_all:
-            mistakes.add(
-                f"{type(self.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) need none; "
-                "leave the estimator out: Sensing(sensors=...)"
-            )
         with mistakes.caught():
             self.estimator.check(plant)
         if self.observer is not None:
@@ -153,7 +149,7 @@ class Sensing(Checked):
         states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
         if self.measured is not None and not measured:
             yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-        elif believes and self.measured is None and not (self.estimator.of_steps or plant.outputs):
+        elif believes and self.measured is None and not (response_age(plant) or plant.outputs):
             yield (
                 f"observer: everything that {own} needs is measured; name what sensors show: "
                 f"Sensing(measured={list(measured)!r}, ...)"
@@ -168,15 +164,16 @@ class Sensing(Checked):
                 f"measured: {own} needs {', '.join(followed)}, and outputs that are controlled are measured or differentiated, "
                 "never observed; measure it, or choose an estimator of what is measured, such as PositionDifference()"
             )
-        if plant.outputs and states and not believes:
+        if states and not believes:
             yield (
                 f"measured: {', '.join(states)} is given as it is to controllers of a plant with outputs, unless an "
                 "observer is stated: leave it out, or add Sensing(..., observer=KalmanFilter(...))"
             )
 
     def delay(self, plant: Plant, period: float) -> float:
-        """Delay of the estimated response in cycles beyond the ideal pair; the largest of the controlled coordinates."""
-        return max(delay(self.estimator, plant.chains[name], period) for name in plant.controlled_names)
+        """Largest delay of an estimated response in cycles beyond the ideal pair: the centre of its weights."""
+        weights = (self.estimator.weights(plant.chains[name], period) for name in plant.controlled_names)
+        return max(round(float(one @ np.arange(one.size)), _DIGITS) for one in weights)
 
     def warm_up_cycles(self, plant: Plant, late: float) -> float:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""

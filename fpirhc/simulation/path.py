@@ -16,7 +16,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import PlantModel
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names, time_signal
 from fpirhc.plant.plant import Plant
@@ -126,7 +125,7 @@ class Mover(ABC):
     @property
     def motion(self) -> tuple[Signal, ...]:
         """Signals of state and outputs, with the states that it has; without any, no state."""
-        state, *outputs = measured_signals(self.problem.plant)
+        state, *outputs = self.problem.plant.motion
         shown = self.states
         if shown == state.elements:
             return (state, *outputs)
@@ -262,7 +261,7 @@ class Body(Mover):
 
     @property
     def states(self) -> tuple[str, ...]:
-        state, *outputs = measured_signals(self.problem.plant)
+        state, *outputs = self.problem.plant.motion
         return tuple(e for e in state.elements if e in self.measures) if outputs else state.elements
 
     @property

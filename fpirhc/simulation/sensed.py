@@ -10,8 +10,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.gate import LOST
+from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.seeing import sensor_ranges
-from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.path import HELD, Mover, moving, real_signals
@@ -31,7 +32,7 @@ def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
     problem, plant = mover.problem, mover.problem.plant
     response = plant.response_signal("realised")
     if problem.sees_plant:
-        sense = [mover.sense(measured_signals(plant), response)]
+        sense = [mover.sense(plant.motion, response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(mover, response)
     if predicts and not mover.shows_truth and all(map(problem.moves.shows, problem.judged_names)):
@@ -49,8 +50,7 @@ def _true_blocks(mover: Mover, response: Signal) -> tuple[list[Block], Shown]:
         return [mover.sense(*hidden)], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response, "plant_realised")
     sense = mover.sense(*true)
-    if problem.sensing.estimator.of_steps:
-        sense = with_true_response(problem, sense, true[0][-1], true[1])
+    sense = with_true_response(problem, sense, true[0][-1], true[1])
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if not problem.truth.seen:
         return blocks, true
@@ -66,9 +66,10 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     """
     plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
     first = problem.first_output
-    starts = (problem.start_state, first)[-len(measured_signals(plant)) :]
-    states_pass = sensing.observer is None  # a believed state is the controller's own
-    states = [*zip(shown[0], measured_signals(plant), starts, strict=True)] if states_pass else []
+    starts = {plant.state.name: problem.start_state, plant.output.name: first}
+    motion = zip(shown[0], plant.motion, strict=False)
+    # a believed state is the controller's own
+    states = [(true, to, starts[to.name]) for true, to in motion] if sensing.observer is None else []
     if not sensing.ideal:
         others = states[:-1]
         sensors = [
@@ -133,15 +134,15 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     writes = Layout(
         (vector("true_error", problem.judged_names, [followed_units(plant)[c] for c in problem.judged_names]),)
     )
-    if problem.given_signals:
+    if given_signals(problem):
         reads = Layout((like(plant.output, "reference"), motion))
         return Block(
             "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
         )
-    function, reads = problem.motion(), Layout((time_signal(plant), motion, *problem.own_signals))
+    function, reads = motion_of(problem), Layout((time_signal(plant), motion, *own_signals(problem)))
 
     def step(s: Signals) -> dict[str, Expression]:
-        along = function(s.time, *(getattr(s, one.name) for one in problem.own_signals))[0]
+        along = function(s.time, *own_values(problem, s))[0]
         return {"true_error": along[places] - getattr(s, motion.name)[own]}
 
     return Block("truth", reads, writes, step)
@@ -161,13 +162,13 @@ def _seen_block(problem: Problem, shown: Shown) -> Block:
 
 
 def with_true_response(problem: Problem, sense: Block, motion: Signal, response: Signal) -> Block:
-    """Return the block of the true motion, with the true response of a map in place of the one that it writes.
+    """Return the block of the true motion; on a map with the true response in place of the one that it writes.
 
     `motion`: signal of the state, or of the outputs where the plant has some.
     """
     period = problem.period
     orders = problem.plant.response_orders
-    if not any(orders.values()):
+    if not (response_age(problem.plant) and any(orders.values())):
         return sense  # a response of order 0 is the output, and no difference
     places = {c: problem.plant.output.elements.index(c) for c in orders}
     entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]

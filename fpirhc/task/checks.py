@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
 from fpirhc.horizon.cost import Cost, view_of_symbols
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import check_time, over
 from fpirhc.plant.motion import followed_units
@@ -46,7 +45,7 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
                 mistakes.add(
                     f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}"
                 )
-        if problem.sensing.estimator.measures_all and not _instant(plant):
+        if problem.sensing.estimator.measures_all and not plant.at_once:
             from fpirhc.sensing.positions import StepDifference  # of maps alone
 
             settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
@@ -55,9 +54,9 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
     return settled
 
 
-def check_maps(model: Plant, real: Plant, sensing: Sensing, mistakes: Mistakes) -> None:
+def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
-    instant = _instant(model)
+    instant = model.at_once
     at_once = bool(instant) and set(instant) == set(model.controlled or model.chains)  # no derivative is looked for
     check_time(real, model, model.chains, mistakes, at_once=at_once)
     if model.step is None:
@@ -67,16 +66,6 @@ def check_maps(model: Plant, real: Plant, sensing: Sensing, mistakes: Mistakes) 
             f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
             "cycles, which is not covered; control them by two problems"
         )
-    if not instant and not sensing.estimator.of_steps:
-        mistakes.add(
-            f"sensing: {type(sensing.estimator).__name__} estimates derivatives with respect to time, which a map does not "
-            "have; leave the estimator out, and differences of its steps are taken"
-        )
-
-
-def _instant(plant: Plant) -> tuple[str, ...]:
-    """Controlled outputs that the command moves at once; their response is the output itself."""
-    return tuple(name for name in plant.controlled or plant.chains if not plant.equations.output_orders[name])
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
@@ -96,7 +85,7 @@ def needed_names(
     Measured is what sensors show, and the state that is given beside outputs where nothing is believed. `judged`: names whose
     errors are judged beside the controlled ones; None: no other need be there.
     """
-    beside = measured_signals(plant)[:-1] if sensing.observer is None else ()
+    beside = plant.motion[:-1] if sensing.observer is None else ()
     states = [element for signal in beside for element in signal.elements]
     measured = tuple(dict.fromkeys((*states, *sensing.measures(plant))))
     if sensing.observer is None:

@@ -19,7 +19,7 @@ from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import nominal_run
-from fpirhc.plant.chain import differentiated_signals, measured_signals
+from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
@@ -131,7 +131,7 @@ class Problem(Checked):
             with mistakes.caught():
                 check()
         mistakes.raise_if_any()
-        check_maps(plant, self.real_plant, self.sensing, mistakes)
+        check_maps(plant, self.real_plant, mistakes)
         mistakes.raise_if_any()
         check_stage(plant, self.cost, self.limits, mistakes)
         _check_inverse(self, mistakes)
@@ -340,23 +340,9 @@ class Problem(Checked):
         return np.array([self.first_shown[e] for e in self.plant.output.elements])
 
     @property
-    def given_signals(self) -> tuple[Signal, ...]:
-        """What a controller is given from outside for the reference."""
-        return self.reference.given(self.plant)
-
-    @property
-    def own_signals(self) -> tuple[Signal, ...]:
-        """The reference's own signals, which its block writes."""
-        return self.reference.own(self.plant)
-
-    def motion(self, ahead: float = 0.0) -> ca.Function:
-        """Function (t, own signals) -> (outputs, response) of the reference, now or after some time."""
-        return self.reference.motion_now(self.plant, ahead)
-
-    @property
     def sample(self) -> tuple[Signal, ...]:
         """What a controller's step is given: the state, outputs and the response, or raw measurements, and beside them states."""
-        plant, sensing, shown = self.plant, self.sensing, measured_signals(self.plant)
+        plant, sensing, shown = self.plant, self.sensing, self.plant.motion
         if not sensing.estimates:
             return (*shown, plant.response_signal("realised"))
         late = self.dead_time.measurement_wait(self.period)

@@ -62,7 +62,7 @@ def settled(density, sign, p):
 
 def later(x, u, p):
     """The road's step; each sign moves the speed at which its segment settles."""
-    after = dict(road.next(x, u, p))
+    after = dict(road.response(x, u, p))
     for name, i in SIGNS.items():
         limited, alone = settled(x[f"rho{i}"], u[name], p)
         after[f"v{i}"] += T / p.tau * (limited - alone)

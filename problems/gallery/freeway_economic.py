@@ -62,7 +62,7 @@ T = road.step  # h
 
 def later(x, u, p):
     """METANET's step, and the time that all cars have spent on the road and in queues since the start, veh h."""
-    after = road.next(x, u, p)
+    after = road.response(x, u, p)
     cars = sum(2 * after[f"rho{i}"] for i in range(1, 7)) + after["w1"] + after["w2"]  # two lanes of 1 km
     return {**after, "spent": x.spent + T * cars}
 

@@ -166,9 +166,7 @@ def _rates(plant: fp.Plant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) ->
     """The user's own function, in numbers; of a map the next state."""
     count = len(plant.coordinates)
     lower = [_named(plant.coordinates, x[k : k + count]) for k in range(0, len(x), count)]
-    function = plant.response if plant.step is None else plant.next
-    assert function is not None
-    return {name: float(value) for name, value in function(*lower, _named(plant.inputs, u), p).items()}
+    return {name: float(value) for name, value in plant.response(*lower, _named(plant.inputs, u), p).items()}
 
 
 def _chain(one: ForeignPlant, x: np.ndarray, u: np.ndarray, p: SimpleNamespace) -> dict[str, tuple[float, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.path import MEASURED_TIME
+from fpirhc.controllers.path import measured
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
@@ -112,9 +112,9 @@ class AdaptiveInverseDynamics(Controller):
         reference = built.motion
 
         def then(s: Signals) -> Expression:
-            return reference(ca.fmax(getattr(s, MEASURED_TIME) - pairs.late, 0), *built.own_values(s))[0]
+            return reference(ca.fmax(s._measured_time - pairs.late, 0), *built.own_values(s))[0]
 
-        return then, (replace(time_signal(plant), name=MEASURED_TIME), *built.own)
+        return then, (measured(time_signal(plant)), *built.own)
 
     def _remembers(self, built: Built) -> bool:
         """Whether it learns from errors of an earlier instant, to set-points, which only a memory knows."""
@@ -141,10 +141,10 @@ def _earlier_targets(built: Built) -> Block:
 
     def step(s: Signals) -> dict[str, Expression]:
         column, remembered = queue.column(s, "targets", s._target)
-        ahead = s.time - getattr(s, MEASURED_TIME)  # of a prediction
+        ahead = s.time - s._measured_time  # of a prediction
         return {_EARLIER: queue.at(column, target.size, (ahead + pairs.late) / period), **remembered}
 
-    reads = Layout((target, time, replace(time, name=MEASURED_TIME)))
+    reads = Layout((target, time, measured(time)))
     return Block("earlier_targets", reads, Layout((like(target, _EARLIER),)), step, Layout(memory))
 
 

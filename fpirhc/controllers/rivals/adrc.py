@@ -14,10 +14,11 @@ import numpy as np
 
 from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed, check_chains
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
+from fpirhc.plant.chain import require_chains
 from fpirhc.plant.maps import check_modes, step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, rename
@@ -46,7 +47,7 @@ class ADRC(Undeformed):
             NotSupported: no chain of integrators.
             InvalidValue: an error that does not decay in the steps of a map.
         """
-        check_chains(problem, "ADRC observes a chain of integrators")
+        require_chains(problem.plant, "ADRC observes a chain of integrators")
         for order in problem.plant.response_orders.values():
             check_modes(self, problem.plant, decay_gains(self.bandwidth, order))
 

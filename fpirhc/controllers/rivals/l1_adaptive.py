@@ -11,9 +11,10 @@ import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed, check_chains
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
+from fpirhc.plant.chain import require_chains
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_in_mean
@@ -42,7 +43,7 @@ class L1Adaptive(Undeformed):
         Raises:
             NotSupported: no derivative below the response can be predicted.
         """
-        check_chains(problem, "L1Adaptive predicts a derivative below the response")
+        require_chains(problem.plant, "L1Adaptive predicts a derivative below the response")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant

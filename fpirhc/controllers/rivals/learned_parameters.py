@@ -141,7 +141,7 @@ _MECHANICS = "learning inverse dynamics is for mechanics"
 
 def _against(plant: Plant) -> Iterator[str]:
     """Reasons against a plant in which other quantities than coordinates of mechanics, of order 2, follow the reference."""
-    if plant.equations.known_by_outputs != tuple(range(plant.state.size)):
+    if not plant.equations.follows_state:
         yield (
             f"{_MECHANICS} in its own coordinates, whose inertia matrix it learns; "
             f"{', '.join(plant.controlled_names)} are other functions of the state; use ComputedTorque with a deformation"

@@ -13,12 +13,12 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed, check_derivatives
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
-from fpirhc.plant.chain import measured_signals
+from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
@@ -54,7 +54,7 @@ class LyapunovMRAC(Undeformed):
             NotSupported: a map, or an output of order 0.
             InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
         """
-        check_derivatives(problem, "LyapunovMRAC proves that errors vanish by")
+        require_derivatives(problem.plant, "LyapunovMRAC proves that errors vanish by")
         plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
         followed = plant.chains
         if len(plant.controlled_names) != len(followed):
@@ -113,7 +113,7 @@ class LyapunovMRAC(Undeformed):
         before = [_gains(plant, n) for n in ("_gains_before", "_gains_first_before")]
         motions = [like(seen, n) for n in ("model", "reference")]
         reads = (
-            *measured_signals(plant),
+            *plant.motion,
             *motions,
             plant.response_signal("_reference_response"),
             plant.parameter,

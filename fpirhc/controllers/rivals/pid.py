@@ -15,7 +15,6 @@ from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import finite_number
 from fpirhc.members import Example
-from fpirhc.plant.chain import measured_signals
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, fed, rename
 from fpirhc.symbolic.expression import Signals, total
@@ -148,7 +147,7 @@ class PID(Undeformed):
             }
 
         before, in_use = integral_signal(plant, "_integral_before"), integral_signal(plant, "_integral_used")
-        reads = (*measured_signals(plant), like(seen, "reference"), plant.parameter, scalar("warm_up"), before)
+        reads = (*plant.motion, like(seen, "reference"), plant.parameter, scalar("warm_up"), before)
         writes = (
             error_signal(plant),
             in_use,

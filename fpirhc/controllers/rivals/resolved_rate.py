@@ -11,10 +11,11 @@ import casadi as ca
 
 from fpirhc.controllers.base import commanding_blocks, invert_block, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed, check_derivatives
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
+from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
@@ -45,7 +46,7 @@ class ResolvedAccelerationRate(Undeformed):
         Raises:
             NotSupported: the response has no derivative.
         """
-        check_derivatives(problem, "ResolvedAccelerationRate prescribes")
+        require_derivatives(problem.plant, "ResolvedAccelerationRate prescribes")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant

@@ -54,11 +54,10 @@ class SlidingMode(Undeformed):
                 f"take a width above {0.5 * self.gain * problem.period:.3g} "
                 f"or a gain below {2 * self.width / problem.period:.3g}"
             )
-        for name, order in problem.plant.response_orders.items():
-            if not order:
-                mistakes.add(
-                    f"the command moves '{name}' at once (order 0), so there is no surface to slide on; use ComputedTorque"
-                )
+        for name in problem.plant.at_once:
+            mistakes.add(
+                f"the command moves '{name}' at once (order 0), so there is no surface to slide on; use ComputedTorque"
+            )
         mistakes.raise_if_any()
         for order in problem.plant.response_orders.values():
             check_modes(self, problem.plant, decay_gains(self.rate, order - 1))

@@ -15,9 +15,10 @@ from typing import NamedTuple
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, judge_block, reference_block, warm_up_block
-from fpirhc.controllers.built import Built, build, checked, with_aim
+from fpirhc.controllers.built import Built, build, checked
+from fpirhc.controllers.composed import with_aim
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.path import measured_output
+from fpirhc.controllers.path import measured
 from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
@@ -169,11 +170,10 @@ def _by_slot(plants: Sequence[Plant], name: str) -> Signal:
 
 
 def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
-    estimator = problem.sensing.estimator
-    if deformation.form.modelled and not (estimator.of_steps or estimator.measures_all):
+    if deformation.form.modelled and problem.sensing.spreads(problem.plant):
         yield (
-            f"ModelReferenced in a slot compares with the model's response of one cycle, and {estimator} gives a mean over "
-            "several; use the map inside"
+            f"ModelReferenced in a slot compares with the model's response of one cycle, and {problem.sensing.estimator} gives a "
+            "mean over several; use the map inside"
         )
     if deformation.form.pairs and not deformation.form.modelled:
         yield (
@@ -187,7 +187,7 @@ _OUTPUT = "_slot_outputs"  # the outputs of every slot's plant, where the plant 
 
 def _seeing_blocks(built: Built, turns: Sequence[Turn]) -> list[Block]:
     """Blocks from what is measured to the outputs and the response of every slot."""
-    plant, model, motion = built.plant, turns[0].built.plant, measured_output(built.plant)
+    plant, model, motion = built.plant, turns[0].built.plant, measured(built.plant.output)
     every = _by_slot([one.built.plant for one in turns], "realised_of_slots")
     still, calm = ca.DM.zeros(plant.input.size), ca.DM.zeros(len(plant.names))
     memory = Layout(tuple(scalar(one.own("below")) for one in turns if one.place is None))
@@ -241,7 +241,6 @@ def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list
     delays = [d for d in delays if d.now.name not in _OF_ALL]
     told = {n for b in blocks for n in (*b.writes.names, *b.memory.names)} | {d.now.name for d in delays}
     names = {n: one.own(n) for n in (*told, *_OF_TURN, "realised", "warm_up")}
-    names |= {n: f"{n}_{one.name}" for n in one.slot.deformation.shown()}
     if not outer.outputs:
         names["output"] = _OUTPUT
     begins, asked = names | {"warm_up": names["_goes_on"]}, names | {Form().request: names["_request"]}

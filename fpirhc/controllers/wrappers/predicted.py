@@ -10,13 +10,15 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built, compose_controller, embedded
+from fpirhc.controllers.built import Built
+from fpirhc.controllers.composed import compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
-from fpirhc.controllers.path import MEASURED, MEASURED_OUTPUT, MEASURED_TIME
+from fpirhc.controllers.path import measured
+from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
-from fpirhc.plant.chain import derivatives_function, measured_signals
+from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import forcing_units, time_signal
@@ -70,7 +72,7 @@ class Predicted(ControllerWrapper):
                 "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
                 "error leaves an offset; write Estimating(Predicted(controller, ...), ...)",
             )
-        if not problem.given_signals or not cycles:
+        if not given_signals(problem) or not cycles:
             return notes
         late = f"{cycles * problem.period:g} {problem.time_unit}"
         return (*notes, f"Predicted follows set-points {late} late; give one that is known ahead so much earlier")
@@ -85,9 +87,8 @@ class Predicted(ControllerWrapper):
         """
         self.controller.check(problem)
         plant, cycles = problem.plant, self._cycles(problem.period)
-        pairs = zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)
-        unmoved = [e for e, place in pairs if place < 0]
-        unmoved += [e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names]
+        free = (e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names)
+        unmoved = [*plant.equations.hidden, *free]
         require(
             self.by == "model" or not unmoved,
             f"Predicted(by='desired') does not predict {', '.join(unmoved)}, which no desired response moves; use by='model'",
@@ -107,8 +108,9 @@ class Predicted(ControllerWrapper):
         if not self._cycles(built.period):
             return self.controller.blocks(built.inner(self))
         inner = compose_controller(built.inner(self), ahead=True)
-        ahead = {s.name: like(s, f"{s.name}_ahead") for s in (time_signal(plant), *measured_signals(plant))}
-        feeds = {**ahead, MEASURED: plant.state, MEASURED_OUTPUT: plant.output, MEASURED_TIME: time_signal(plant)}
+        given = time_signal(plant), *plant.motion
+        ahead = {s.name: like(s, f"{s.name}_ahead") for s in given}
+        feeds = {**ahead, **{measured(s).name: s for s in given}}
         command = replace(built.before, name=plant.input.name)
         sent = plant.response_signal("desired") if self.by == "desired" else command
         before = replace(sent, name="_sent_before")
@@ -136,9 +138,9 @@ class Predicted(ControllerWrapper):
         last = (replace(built.state, name="state_answered"),) * response_age(plant)
         own = (residual, *last) if corrected else ()
         responses = (plant.response_signal("realised"),) if corrected else ()
-        reads = (time_signal(plant), *measured_signals(plant), *responses, plant.parameter, before)
+        reads = (time_signal(plant), *plant.motion, *responses, plant.parameter, before)
         # An output that is the state is where the state is.
-        outputs_ahead = {s.name: _output_ahead(plant) for s in measured_signals(plant)[1:]}
+        outputs_ahead = {s.name: _output_ahead(plant) for s in plant.beside}
 
         def step(s: Signals) -> dict[str, Expression]:
             queued, values = queue.column(s, "sent", getattr(s, before.name))
@@ -166,8 +168,8 @@ def _along_desired(plant: Plant, period: float) -> ca.Function:
         chain = sorted((e for e in elements if e.rstrip("'") == name), key=len)
         values = [seen[elements.index(e)] for e in chain] + [d[k]]
         later |= {element: sum(_terms(values[j:], period), start=ca.SX(0)) for j, element in enumerate(chain)}
-    state_next = [later[elements[place]] for place in plant.equations.known_by_outputs]
-    return ca.Function("fpirhc_predict", [x, d, p, w], [ca.vertcat(*state_next)])
+    outputs_next = ca.vertcat(*(later[element] for element in elements))
+    return ca.Function("fpirhc_predict", [x, d, p, w], [plant.equations.state_of(outputs_next, x)])
 
 
 def _residual(plant: Plant, time: float, period: float) -> ca.Function:

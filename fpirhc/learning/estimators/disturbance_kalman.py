@@ -337,8 +337,7 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
     """State, input and parameters of the model on the reference at t = 0; states without a reference are those of the start."""
     plant = problem.plant
     seen, response = problem.reference.function(plant)(0.0)
-    known = zip(problem.start_state, plant.equations.known_by_outputs, strict=True)
-    state = ca.DM([value if place < 0 else float(seen[place]) for value, place in known])
+    state = plant.equations.state_of(seen, ca.DM(problem.start_state))
     if plant.controlled is None and len(plant.inputs) != len(plant.chains):
         return state, ca.DM.zeros(len(plant.inputs)), plant.approximate
     needed = plant.equations.inverse(state, response[controlled_places(plant)], plant.approximate)
