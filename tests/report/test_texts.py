@@ -24,6 +24,8 @@ PLANNED = """period=5e-3, duration=1.0, measure_from=0.5,
     horizon=fp.Horizon(stages=10, step=1e-2),
     cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2}),
     limits=fp.Limits(inputs={"u": (-30.0, 30.0)})"""
+NOISY = f"""{PLANNED[:-1]}, states={{"y'": (-0.9, 1.0)}}, rates={{"u": (-60.0, 60.0)}}),
+    sensing=fp.Sensing({{"y''": fp.Sensor(noise=fp.Noise(0.2))}})"""
 MORE = """optimiser = fp.FixedPoint(iterations=3, tolerance=1e-3)
 controllers["RHC"] = fp.RecedingHorizon(optimiser)
 controllers["RHC+FPI"] = fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=-0.7)))
@@ -33,6 +35,8 @@ COMMANDS = {
     "page": "compare line.py --no-compile",
     "plans": "compare line.py --plans",
     "review": "review line.py --verbose",
+    "noisy": "review noisy.py --verbose -c CTC+FPI",
+    "tanks": "review leaking_tanks --verbose -c RHC+FPI",
     "study": "study line.py --draws 6 --mismatch 20% --no-compile -c CTC CTC+FPI",
     "limits": "study line.py --limits mismatch lost --no-compile -c CTC",
 }
@@ -79,6 +83,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "400")
     Path("line.py").write_text(line_text(PLANNED, more=MORE), encoding="utf-8")
+    Path("noisy.py").write_text(line_text(NOISY, more=MORE), encoding="utf-8")
     return tmp_path
 
 

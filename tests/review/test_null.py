@@ -76,12 +76,6 @@ def test_masses_that_do_not_drift_pass_until_a_dead_time_is_not_paired(late, ver
     assert alone(problem, controller).verdict == verdict
 
 
-def test_errors_of_rounding_are_none():
-    """A motor held at its speed with a right model: 4e-15 without adaptation and 4e-14 with it are no errors."""
-    task = fp.load_problem("noisy_motor")
-    assert alone(task.problem, task.controllers["RHC+FPI"]).verdict == "yes"
-
-
 def test_commands_at_a_limit_show_nothing():
     """A wrong map asks for more than the light lets in."""
     task = fp.load_problem("problems/gallery/freeway.py")

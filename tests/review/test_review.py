@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.line import line_text
 from helpers.reviewed import PERIOD, answers, biased, heavy, mass, plans, torque
 
 import fpirhc as fp
@@ -143,28 +144,10 @@ def test_a_set_point_is_judged_beside_the_plant_that_is_left_alone():
     assert told.numbers["rms_error"] == pytest.approx(3 / 3.2, rel=0.02)
 
 
-def test_numbers_have_units_and_spans():
-    found = answers(mass(limits=LIMITS, measure_from=2.0))
-    assert f"time constant {-PERIOD / math.log(found['returns'].numbers['factor']):.3g} s" in found["returns"].evidence
-    assert re.fullmatch(r"rms error of q \S+ m \(t = 2 to 4 s\), \S+ % of its motion of 1 m", found["follows"].evidence)
-    assert found["model"].evidence.startswith("model as the plant, without noise and disturbances: rms error of q")
-
-
-FILE = """
-import casadi as ca
-import fpirhc as fp
-
-plant = fp.Plant({{"q": "m"}}, {{"u": "N"}}, {{"m": fp.Parameter(1.5, 1.0, "kg")}}, lambda x, v, u, p: {{"q": u.u / p.m}})
-reference = fp.Trajectory(lambda t: {{"q": 0.5 * ca.sin(3 * t)}})
-problem = fp.Problem(plant, reference, {{"q": 0.0}}, period=1e-3, duration=2.0, limits=fp.Limits(inputs={{"u": (-20.0, 20.0)}}))
-controllers = {{"CTC+FPI": fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain={gain}))}}
-"""
-
-
 @pytest.mark.parametrize(("gain", "code"), [(-0.5, 0), (0.5, 1)])
 def test_the_command_writes_fixed_names_and_says_no_by_its_exit_code(tmp_path: Path, gain: float, code: int, capsys):
     """A gain of the wrong sign is a no."""
-    (tmp_path / "mine.py").write_text(FILE.format(gain=gain))
+    (tmp_path / "mine.py").write_text(line_text("period=1e-3, duration=2.0", f"fp.Affine(gain={gain})"))
     assert main(["review", str(tmp_path / "mine.py"), "--json"]) == code
     told = json.loads(capsys.readouterr().out)
     assert told["ready"] is (code == 0)
