@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import build
-from fpirhc.controllers.composed import compose_controller
+from fpirhc.controllers.built import build, compose_controller
 from fpirhc.horizon.cost import Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.plant import Output, Parameter, Plant

@@ -1,13 +1,14 @@
-"""A controller built for a problem: everything automatic is chosen and everything is checked once, at `build`.
+"""A controller built for a problem: everything automatic is chosen and everything is checked once, at `build`; and its one step.
 
-    build(problem, controller) -> Built -> blocks(built) -> one step, from what is measured to the command
+    build(problem, controller) -> Built -> blocks(built) -> raw measurements -> [estimator -> controller] -> command
 
-Blocks are handed the result. They read facts from it, and look nothing up again.
+Blocks are handed the result. They read facts from it, and look nothing up again. A machine gives the step what its sensors show; a
+skipped cycle leaves the estimator's memory as it was, like every other one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
@@ -17,18 +18,19 @@ import casadi as ca
 
 from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
-from fpirhc.controllers.path import Pairs, Path, Told, believed_path
-from fpirhc.controllers.reference_states import given_signals, largest_response, motion_of, own_signals
+from fpirhc.controllers.path import ACTED, NOW, Pairs, Path, Told, believed_path, measured
+from fpirhc.controllers.reference_states import largest_response
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
-from fpirhc.errors import refuse
-from fpirhc.plant.motion import followed_units
+from fpirhc.errors import InvalidProblem, refuse
+from fpirhc.fields.kinds import described
+from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.block import Block, Composite, Delay, compose, fed, rename
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Signal, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem, cycles_per_plan
 
@@ -110,7 +112,7 @@ def build(problem: Problem, controller: Controller, *, opened: bool = False) -> 
 def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
-    own, before = own_signals(problem), tuple(map(float, problem.inputs_before))
+    own, before = problem.own_signals, tuple(map(float, problem.inputs_before))
     units = followed_units(plant)
     return Built(
         problem=problem,
@@ -124,9 +126,9 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         output=replace(plant.output, start=tuple(map(float, problem.start_output))),
         pairs=Pairs(problem, problem.dead_time),
         own=own,
-        given=given_signals(problem),
-        motion=motion_of(problem),
-        later=motion_of(problem, ahead=problem.period),
+        given=problem.given_signals,
+        motion=problem.motion(),
+        later=problem.motion(ahead=problem.period),
         aim=problem.reference.block(plant, problem.period) if own else None,
         error=vector("error", problem.judged_names, [units[name] for name in problem.judged_names]),
         judged=tuple(plant.output.elements.index(name) for name in problem.judged_names),
@@ -163,7 +165,6 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
 
 
 def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
-    refuse(_against_outputs(problem))
     ready = resolved(problem, controller)
     if numbers_only and ready.inner is None and ready.planner is not None:
         ready.planner.check_weights(problem)
@@ -175,16 +176,6 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
     if ready.deforms not in ("target", "turns") and _REFUSES.get():  # their own checks judge gains
         require_converging(problem, ready.deformation)
     return ready
-
-
-def _against_outputs(problem: Problem) -> Iterator[str]:
-    """Reasons against outputs; those of order 0 have a response that is measured."""
-    instant = ", ".join(problem.plant.at_once)
-    if instant and not problem.sensing.estimator.measures_all:
-        yield (
-            f"{type(problem.sensing.estimator).__name__} estimates derivatives, and outputs of order 0 ({instant}) "
-            "need none; leave the estimator out: Sensing(sensors=...)"
-        )
 
 
 def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
@@ -203,3 +194,115 @@ def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
     if plant.step is not None and any(every(form.lag)):
         yield f"{type(deformation).__name__}: a map has no lag; write an actuator as a state of the map"
+
+
+_COMPOSED: Latest[Composite] = Latest(4)
+
+
+def compose_with_sensing(built: Built) -> Composite:
+    """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
+
+    Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
+    """
+    return _COMPOSED.of((built,), (), lambda: _composed(built))
+
+
+def _composed(built: Built) -> Composite:
+    (blocks, delays), (seeing, seen) = _blocks_of(built), built.seeing
+    own = [*seeing, *_measuring(built, blocks), *blocks]
+    return _informed(built, _reads(built, *built.sample), own, [*delays, *seen])
+
+
+def _reads(built: Built, *seen: Signal) -> Layout:
+    """What a controller reads in every cycle: time, what is seen, parameters, and what a reference is given."""
+    return Layout((time_signal(built.plant), *seen, built.model.plant.parameter, *built.given))
+
+
+def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
+    """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
+
+    `ahead`: whether time and state are those at which the command will act. The step then also reads the measured state, its time,
+    and the signals of the last cycle, where a block needs them.
+    """
+    blocks, delays = _blocks_of(built)
+    reads = _reads(built, *built.plant.motion, built.plant.response_signal("realised"))
+    measuring = _measuring(built, blocks)
+    if ahead:
+        reads = reads + Layout(tuple(signal for block in measuring for signal in block.writes.signals))
+        return _informed(built, reads, blocks, delays, ahead=True)
+    return _informed(built, reads, [*measuring, *blocks], delays)
+
+
+def _measuring(built: Built, blocks: Sequence[Block]) -> list[Block]:
+    """Blocks that write what is measured, where some blocks read it: what is given, unless a controller acts on predictions."""
+    read, given = _read_by(blocks), (*built.plant.motion, time_signal(built.plant))
+    return [rename(f"measured_{one.name}", one, measured(one)) for one in given if measured(one).name in read]
+
+
+def _read_by(blocks: Sequence[Block]) -> set[str]:
+    return {name for block in blocks for name in block.reads.names}
+
+
+def dependencies_of_command(step: Composite) -> frozenset[str]:
+    """Return the names of what the command of a composed controller depends on, in its cycle or by the memory in a later one."""
+    function = step.function
+    results = [function.index_out(name) for name in ("command", "memory_next")]
+    reads = enumerate(function.name_in())
+    return frozenset(name for k, name in reads if any(function.jac_sparsity(one, k).nnz() for one in results))
+
+
+def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
+    given: object = built.controller.blocks(built)
+    pair = given if isinstance(given, tuple) and len(given) == 2 else None
+    kinds = (Block, Delay)
+    if pair is None or [part for part, kind in zip(pair, kinds, strict=True) if not _holds(part, kind)]:
+        raise InvalidProblem(
+            f"{type(built.controller).__name__}.blocks(built) must return two lists (blocks, delays), got {described(given)}"
+        )
+    return with_aim(built, pair[0]), list(pair[1])
+
+
+def with_aim(built: Built, blocks: Sequence[Block]) -> list[Block]:
+    """Return the blocks of a controller after the reference's own block, where some of them read its signals."""
+    own = {signal.name for signal in built.own}
+    return [*([built.aim] if built.aim is not None and own & _read_by(blocks) else []), *blocks]
+
+
+def _holds(part: object, kind: type) -> bool:
+    return isinstance(part, list | tuple) and not [one for one in part if not isinstance(one, kind)]
+
+
+def _informed(
+    built: Built, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay], *, ahead: bool = False
+) -> Composite:
+    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
+
+    `ahead`: whether the time is the one at which the command will act.
+    """
+    told = built.told
+    compares = bool(told.places) and ACTED in _read_by(blocks)
+    first = told.block(remembers=compares and not ahead)
+    if first is None:
+        return compose("controller", reads, blocks, delays, outputs=("command",))
+    reads = reads + Layout(told.reads if compares and ahead else ())
+    now = like(told.plant.parameter, NOW)
+    return compose(
+        "controller", reads, [first, *(fed(b, "parameters", now) for b in blocks)], delays, outputs=("command",)
+    )
+
+
+def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block:
+    """Return a composed step as one block.
+
+    `feeds`: name of a signal that the step reads -> the signal that it is given instead.
+    """
+    reads = tuple(feeds.get(s.name, s) for s in composite.reads.signals)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        memory = composite.memory.join({m: getattr(s, m) for m in composite.memory.names})
+        next_memory, trace, *_ = composite.function(memory, *(getattr(s, r.name) for r in reads))
+        remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
+        return {**composite.trace.split(trace), **remembered}
+
+    inside = composite.trace, step, composite.memory, composite.opaque
+    return Block(name, Layout(reads), *inside)

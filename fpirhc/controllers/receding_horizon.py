@@ -11,7 +11,6 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Planner
-from fpirhc.controllers.reference_states import own_signals, own_values, preview_of
 from fpirhc.controllers.replanning import (
     FromMeasurement,
     Replanning,
@@ -169,18 +168,18 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     optimiser, restarts = controller.optimiser, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     count = len(ocp.settings)
-    data_of = _stage_data(problem, count)
-    preview = preview_of(problem)
-    running_data = data_of if preview is None else _stage_data(problem, count, previewed=True)
-    memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp, data_of))
+    preview = problem.reference.preview(plant, horizon.nodes)
+    ahead, previewed = previewed_values(plant, problem.signals), preview is not None
+    data_of = stage_data(plant, problem.reference, horizon, problem.cost, count, ahead, previewed=previewed)
+    memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))
     solve = built(optimiser, ocp, optimiser.step)
     low, high = problem.limits.input_ends(plant)
     writes = (like(plant.input, "planned"), Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)), discrete("_solve_status"))
 
     def step(s: Signals) -> dict[str, Value]:
-        own = own_values(problem, s)
+        own = [getattr(s, one.name) for one in problem.own_signals]
         motion = () if preview is None else preview(s.time, *own)
-        data = running_data(s.time, *motion, s.parameters, *_open_rows(problem, ocp, s))
+        data = data_of(s.time, *motion, s.parameters, *_open_rows(problem, ocp, s))
         for seen in plant.beside if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=controller.planner.feeds_back(plant))
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
@@ -213,21 +212,13 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     return Block("plan", _plan_reads(problem, room), Layout(writes), step, own, opaque=True)
 
 
-def _stage_data(problem: Problem, settings: int, *, previewed: bool = False) -> ca.Function:
-    assert problem.horizon is not None
-    assert problem.cost is not None
-    ahead = previewed_values(problem.plant, problem.signals)
-    arguments = problem.plant, problem.reference, problem.horizon, problem.cost, settings, ahead
-    return stage_data(*arguments, previewed=previewed)
-
-
 def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
     """Time, start of the plan, parameters, last command and its shift or last plan, outputs, own signals."""
     plant = problem.plant
     names = ("_command_shift_last", "_command_before") if room is None else (_PLANNED_BEFORE,)
     last = tuple(like(plant.input, name) for name in names)
     assert problem.horizon is not None
-    own, outputs = own_signals(problem), plant.beside
+    own, outputs = problem.own_signals, plant.beside
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
     return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *own))

@@ -19,41 +19,12 @@ from fpirhc.errors import InvalidValue
 from fpirhc.horizon.nominal import reference_state
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, one_rate
 
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}  # a whole turn by unit
 _NEAR = 0.05  # share of a turn that a jump of whole turns may be off, because the reference moves within a cycle
 _OWN = 0.25  # share of a turn per cycle, up to which an angle moves by itself
-
-
-def given_signals(problem: Problem) -> tuple[Signal, ...]:
-    """Return what a controller reads from outside for the reference."""
-    return problem.reference.given(problem.plant)
-
-
-def own_signals(problem: Problem) -> tuple[Signal, ...]:
-    """Return the reference's own signals, which its block writes."""
-    return problem.reference.own(problem.plant)
-
-
-def own_values(problem: Problem, s: Signals) -> list[Expression]:
-    """Return the own signals inside a step."""
-    return [getattr(s, signal.name) for signal in own_signals(problem)]
-
-
-def motion_of(problem: Problem, ahead: float = 0.0) -> ca.Function:
-    """Function (t, own signals) -> (state, response) of the reference, now or after some time."""
-    return problem.reference.motion_now(problem.plant, ahead)
-
-
-def preview_of(problem: Problem) -> ca.Function | None:
-    """Function (t, own signals) -> (states, responses) at the nodes of the horizon; None without own signals."""
-    if problem.horizon is None:
-        return None
-    return problem.reference.preview(problem.plant, problem.horizon.nodes)
 
 
 def nominal_motion(problem: Problem) -> ca.Function:

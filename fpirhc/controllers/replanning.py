@@ -201,19 +201,11 @@ def _planned(problem: Problem) -> Signal:
 _LATEST: Latest[np.ndarray] = Latest(8)
 
 
-def first_memory_of(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
-    """Return the optimiser's memory before a run, with the numbers of the build.
+def first_memory_of(problem: Problem, optimiser: Optimiser, ocp: OptimalControl) -> np.ndarray:
+    """Return the optimiser's memory before the run, with the numbers of the build."""
+    state, inputs = problem.start_state, np.asarray(problem.inputs_before, dtype=float)
 
-    `data_of`: Function (time, parameters, settings) -> data of the horizon.
-    """
-    start = problem.start_state.tobytes(), np.asarray(problem.inputs_before, dtype=float).tobytes()
-    facts = (*start, plans_are_compiled())
-    return _LATEST.of((ocp, optimiser), facts, lambda: _first_memory(problem, optimiser, ocp, data_of)).copy()
+    def made() -> np.ndarray:
+        return first_memory(optimiser, ocp, np.asarray(ocp.start(state, inputs).full()).ravel(), ocp.nodes[2])
 
-
-def _first_memory(problem: Problem, optimiser: Optimiser, ocp: OptimalControl, data_of: ca.Function) -> np.ndarray:
-    first = np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel()
-    settings = ocp.nodes[2][ocp.data.slice("settings").start :, 0] if ocp.settings else None
-    arguments = (0.0, problem.plant.approximate)
-    table = data_of(*arguments) if settings is None else data_of(*arguments, settings)
-    return first_memory(optimiser, ocp, first, np.asarray(table.full()))
+    return _LATEST.of((ocp, optimiser), (state.tobytes(), inputs.tobytes(), plans_are_compiled()), made).copy()

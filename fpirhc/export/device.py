@@ -14,7 +14,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidName
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.stepper import Stepper
@@ -64,7 +63,7 @@ class Device:
     @cached_property
     def data(self) -> Layout:
         """What stays until somebody changes it: parameters and set-points."""
-        stays = {"parameters", *(signal.name for signal in given_signals(self.problem))}
+        stays = {"parameters", *(signal.name for signal in self.problem.given_signals)}
         return self._read(lambda name: name in stays)
 
     @cached_property

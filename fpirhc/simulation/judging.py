@@ -10,7 +10,6 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import factors_along, identified_factor, jacobians_along
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.reference_states import own_signals
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
@@ -100,7 +99,7 @@ def _costs(problem: Problem, layout: Layout, log: np.ndarray) -> tuple[Signal, n
     The same cost judges all controllers of a problem, whatever their models: effort relative to a feedforward is relative to the
     feedforward of the plant.
     """
-    shifted, own = LOGGED in layout.names, bool(own_signals(problem))
+    shifted, own = LOGGED in layout.names, bool(problem.own_signals)
     ocp, evaluator = _COSTS.of((problem,), (shifted,), lambda: _cost_evaluator(problem, shifted=shifted))
     states = log[:, layout.slice("plant_state")]
     commands = log[:, layout.slice("command")]
@@ -126,7 +125,7 @@ def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl,
     """A horizon of one cycle, and its cost terms of many cycles."""
     assert problem.horizon is not None
     assert problem.cost is not None
-    plant, own = problem.plant, bool(own_signals(problem))
+    plant, own = problem.plant, bool(problem.own_signals)
     one_cycle = replace(problem.horizon, stages=1, step=problem.period, blocks=(), margins={}, lengths=())
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
     outside = real_values(plant, problem.signals)

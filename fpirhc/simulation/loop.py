@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, reference_block
-from fpirhc.controllers.built import Built, build
-from fpirhc.controllers.composed import compose_with_sensing
+from fpirhc.controllers.built import Built, build, compose_with_sensing
 from fpirhc.controllers.contract import PlantModel, Undeformed
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings

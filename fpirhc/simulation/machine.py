@@ -15,8 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built, build
-from fpirhc.controllers.composed import compose_with_sensing
+from fpirhc.controllers.built import Built, build, compose_with_sensing
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import sensor_ranges

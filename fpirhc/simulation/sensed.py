@@ -10,7 +10,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.gate import LOST
-from fpirhc.controllers.reference_states import given_signals, motion_of, own_signals, own_values
 from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import followed_units, time_signal
@@ -134,15 +133,15 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     writes = Layout(
         (vector("true_error", problem.judged_names, [followed_units(plant)[c] for c in problem.judged_names]),)
     )
-    if given_signals(problem):
+    if problem.given_signals:
         reads = Layout((like(plant.output, "reference"), motion))
         return Block(
             "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
         )
-    function, reads = motion_of(problem), Layout((time_signal(plant), motion, *own_signals(problem)))
+    function, reads = problem.motion(), Layout((time_signal(plant), motion, *problem.own_signals))
 
     def step(s: Signals) -> dict[str, Expression]:
-        along = function(s.time, *own_values(problem, s))[0]
+        along = function(s.time, *(getattr(s, one.name) for one in problem.own_signals))[0]
         return {"true_error": along[places] - getattr(s, motion.name)[own]}
 
     return Block("truth", reads, writes, step)

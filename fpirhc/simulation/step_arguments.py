@@ -14,7 +14,6 @@ import numpy as np
 
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.checked import ByName
 from fpirhc.fields.kinds import described, named_entries, real_number
@@ -39,7 +38,7 @@ _FUNCTION = "a function of time"
 
 def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) -> np.ndarray:
     """Return what the reference is given in every cycle, shape (cycles, entries); no entries for a reference without set-points."""
-    signals, steps = given_signals(problem), _steps(problem, setpoints)
+    signals, steps = problem.given_signals, _steps(problem, setpoints)
     if not signals:
         return np.zeros((cycles, 0))
     times = np.arange(cycles) * problem.period
@@ -138,7 +137,7 @@ class StepArguments:
         places = {name: k + 1 for k, name in enumerate(composite.reads.names)}  # after the memory
         self.settings = arguments.get(SETTINGS, NOTHING)
         self.setpoints = np.zeros(0)
-        for signal in given_signals(problem):
+        for signal in problem.given_signals:
             self.setpoints = self.evaluator.arguments[places[signal.name]]
             self.setpoints[:] = signal.start_vector()
         self.memory_next, self.trace, self.command_next = self.evaluator.results

@@ -340,6 +340,20 @@ class Problem(Checked):
         return np.array([self.first_shown[e] for e in self.plant.output.elements])
 
     @property
+    def given_signals(self) -> tuple[Signal, ...]:
+        """What a controller is given from outside for the reference."""
+        return self.reference.given(self.plant)
+
+    @property
+    def own_signals(self) -> tuple[Signal, ...]:
+        """The reference's own signals, which its block writes."""
+        return self.reference.own(self.plant)
+
+    def motion(self, ahead: float = 0.0) -> ca.Function:
+        """Function (t, own signals) -> (outputs, response) of the reference, now or after some time."""
+        return self.reference.motion_now(self.plant, ahead)
+
+    @property
     def sample(self) -> tuple[Signal, ...]:
         """What a controller's step is given: the state, outputs and the response, or raw measurements, and beside them states."""
         plant, sensing, shown = self.plant, self.sensing, self.plant.motion

@@ -15,8 +15,7 @@ from typing import NamedTuple
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, judge_block, reference_block, warm_up_block
-from fpirhc.controllers.built import Built, build, checked
-from fpirhc.controllers.composed import with_aim
+from fpirhc.controllers.built import Built, build, checked, with_aim
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.path import measured
 from fpirhc.controllers.slots.schedules import Schedule

@@ -15,8 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, reference_block
-from fpirhc.controllers.built import Built
-from fpirhc.controllers.composed import compose_controller, embedded
+from fpirhc.controllers.built import Built, compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import InvalidValue, NotContractive, require

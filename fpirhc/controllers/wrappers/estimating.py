@@ -13,8 +13,7 @@ from typing import ClassVar
 import casadi as ca
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built
-from fpirhc.controllers.composed import compose_controller, dependencies_of_command, embedded
+from fpirhc.controllers.built import Built, compose_controller, dependencies_of_command, embedded
 from fpirhc.controllers.contract import ControllerWrapper, Planner, innermost, with_field
 from fpirhc.controllers.path import Pairs
 from fpirhc.errors import require

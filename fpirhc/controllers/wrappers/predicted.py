@@ -10,11 +10,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built
-from fpirhc.controllers.composed import compose_controller, embedded
+from fpirhc.controllers.built import Built, compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.controllers.path import measured
-from fpirhc.controllers.reference_states import given_signals
 from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
@@ -72,7 +70,7 @@ class Predicted(ControllerWrapper):
                 "what is learned inside Predicted corrects the controller's model, and the prediction keeps the stated one, whose "
                 "error leaves an offset; write Estimating(Predicted(controller, ...), ...)",
             )
-        if not given_signals(problem) or not cycles:
+        if not problem.given_signals or not cycles:
             return notes
         late = f"{cycles * problem.period:g} {problem.time_unit}"
         return (*notes, f"Predicted follows set-points {late} late; give one that is known ahead so much earlier")
