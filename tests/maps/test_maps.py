@@ -172,7 +172,7 @@ def test_disturbances_and_signals_act_as_in_the_loop_by_hand() -> None:
     problem = task(
         plant,
         duration=70.0,
-        signals={"rain": fp.Unknown(fp.Samples(T * np.arange(8), rain, "zero"))},
+        signals={"rain": fp.Unknown(fp.Samples(T * np.arange(8), rain))},
         disturbances={"stock": fp.Step(at=30.0, size=2e-3)},
     )
     run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE)))
