@@ -5,6 +5,7 @@ from .deformation import check_deformation as check_deformation
 from .laws import FAMILIES as FAMILIES
 from .laws import Example as Example
 from .laws import examples as examples
+from .laws import laws_of as laws_of
 from .laws import member_classes as member_classes
 from .live import check_live as check_live
 from .loops import two_masses as two_masses

@@ -10,12 +10,10 @@ import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from fpirhc.conformance.laws import Broken, frozen_value, keep, within
+from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.conformance.loops import REPLAYED, Replay, by_states, coarse_steps, two_masses
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import checked
@@ -34,9 +32,6 @@ from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status
 from fpirhc.task.exogenous import really_known
 from fpirhc.task.problem import Problem
-
-Array = npt.NDArray[Any]
-Draw = np.random.Generator
 
 _OTHER = 1.01  # factor of exact parameters
 _SAME = 1e-9  # relative difference that counts as none
@@ -57,7 +52,7 @@ def check_controller(
         compiled: whether to compare with compiled C too, which costs a second or more the first time; skipped without a
             compiler.
     """
-    keep(controller, Trial(controller, problem or two_masses(), seed, left, compiled), LAWS, seed)
+    keep(Trial(controller, problem or two_masses(), seed, left, compiled), seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,19 +316,3 @@ def _measured_once(trial: Trial, bad: float, entry: int | None, what: str) -> Br
             yield f"{what}: the status of that cycle is OK"
     if status == Status.NON_FINITE:
         yield f"{what}: {_STEPS} good measurements later the status is still NON_FINITE"
-
-
-LAWS = (
-    frozen_value,
-    same_command_everywhere,
-    command_keeps_the_limits,
-    bad_measurement_never_acts,
-    exact_model_tracks,
-    facts_hold,
-    exact_parameters_are_unknown,
-    deformation_acts,
-    learning_remembers,
-    model_is_of_the_plant,
-    law_is_what_it_does,
-    what_it_takes_it_controls,
-)

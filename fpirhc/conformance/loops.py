@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
+from fpirhc.conformance.laws import Array
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import build, compose_controller
 from fpirhc.horizon.cost import Quadratic
@@ -21,8 +21,6 @@ from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
-
-Array = npt.NDArray[Any]
 
 Cycle: TypeAlias = dict[str, Array]  # what a controller says in one cycle, and its `memory` before the next one
 

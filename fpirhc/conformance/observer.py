@@ -8,9 +8,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
-from fpirhc.conformance.laws import Broken, frozen_value, keep, within
+from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.conformance.loops import two_masses
 from fpirhc.controllers.path import observed_model
 from fpirhc.plant.motion import with_exact_parameters
@@ -18,9 +17,6 @@ from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, unobse
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
-
-Array = npt.NDArray[Any]
-Draw = np.random.Generator
 
 _SAME = 1e-9  # of the largest state
 _OTHER = 1.01  # factor of exact parameters
@@ -39,7 +35,7 @@ def check_observer(observer: StateObserver, *, seed: int, problem: Problem | Non
     task, sensing = problem or two_masses(), Sensing({}, Measured(), measured=["a", "b"])
     sensing = sensing if problem is None else problem.sensing
     believed = Sensing(sensing.sensors, sensing.estimator, measured=sensing.measured, observer=observer)
-    keep(observer, _Trial(observer, replace(task, sensing=believed)), LAWS, seed)
+    keep(_Trial(observer, replace(task, sensing=believed)), seed)
 
 
 @dataclass(frozen=True)
@@ -164,12 +160,3 @@ def wrong_start_is_corrected(trial: _Trial, draw: Draw) -> Broken:
             f"started wrong by {size:.3g} in what is measured it is wrong by up to {most:.3g} in {_LONG} samples "
             f"without noise, and by {late:.3g} in the later half: it does not converge; look at its gains and its memory"
         )
-
-
-LAWS = (
-    frozen_value,
-    exact_parameters_are_unknown,
-    old_samples_do_nothing,
-    wrong_start_is_corrected,
-    right_model_believes_what_is,
-)

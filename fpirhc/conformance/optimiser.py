@@ -9,9 +9,8 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
-from fpirhc.conformance.laws import Broken, frozen_value, keep, within
+from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.errors import CompileError, InvalidProblem, NotSupported
 from fpirhc.fields.checked import checked_call, replaced
 from fpirhc.fields.kinds import Range, Seed
@@ -30,8 +29,6 @@ from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 
-Array = npt.NDArray[Any]
-Draw = np.random.Generator
 Posed: TypeAlias = tuple[OptimalControl, Array, Array]
 
 _CALLS, _FEW = 50, 5  # of the step within which it must solve a small convex problem; on a problem without solution
@@ -80,7 +77,7 @@ def check_optimiser(
     Args:
         tolerance: stationarity, in the unit of the inputs, below which it calls a plan OK.
     """
-    keep(optimiser, Trial(optimiser, tolerance), LAWS, seed)
+    keep(Trial(optimiser, tolerance), seed)
 
 
 class _Plan(NamedTuple):
@@ -356,16 +353,3 @@ def solution_stays(trial: Trial, draw: Draw) -> Broken:
     later = horizon.solved(horizon.states(state, again.inputs)[1], shifted)
     if later.status != Status.OK:
         yield f"from the shifted plan of the stage before its status is {later.status.name}"
-
-
-LAWS = (
-    frozen_value,
-    remembers_a_plan,
-    work_is_bounded_as_told,
-    numbers_are_true,
-    iterations_are_counted,
-    bounds_of_a_call_count,
-    infeasible_is_told,
-    nan_is_told,
-    solution_stays,
-)

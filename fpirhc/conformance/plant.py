@@ -8,15 +8,11 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import numpy.typing as npt
 
-from fpirhc.conformance.laws import Broken, keep, within
+from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.errors import Mistakes
 from fpirhc.plant.motion import input_columns
 from fpirhc.plant.plant import Plant
-
-Array = npt.NDArray[Any]
-Draw = np.random.Generator
 
 _POINTS = 20
 _INVERSE = 1e-6  # relative to the response; Newton's method is stopped at 1e-8
@@ -34,7 +30,7 @@ def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float
     mistakes.unknown("state or input", box or {}, names)
     mistakes.raise_if_any()
     box = dict.fromkeys(names, (-1.0, 1.0)) | dict(box or {})
-    keep(plant, _Trial(plant, {name: box[name] for name in names}), LAWS, seed)
+    keep(_Trial(plant, {name: box[name] for name in names}), seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +119,3 @@ def inverse_inverts(trial: _Trial, draw: Draw) -> Broken:
             if not within(got - wanted, _INVERSE * (1 + float(np.abs(wanted).max()))):
                 words = f"for the response {wanted} the inverse ({which} parameters) gives the input {command}"
                 yield f"{words}, whose response is {got} {where}"
-
-
-LAWS = (response_is_finite, both_parameter_sets_enter, response_is_pure, slopes_are_true, inverse_inverts)

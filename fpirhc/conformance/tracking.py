@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from fpirhc.conformance.laws import Broken, frozen_value, keep, within
+from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.controllers.computed_torque import ComputedTorque
 from fpirhc.errors import InvalidValue
 from fpirhc.plant.motion import places
@@ -22,9 +21,6 @@ from fpirhc.symbolic.layout import Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
 from fpirhc.tracking.base import Tracking
-
-Array = npt.NDArray[Any]
-Draw = np.random.Generator
 
 _TRIALS = 5
 _EXACT = 1e-9  # relative
@@ -44,7 +40,7 @@ def check_tracking(
     """
     if not {*orders} or not {*orders} <= {1, 2, 3}:
         raise InvalidValue(f"check_tracking(orders={tuple(orders)!r}): expected whole numbers from 1 to 3")
-    keep(tracking, _Trial(tracking, tuple(orders), period, duration), LAWS, seed)
+    keep(_Trial(tracking, tuple(orders), period, duration), seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +100,59 @@ def zero_error_asks_for_the_nominal_response(trial: _Trial, draw: Draw) -> Broke
             yield f"without any error the desired response is {desired} in cycle {cycle}, the nominal response is {nominal}"
 
 
+def start_forgets(trial: _Trial, draw: Draw) -> Broken:
+    """The first cycle of a run does not depend on the memory of an earlier run."""
+    for _ in range(_TRIALS):
+        motion = trial.motion(draw)
+        _, fresh = trial(trial.start(), *motion, warm_up=0)
+        _, soiled = trial(draw.normal(size=trial.cycle.memory.size), *motion, warm_up=0)
+        if not within(soiled - fresh, _EXACT * (1 + float(np.abs(fresh).max()))):
+            yield f"with `warm_up` at 0 an earlier run changes the desired response from {fresh} to {soiled}"
+
+
+def nan_shows(trial: _Trial, draw: Draw) -> Broken:
+    """A measured coordinate that is not a number gives a desired response that is not one, so that it never acts."""
+    for k, place in enumerate(places(trial.plant, 0)):
+        state, target, nominal = trial.motion(draw)
+        state[place] = np.nan
+        _, desired = trial(trial.start(), state, target, nominal)
+        if not np.isnan(desired[k]):
+            yield f"'{trial.plant.names[k]}' of NaN is hidden: the desired response is {desired[k]:.6g}"
+
+
+def clipping_freezes(trial: _Trial, draw: Draw) -> Broken:
+    """A constant error does not wind the law up further into a limit: its desired response settles."""
+    state, target, nominal = trial.motion(draw)
+    cycles, memory, cut_off, said = round(trial.duration / trial.period), trial.start(), target - state, []
+    for cycle in range(cycles + 1):
+        memory, desired = trial(
+            memory, state, target, nominal, warm_up=float(cycle > 0), cut=cut_off[places(trial.plant, 0)]
+        )
+        said.append(desired)
+    halfway, last = said[cycles // 2], said[-1]
+    if not within((last - halfway) / (np.abs(last - nominal) + _EXACT), _WIND):
+        yield (
+            f"clipped for {trial.duration:g} s at a constant error, the desired response goes from {halfway} at half time to "
+            f"{last}; leave the memory unchanged where the error has the sign of `_cut_off`, or where `clipped` is 1"
+        )
+
+
+def error_decays(trial: _Trial, draw: Draw) -> Broken:
+    """On an ideal plant that starts at rest the error goes to zero."""
+    names = trial.plant.names
+    first = {name: float(draw.uniform(0.5, 2.0) * draw.choice([-1, 1])) for name in names}
+    rest = Trajectory(lambda t: dict.fromkeys(names, 0 * t))
+    problem = Problem(trial.plant, rest, first, period=trial.period, duration=trial.duration)
+    run = simulate(problem, ComputedTorque(trial.tracking), seed=0, compiled=False)
+    if run.stop is not None:
+        yield f"the loop on an ideal plant diverges: {run.stop}"
+    for name, order in zip(names, trial.orders, strict=True):
+        share = run[f"error.{name}"] / -first[name]
+        if not within(share[-1], _LEFT):
+            words = f"of an error on an ideal plant of order {order} the share {share[-1]:.3g} is left"
+            yield f"{words} after {trial.duration:g} s, more than {_LEFT:g}"
+
+
 def gains_are_what_it_does(trial: _Trial, draw: Draw) -> Broken:
     """A law that tells constant gains feeds errors back with them."""
     elements = trial.plant.state.elements
@@ -128,67 +177,3 @@ def gains_are_what_it_does(trial: _Trial, draw: Draw) -> Broken:
                 does = given - nominal[k]
                 if not within(does - expected, _EXACT * scale):
                     yield f"{what} its feedback for order {order} is {does:.6g}, its gains {gains} give {expected:.6g}"
-
-
-def start_forgets(trial: _Trial, draw: Draw) -> Broken:
-    """The first cycle of a run does not depend on the memory of an earlier run."""
-    for _ in range(_TRIALS):
-        motion = trial.motion(draw)
-        _, fresh = trial(trial.start(), *motion, warm_up=0)
-        _, soiled = trial(draw.normal(size=trial.cycle.memory.size), *motion, warm_up=0)
-        if not within(soiled - fresh, _EXACT * (1 + float(np.abs(fresh).max()))):
-            yield f"with `warm_up` at 0 an earlier run changes the desired response from {fresh} to {soiled}"
-
-
-def error_decays(trial: _Trial, draw: Draw) -> Broken:
-    """On an ideal plant that starts at rest the error goes to zero."""
-    names = trial.plant.names
-    first = {name: float(draw.uniform(0.5, 2.0) * draw.choice([-1, 1])) for name in names}
-    rest = Trajectory(lambda t: dict.fromkeys(names, 0 * t))
-    problem = Problem(trial.plant, rest, first, period=trial.period, duration=trial.duration)
-    run = simulate(problem, ComputedTorque(trial.tracking), seed=0, compiled=False)
-    if run.stop is not None:
-        yield f"the loop on an ideal plant diverges: {run.stop}"
-    for name, order in zip(names, trial.orders, strict=True):
-        share = run[f"error.{name}"] / -first[name]
-        if not within(share[-1], _LEFT):
-            words = f"of an error on an ideal plant of order {order} the share {share[-1]:.3g} is left"
-            yield f"{words} after {trial.duration:g} s, more than {_LEFT:g}"
-
-
-def clipping_freezes(trial: _Trial, draw: Draw) -> Broken:
-    """A constant error does not wind the law up further into a limit: its desired response settles."""
-    state, target, nominal = trial.motion(draw)
-    cycles, memory, cut_off, said = round(trial.duration / trial.period), trial.start(), target - state, []
-    for cycle in range(cycles + 1):
-        memory, desired = trial(
-            memory, state, target, nominal, warm_up=float(cycle > 0), cut=cut_off[places(trial.plant, 0)]
-        )
-        said.append(desired)
-    halfway, last = said[cycles // 2], said[-1]
-    if not within((last - halfway) / (np.abs(last - nominal) + _EXACT), _WIND):
-        yield (
-            f"clipped for {trial.duration:g} s at a constant error, the desired response goes from {halfway} at half time to "
-            f"{last}; leave the memory unchanged where the error has the sign of `_cut_off`, or where `clipped` is 1"
-        )
-
-
-def nan_shows(trial: _Trial, draw: Draw) -> Broken:
-    """A measured coordinate that is not a number gives a desired response that is not one, so that it never acts."""
-    for k, place in enumerate(places(trial.plant, 0)):
-        state, target, nominal = trial.motion(draw)
-        state[place] = np.nan
-        _, desired = trial(trial.start(), state, target, nominal)
-        if not np.isnan(desired[k]):
-            yield f"'{trial.plant.names[k]}' of NaN is hidden: the desired response is {desired[k]:.6g}"
-
-
-LAWS = (
-    frozen_value,
-    zero_error_asks_for_the_nominal_response,
-    start_forgets,
-    nan_shows,
-    clipping_freezes,
-    error_decays,
-    gains_are_what_it_does,
-)
