@@ -17,7 +17,6 @@ from fpirhc.fields.kinds import Range, Seed
 from fpirhc.horizon.cost import LQRTerminal, Quadratic
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser, worked
 from fpirhc.plant.plant import Parameter, Plant
@@ -51,9 +50,9 @@ def posed(problem: Problem, *, time: float = 0.0, parameters: Array | None = Non
     horizon, cost = problem.horizon, problem.cost
     if horizon is None or cost is None:
         raise InvalidProblem("nothing is planned without a horizon and a cost: give the problem both")
-    parts, ahead = (problem.plant, problem.reference, horizon, cost), previewed_values(problem.plant, problem.signals)
-    ocp = transcribe(*parts, problem.limits, ahead, problem.start_state)
-    data = stage_data(*parts, signals=ahead)(time, problem.plant.approximate if parameters is None else parameters)
+    plant, ahead = problem.plant, previewed_values(problem.plant, problem.signals)
+    ocp = transcribe(plant, problem.reference, horizon, cost, problem.limits, ahead, problem.start_state)
+    data = ocp.data_of()(time, plant.approximate if parameters is None else parameters)
     return ocp, np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel(), data.full()
 
 

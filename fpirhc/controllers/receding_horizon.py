@@ -25,7 +25,7 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import offset_limits, shifted_reference, stage_data
+from fpirhc.horizon.stage_data import offset_limits, shifted_reference
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
@@ -167,10 +167,8 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     assert problem.cost is not None
     optimiser, restarts = controller.optimiser, controller.replanning.restarts
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
-    count = len(ocp.settings)
     preview = problem.reference.preview(plant, horizon.nodes)
-    ahead, previewed = previewed_values(plant, problem.signals), preview is not None
-    data_of = stage_data(plant, problem.reference, horizon, problem.cost, count, ahead, previewed=previewed)
+    data_of = ocp.data_of(previewed=preview is not None)
     memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))
     solve = built(optimiser, ocp, optimiser.step)
     low, high = problem.limits.input_ends(plant)

@@ -34,6 +34,7 @@ class OptimalControl:
         state: signal of s_i.
         input: signal of u_i.
         data: layout of theta_i.
+        data_of: returns the Function (time, parameters, settings) -> theta of all stages; `previewed`: as `stage_data` says.
         dynamics: (s, u, theta) -> s_next.
         stage_cost: (s, u, theta) -> (l, terms).
         terminal_cost: (s, theta) -> T.
@@ -63,6 +64,7 @@ class OptimalControl:
     state: Signal
     input: Signal
     data: Layout
+    data_of: Callable[..., ca.Function]
     dynamics: ca.Function
     stage_cost: ca.Function
     terminal_cost: ca.Function

@@ -5,8 +5,6 @@ Where cost or limits have open numbers, the data of every stage end with these s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import casadi as ca
 import numpy as np
 
@@ -136,8 +134,3 @@ def setting_rows(paths: tuple[str, ...]) -> Layout:
     if not paths:
         return Layout()
     return Layout((Signal("settings", paths),))
-
-
-def with_rows(table: np.ndarray, rows: Sequence[float]) -> np.ndarray:
-    """Return the data of all stages with the rows of the settings."""
-    return np.vstack([table, np.repeat(np.array([rows]).T, table.shape[1], axis=1)])

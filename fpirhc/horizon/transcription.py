@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -24,7 +25,7 @@ from fpirhc.horizon.cost import Cost, Linearisation, View, outputs_of, read_by_c
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
-from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data, with_rows
+from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
 from fpirhc.plant.motion import sampling
@@ -74,12 +75,12 @@ def _transcribed(
     same = plant.equations, reference, cost, whole
     stage = _STAGES.of(same, (horizon,), lambda: _stage(plant, reference, horizon, cost, limits))
     binding, free = stage.binding, stage.before
-    table = np.asarray(stage_data(plant, reference, horizon, cost, signals=signals)(0.0, plant.approximate).full())
+    data_of = partial(stage_data, plant, reference, horizon, cost, len(stage.settings), signals)
+    numbers = {path: number_of(number) for path, number in open_numbers(cost, limits).items()}
+    settings = [[numbers[path] for path in stage.settings]] if stage.settings else []
+    table = np.asarray(data_of()(0.0, plant.approximate, *settings).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     bounds = limits.input_bounds(plant)
-    values = {path: number_of(number) for path, number in open_numbers(cost, limits).items()}
-    if stage.settings:
-        nodes = (*nodes[:2], with_rows(nodes[2], [values[path] for path in stage.settings]))
     _check_finite_limits(stage, nodes)
     _check_finite(stage, nodes)
     functions: dict[object, ca.Function] = {}
@@ -94,6 +95,7 @@ def _transcribed(
         state=state,
         input=plant.input,
         data=data_layout(plant, horizon) + setting_rows(stage.settings),
+        data_of=data_of,
         dynamics=stage.dynamics,
         stage_cost=stage.cost,
         terminal_cost=stage.terminal_cost,

@@ -20,7 +20,6 @@ from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient
-from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.members import member_modules
 from fpirhc.optimisers.base import Optimiser
@@ -289,10 +288,8 @@ def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[s
         if cost is None:
             raise InvalidProblem(f"problem '{task.name}' has no cost; give Problem(cost=...)")
         ocp = transcribe(plant, problem.reference, problem.horizon, cost, limits, ahead, start)
-        data_of = stage_data(plant, problem.reference, problem.horizon, cost, signals=ahead)
-        data = np.asarray(data_of(0.0, plant.approximate).full())
         first = np.asarray(ocp.start(start, problem.inputs_before).full()).ravel()
-        plan = solve(ocp, optimiser, first, data)
+        plan = solve(ocp, optimiser, first, ocp.nodes[2])
         solved.append(Solved(label, plan, None if plan.overflow() else certify(plan)))
     return solved
 
