@@ -304,11 +304,11 @@ def _write(run: Run, path: Path) -> None:
 
 
 def _read(path: Path) -> tuple[Facts, Layout, np.ndarray]:
-    """Return facts, layout and log of a file."""
+    """Return facts, layout and log of a file, with columns that a file of an older version lacks."""
     try:
         log, stored = _parts(path)
         facts = _facts(stored)
-        layout = _layout(facts, log)
+        layout, log = with_common_columns(_layout(facts, log), log)
     except OutputError as error:
         raise OutputError(f"cannot read a run from '{path}': {error}") from None
     except FpirhcError as error:

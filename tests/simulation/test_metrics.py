@@ -11,7 +11,7 @@ from helpers.hand_made_runs import CYCLES, SOLVE, problem, run, step
 from helpers.plants import linear
 
 import fpirhc as fp
-from fpirhc.contracts import Signal
+from fpirhc.contracts import Layout, Signal
 from fpirhc.errors import InvalidName, InvalidValue
 
 
@@ -181,6 +181,13 @@ def test_every_run_has_the_same_columns(late):
     assert np.array_equal(result["plant_realised"], result["realised"]) != late
     assert np.array_equal(result["true_error"], result["error"]) != late
     assert result.unit("plant_realised.y") == result.unit("realised.y")
+
+
+def test_a_run_of_an_older_version_gets_its_columns(tmp_path):
+    result = run(np.linspace(1.0, 0.0, CYCLES))
+    old = Layout(tuple(s for s in result.layout.signals if s.name not in ("plant_state", "true_error")))
+    replace(result, layout=old, log=result.log[:, : old.size]).save(tmp_path / "old.npz")
+    np.testing.assert_array_equal(fp.load_run(tmp_path / "old.npz")["true_error"], result["true_error"])
 
 
 def of_solves(plans) -> Any:
