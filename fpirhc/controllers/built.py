@@ -31,8 +31,9 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
+from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.dead_time import every
-from fpirhc.task.problem import Problem, cycles_per_plan
+from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,9 +23,10 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
 from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous
-from fpirhc.task.problem import Problem, cycles_per_plan, cycles_per_stage
+from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
 if TYPE_CHECKING:

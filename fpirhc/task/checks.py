@@ -1,4 +1,4 @@
-"""Whether the parts of a problem fit together: steps of maps, what the plant that moves must have, cost, limits and set-points.
+"""Whether the parts of a problem fit together, and what follows from maps among them.
 
 A map has its own steps in place of an integrator, in the run and along a horizon. A response of a map is a difference of outputs,
 which no sensor shows, so it is taken from the outputs of the last cycles (`StepDifference`); that of an output of order 0 is the
@@ -12,20 +12,33 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fpirhc.errors import InvalidValue, Mistakes
+import casadi as ca
+import numpy as np
+
+from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
+from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost, view_of_symbols
+from fpirhc.horizon.horizon import Horizon
+from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
-from fpirhc.plant.maps import check_time, over
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.maps import check_time, over, response_age
+from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.open import nominal
+from fpirhc.task.exogenous import check_signals, not_held
 from fpirhc.task.limits import Limits
+from fpirhc.task.reference import pairs
 
 if TYPE_CHECKING:
     from fpirhc.task.problem import Problem
+
+_MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
+_INSTANTS = 101  # at which signals from outside are tried before a run
+_SHOWN = 200  # instants at which a reference is compared with the ranges of sensors
+_GAINS: Latest[ca.Function] = Latest(4)
 
 
 def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
@@ -54,7 +67,188 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
     return settled
 
 
-def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
+def check_problem(problem: Problem) -> None:
+    """Raise with all mistakes of a problem; what needs other parts to fit is checked after them."""
+    plant, mistakes = problem.plant, Mistakes("problem")
+    _check_times(problem, mistakes)
+    _check_start(problem, mistakes)
+    mistakes.unknown(f"judged: {followed(plant)}", problem.judged or (), followed_units(plant))
+    times = np.linspace(0.0, problem.duration, _INSTANTS)
+    check_signals(dict.fromkeys((plant, problem.real_plant)), problem.signals, times, mistakes)
+    set_points = {n: one for n, one in problem.reference.set_points.items() if n in plant.chains}
+    steps = {name: [value for _, value in pairs(name, one)] for name, one in set_points.items()}
+    needed = needed_names(plant, problem.sensing, problem.judged)
+    checks = (
+        lambda: _check_disturbances(problem),
+        lambda: problem.limits.check(plant),
+        lambda: check_names(problem.horizon, problem.limits) if problem.horizon else None,
+        lambda: _check_reference(problem),
+        lambda: check_values(plant, problem.limits, steps),
+        lambda: problem.dead_time.check(plant, problem.period),
+        lambda: problem.sensing.check(plant),
+        lambda: problem.reality.check(plant, *needed) if problem.reality else None,
+    )
+    for check in checks:
+        with mistakes.caught():
+            check()
+    mistakes.raise_if_any()
+    _check_maps(plant, problem.real_plant, mistakes)
+    mistakes.raise_if_any()
+    _check_stage(plant, problem.cost, problem.limits, mistakes)
+    _check_inverse(problem, mistakes)
+    smooth = not_held(problem.signals, differentiated_signals(plant))
+    if smooth:
+        mistakes.add(
+            f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state "
+            "it in steps, Samples(times, values), which hold between their times, or choose an output without it"
+        )
+    mistakes.raise_if_any()
+    if problem.reality is not None:
+        problem.reality.check_motion(problem.real_start, problem.inputs_before, problem.real_integrator, problem.period)
+
+
+def _check_times(problem: Problem, mistakes: Mistakes) -> None:
+    unit = problem.time_unit
+    if problem.duration > _MOST_CYCLES * problem.period:
+        mistakes.add(
+            f"a run of {problem.duration:g} s has more than {_MOST_CYCLES:.0e} cycles of {problem.period:g} s; shorten it"
+        )
+    if problem.duration < problem.period:
+        mistakes.add(f"duration {problem.duration} {unit} is shorter than one period of {problem.period} {unit}")
+    if not 0 <= problem.measure_from < problem.duration:
+        mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
+    if problem.horizon is not None:
+        with mistakes.caught():
+            cycles_per_plan(problem.horizon, problem.period, unit)
+
+
+def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
+    """Return how many control cycles one stage of the horizon lasts."""
+    ratio = horizon.step / period
+    if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+        whole = max(1, round(ratio))
+        raise InvalidValue(
+            f"period {period:g} {unit} does not divide the horizon step {horizon.step:g} {unit}; "
+            f"use a step of {whole * period:.12g} {unit} or a period of {horizon.step / whole:.12g} {unit}"
+        )
+    return round(ratio)
+
+
+def cycles_per_plan(horizon: Horizon, period: float, unit: str = "s") -> int:
+    """Return how many control cycles pass from plan to plan."""
+    stage = cycles_per_stage(horizon, period, unit)
+    if isinstance(horizon.replan, str):
+        return stage if horizon.replan == "stage" else 1
+    cycles = horizon.replan
+    if cycles > stage:
+        raise InvalidValue(
+            f"a plan every {cycles} cycles is older than its first stage, which lasts {stage} cycles ({horizon.step:g} {unit}); "
+            f"use Horizon(replan={stage}) or fewer, or longer stages"
+        )
+    return cycles
+
+
+def _check_start(problem: Problem, mistakes: Mistakes) -> None:
+    plant = problem.plant
+    mistakes.unknown("start: state", problem.start, plant.state.elements)
+    for c in plant.names:
+        if c not in problem.start:
+            mistakes.add(f"start: {words(plant)[0]} '{c}' has no first value; add '{c}': ...")
+    for name, value in problem.start.items():
+        low, high = plant.ranges.get(name, (-math.inf, math.inf))
+        if not low <= value <= high:
+            mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")
+    mistakes.unknown("input_before: input", problem.input_before, problem.plant.inputs)
+    for name, value in problem.input_before.items():
+        lower, upper = problem.limits.inputs.get(name, (-math.inf, math.inf))
+        if not math.isfinite(value) or not lower <= value <= upper:
+            mistakes.add(f"input_before: '{name}' must be a finite number within its limits, got {value!r}")
+
+
+def _check_reference(problem: Problem) -> None:
+    """Raise where the reference is wrong, or not finite at the first or the last instant."""
+    function, plant = problem.reference.function(problem.plant), problem.plant
+    names = [*plant.output.elements, *(f"{c}{chr(39) * order}" for c, order in plant.chains.items())]
+    for t in (0.0, problem.duration):
+        values = np.concatenate([np.asarray(part.full()).ravel() for part in function(t)])
+        wrong = [f"{name} is {value:g}" for name, value in zip(names, values, strict=True) if not np.isfinite(value)]
+        if wrong:
+            where = f"reference: at t = {t:g} {problem.time_unit}"
+            raise InvalidProblem(f"{where} {', '.join(wrong)}; give a motion that has these values")
+    shown = {
+        n: s.range for n, s in problem.sensing.sensors.items() if s.range is not None and n in plant.output.elements
+    }
+    if not shown:
+        return
+    along = np.asarray(function.map(_SHOWN)(np.linspace(0.0, problem.duration, _SHOWN)[None, :])[0].full())
+    for name, (low, high) in shown.items():
+        row = along[plant.output.elements.index(name)]
+        if row.min() < low or row.max() > high:
+            raise InvalidProblem(
+                f"sensing: the reference of '{name}' goes from {row.min():.3g} to {row.max():.3g}, but its sensor shows {low:g} to "
+                f"{high:g}, and takes the rest for faults; widen Sensor(range=...), or keep the reference within it"
+            )
+
+
+def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
+    """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
+    plant = problem.plant
+    sets = {"approximate": plant.approximate}
+    sets |= {} if problem.reality else {"exact": plant.exact}  # with a reality these values move nothing
+    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
+        return
+    gain_of = _GAINS.of((plant.equations,), (), lambda: _gain(plant))
+    state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
+    for which, values in sets.items():
+        gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
+        if not np.all(np.isfinite(free)):
+            name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
+            mistakes.add(
+                f"the response of '{name}' ({which} parameters) is not finite at the start ({state}); "
+                "start elsewhere, or change what is divided by zero there"
+            )
+        elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
+            weakest = int(np.argmin(np.linalg.norm(gain, axis=0)))
+            x, u, p = plant.symbols()
+            reached = np.asarray(ca.DM(ca.jacobian_sparsity(plant.equations.rate(x, u, p), u), 1).full())[:, weakest]
+            moved = ", ".join(
+                f"the rate of {e}" for e, moves in zip(plant.state.elements, reached, strict=True) if moves
+            )
+            mistakes.add(
+                f"the response ({which} parameters) is not invertible at the start ({state}): input "
+                f"'{plant.input.elements[weakest]}' has no independent effect there; start elsewhere, give Plant(inverse=...), or "
+                f"control what follows from {moved or 'another input'}. In a switch (if_else, floor, sign) it has no slope: write "
+                "its mean"
+            )
+
+
+def _gain(plant: Plant) -> ca.Function:
+    """Function (state, inputs, parameters) -> (gain of the response, response)."""
+    x, u, p = plant.symbols()
+    response = plant.equations.controlled_response(x, u, p)
+    return ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
+
+
+def _check_disturbances(problem: Problem) -> None:
+    """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
+    mistakes, instants = Mistakes("disturbances"), np.array([0.0, problem.period])
+    what = "input, coordinate or output" if problem.plant.outputs else "input or coordinate"
+    mistakes.unknown(what, problem.disturbances, problem.disturbable)
+    for name, one in problem.disturbances.items():
+        with mistakes.caught(f"'{name}': "):
+            one.values(instants, np.random.default_rng(0))
+    for name, order in problem.disturbed_outputs.items():
+        if response_age(problem.plant) * order > 1:
+            mistakes.add(
+                f"the output '{name}' of a map has relative order {order}, and its differences look ahead to unknown "
+                "disturbances; disturb a state or an input, or an output of order 1"
+            )
+        with mistakes.caught():
+            problem.disturbances[name].derivative(instants, 1)
+    mistakes.raise_if_any()
+
+
+def _check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
     """Add what is not covered beside a map to `mistakes`."""
     instant = model.at_once
     at_once = bool(instant) and set(instant) == set(model.controlled or model.chains)  # no derivative is looked for
@@ -93,7 +287,7 @@ def needed_names(
     return frozenset((*(name.rstrip("'") for name in measured), *(judged or ()), *plant.controlled_names)), measured
 
 
-def check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
+def _check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
     """Add every mistake in the cost's names and weights, and in the user's functions of a stage; problems share what they share."""
     mistakes.join(_STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, nominal(cost), nominal(limits))))
 

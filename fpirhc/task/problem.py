@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
@@ -12,37 +10,27 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
+from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, Finite
-from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import nominal_run
-from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
-from fpirhc.plant.maps import response_age
-from fpirhc.plant.motion import followed, followed_units, with_exact_parameters, words
+from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
-from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Signal
-from fpirhc.task.checks import check_maps, check_stage, check_values, needed_names, settled_maps
+from fpirhc.task.checks import check_problem, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
-from fpirhc.task.exogenous import Exogenous, check_signals, not_held, real_values, rows_of, signals_of
+from fpirhc.task.exogenous import Exogenous, real_values, rows_of, signals_of
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
 from fpirhc.task.reality import Reality
-from fpirhc.task.reference import Reference, pairs
-
-_WHOLE = 1e-6  # cycles by which a duration may miss a whole number of them
-MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
-# Cached properties that depend on the exact parameters.
-_OF_EXACT = ("truth", "real_start", "start_output", "first_shown", "of_equations")
-_INSTANTS = 101  # at which signals from outside are tried before a run
+from fpirhc.task.reference import Reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,45 +93,7 @@ class Problem(Checked):
         for name, value in settled_maps(self, mistakes).items():
             object.__setattr__(self, name, value)
         mistakes.raise_if_any()
-        _check_times(self, mistakes)
-        _check_start(self, mistakes)
-        plant = self.plant
-        _check_input_before(self, mistakes)
-        mistakes.unknown(f"judged: {followed(plant)}", self.judged or (), followed_units(plant))
-        check_signals(
-            dict.fromkeys((plant, self.real_plant)), self.signals, np.linspace(0.0, self.duration, _INSTANTS), mistakes
-        )
-        set_points = {n: one for n, one in self.reference.set_points.items() if n in plant.chains}
-        steps = {name: [value for _, value in pairs(name, one)] for name, one in set_points.items()}
-        checks = (
-            lambda: self._check_disturbances(),
-            lambda: self.limits.check(plant),
-            lambda: check_names(self.horizon, self.limits) if self.horizon else None,
-            lambda: _check_reference(self),
-            lambda: check_values(plant, self.limits, steps),
-            lambda: self.dead_time.check(plant, self.period),
-            lambda: self.sensing.check(plant),
-            lambda: (
-                self.reality.check(plant, *needed_names(plant, self.sensing, self.judged)) if self.reality else None
-            ),
-        )
-        for check in checks:
-            with mistakes.caught():
-                check()
-        mistakes.raise_if_any()
-        check_maps(plant, self.real_plant, mistakes)
-        mistakes.raise_if_any()
-        check_stage(plant, self.cost, self.limits, mistakes)
-        _check_inverse(self, mistakes)
-        smooth = not_held(self.signals, differentiated_signals(plant))
-        if smooth:
-            mistakes.add(
-                f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state "
-                "it in steps, Samples(times, values), which hold between their times, or choose an output without it"
-            )
-        mistakes.raise_if_any()
-        if self.reality is not None:
-            self.reality.check_motion(self.real_start, self.inputs_before, self.real_integrator, self.period)
+        check_problem(self)
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))
@@ -212,21 +162,13 @@ class Problem(Checked):
     def with_exact(self, exact: np.ndarray) -> Problem:
         """Return the problem with other exact parameters of what moves, shape (np,).
 
-        What does not depend on them is shared and not checked again.
-
         Raises:
             InvalidProblem: the plant is not invertible at the start with them, or one of them leaves its bounds.
             NotSupported: an external plant without parameters.
         """
         if self.reality is not None:
             return replace(self, reality=self.reality.with_exact(exact))
-        other, mistakes = copy(self), Mistakes("problem")
-        object.__setattr__(other, "plant", with_exact_parameters(self.plant, exact))
-        for name in _OF_EXACT:
-            other.__dict__.pop(name, None)
-        _check_inverse(other, mistakes, ("exact",))
-        mistakes.raise_if_any()
-        return other
+        return replace(self, plant=with_exact_parameters(self.plant, exact))
 
     @property
     def of_model(self) -> Problem:
@@ -272,24 +214,6 @@ class Problem(Checked):
         plant = self.real_plant
         middle = self.period / 2 / self.signal_steps
         return rows_of(real_values(plant, self.signals), np.array([middle]), plant.exact)[0]
-
-    def _check_disturbances(self) -> None:
-        """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
-        mistakes, instants = Mistakes("disturbances"), np.array([0.0, self.period])
-        what = "input, coordinate or output" if self.plant.outputs else "input or coordinate"
-        mistakes.unknown(what, self.disturbances, self.disturbable)
-        for name, one in self.disturbances.items():
-            with mistakes.caught(f"'{name}': "):
-                one.values(instants, np.random.default_rng(0))
-        for name, order in self.disturbed_outputs.items():
-            if response_age(self.plant) * order > 1:
-                mistakes.add(
-                    f"the output '{name}' of a map has relative order {order}, and its differences look ahead to unknown "
-                    "disturbances; disturb a state or an input, or an output of order 1"
-                )
-            with mistakes.caught():
-                self.disturbances[name].derivative(instants, 1)
-        mistakes.raise_if_any()
 
     @property
     def disturbable(self) -> tuple[str, ...]:
@@ -388,136 +312,6 @@ class Problem(Checked):
     def warm_up_cycles(self) -> float:
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
         return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
-
-
-def _check_times(problem: Problem, mistakes: Mistakes) -> None:
-    unit = problem.time_unit
-    if problem.duration > MOST_CYCLES * problem.period:
-        mistakes.add(
-            f"a run of {problem.duration:g} s has more than {MOST_CYCLES:.0e} cycles of {problem.period:g} s; shorten it"
-        )
-    if problem.duration < problem.period:
-        mistakes.add(f"duration {problem.duration} {unit} is shorter than one period of {problem.period} {unit}")
-    if not 0 <= problem.measure_from < problem.duration:
-        mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
-    if problem.horizon is not None:
-        with mistakes.caught():
-            cycles_per_plan(problem.horizon, problem.period, unit)
-
-
-def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:
-    """Return how many control cycles one stage of the horizon lasts."""
-    ratio = horizon.step / period
-    if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-6 * ratio:
-        whole = max(1, round(ratio))
-        raise InvalidValue(
-            f"period {period:g} {unit} does not divide the horizon step {horizon.step:g} {unit}; "
-            f"use a step of {whole * period:.12g} {unit} or a period of {horizon.step / whole:.12g} {unit}"
-        )
-    return round(ratio)
-
-
-def cycles_per_plan(horizon: Horizon, period: float, unit: str = "s") -> int:
-    """Return how many control cycles pass from plan to plan."""
-    stage = cycles_per_stage(horizon, period, unit)
-    if isinstance(horizon.replan, str):
-        return stage if horizon.replan == "stage" else 1
-    cycles = horizon.replan
-    if cycles > stage:
-        raise InvalidValue(
-            f"a plan every {cycles} cycles is older than its first stage, which lasts {stage} cycles ({horizon.step:g} {unit}); "
-            f"use Horizon(replan={stage}) or fewer, or longer stages"
-        )
-    return cycles
-
-
-def _check_start(problem: Problem, mistakes: Mistakes) -> None:
-    plant = problem.plant
-    mistakes.unknown("start: state", problem.start, plant.state.elements)
-    for c in plant.names:
-        if c not in problem.start:
-            mistakes.add(f"start: {words(plant)[0]} '{c}' has no first value; add '{c}': ...")
-    for name, value in problem.start.items():
-        low, high = plant.ranges.get(name, (-math.inf, math.inf))
-        if not low <= value <= high:
-            mistakes.add(f"start: '{name}' is {value:g}, outside its physical range of {low:g} to {high:g}")
-
-
-def _check_input_before(problem: Problem, mistakes: Mistakes) -> None:
-    mistakes.unknown("input_before: input", problem.input_before, problem.plant.inputs)
-    for name, value in problem.input_before.items():
-        lower, upper = problem.limits.inputs.get(name, (-math.inf, math.inf))
-        if not math.isfinite(value) or not lower <= value <= upper:
-            mistakes.add(f"input_before: '{name}' must be a finite number within its limits, got {value!r}")
-
-
-_GAINS: Latest[ca.Function] = Latest(4)
-_SHOWN = 200  # instants at which a reference is compared with the ranges of sensors
-
-
-def _check_reference(problem: Problem) -> None:
-    """Raise where the reference is wrong, or not finite at the first or the last instant."""
-    function, plant = problem.reference.function(problem.plant), problem.plant
-    names = [*plant.output.elements, *(f"{c}{chr(39) * order}" for c, order in plant.chains.items())]
-    for t in (0.0, problem.duration):
-        values = np.concatenate([np.asarray(part.full()).ravel() for part in function(t)])
-        wrong = [f"{name} is {value:g}" for name, value in zip(names, values, strict=True) if not np.isfinite(value)]
-        if wrong:
-            where = f"reference: at t = {t:g} {problem.time_unit}"
-            raise InvalidProblem(f"{where} {', '.join(wrong)}; give a motion that has these values")
-    shown = {
-        n: s.range for n, s in problem.sensing.sensors.items() if s.range is not None and n in plant.output.elements
-    }
-    if not shown:
-        return
-    followed = np.asarray(function.map(_SHOWN)(np.linspace(0.0, problem.duration, _SHOWN)[None, :])[0].full())
-    for name, (low, high) in shown.items():
-        row = followed[plant.output.elements.index(name)]
-        if row.min() < low or row.max() > high:
-            raise InvalidProblem(
-                f"sensing: the reference of '{name}' goes from {row.min():.3g} to {row.max():.3g}, but its sensor shows {low:g} to "
-                f"{high:g}, and takes the rest for faults; widen Sensor(range=...), or keep the reference within it"
-            )
-
-
-def _check_inverse(problem: Problem, mistakes: Mistakes, asked: Sequence[str] = ("approximate", "exact")) -> None:
-    """Add a mistake where the response is not finite at the start, or cannot be solved for the inputs there."""
-    plant = problem.plant
-    known = {"approximate": plant.approximate}
-    known |= {} if problem.reality else {"exact": plant.exact}  # with a reality these values move nothing
-    sets = [(which, known[which]) for which in asked if which in known]
-    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
-        return
-    gain_of = _GAINS.of((plant.equations,), (), lambda: _gain(plant))
-    state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
-    for which, values in sets:
-        gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
-        if not np.all(np.isfinite(free)):
-            name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
-            mistakes.add(
-                f"the response of '{name}' ({which} parameters) is not finite at the start ({state}); "
-                "start elsewhere, or change what is divided by zero there"
-            )
-        elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
-            weakest = int(np.argmin(np.linalg.norm(gain, axis=0)))
-            x, u, p = plant.symbols()
-            reached = np.asarray(ca.DM(ca.jacobian_sparsity(plant.equations.rate(x, u, p), u), 1).full())[:, weakest]
-            moved = ", ".join(
-                f"the rate of {e}" for e, moves in zip(plant.state.elements, reached, strict=True) if moves
-            )
-            mistakes.add(
-                f"the response ({which} parameters) is not invertible at the start ({state}): input "
-                f"'{plant.input.elements[weakest]}' has no independent effect there; start elsewhere, give Plant(inverse=...), or "
-                f"control what follows from {moved or 'another input'}. In a switch (if_else, floor, sign) it has no slope: write "
-                "its mean"
-            )
-
-
-def _gain(plant: Plant) -> ca.Function:
-    """Function (state, inputs, parameters) -> (gain of the response, response)."""
-    x, u, p = plant.symbols()
-    response = plant.equations.controlled_response(x, u, p)
-    return ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
 
 
 def problem_facts(problem: Problem) -> tuple[str, ...]:
