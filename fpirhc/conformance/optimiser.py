@@ -23,7 +23,7 @@ from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
-from fpirhc.task.exogenous import previewed_values
+from fpirhc.task.exogenous import model_values
 from fpirhc.task.limits import Limits
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Trajectory
@@ -50,7 +50,7 @@ def posed(problem: Problem, *, time: float = 0.0, parameters: Array | None = Non
     horizon, cost = problem.horizon, problem.cost
     if horizon is None or cost is None:
         raise InvalidProblem("nothing is planned without a horizon and a cost: give the problem both")
-    plant, ahead = problem.plant, previewed_values(problem.plant, problem.signals)
+    plant, ahead = problem.plant, model_values(problem.plant, problem.signals)
     ocp = transcribe(plant, problem.reference, horizon, cost, problem.limits, ahead, problem.start_state)
     data = ocp.data_of()(time, plant.approximate if parameters is None else parameters)
     return ocp, np.asarray(ocp.start(problem.start_state, problem.inputs_before).full()).ravel(), data.full()

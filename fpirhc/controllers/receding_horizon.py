@@ -37,7 +37,7 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, like, scalar
 from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
-from fpirhc.task.exogenous import previewed_values
+from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
@@ -125,7 +125,7 @@ def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
         raise not_live(live, f"the code of the optimiser is computed from it while the loop is built; {ANEW}", " here")
     assert problem.horizon is not None
     assert problem.cost is not None
-    ahead, limits, start = previewed_values(problem.plant, problem.signals), problem.limits, problem.start_state
+    ahead, limits, start = model_values(problem.plant, problem.signals), problem.limits, problem.start_state
     return transcribe(problem.plant, problem.reference, problem.horizon, problem.cost, limits, ahead, start)
 
 

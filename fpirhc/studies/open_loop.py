@@ -26,7 +26,7 @@ from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.summary import line, number, table
-from fpirhc.task.exogenous import previewed_values
+from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
@@ -282,7 +282,7 @@ def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[s
             for some in alike.values()
         }
     plant, limits, start = problem.plant, problem.limits, problem.start_state
-    ahead = previewed_values(plant, problem.signals)
+    ahead = model_values(plant, problem.signals)
     solved = []
     for label, (optimiser, cost) in wanted.items():
         if cost is None:

@@ -30,22 +30,18 @@ class Exogenous(Checked):
     """What acts on the plant, and how much of it the model is told: `Known` or `Unknown`."""
 
     values: Course
-    preview: bool = False  # whether a horizon has the values of the future; else that of the cycle is held along it
-    told: ClassVar[bool]  # whether the model has the values; else it goes on with the nominal one
+    told: ClassVar[bool]  # whether the model has the values, also of the future; else it goes on with the nominal one
 
 
 @dataclass(frozen=True, eq=False)
 class Known(Exogenous):
-    """A signal that the model has as it is.
+    """A signal that the model has as it is, also along a horizon, as from a schedule or a forecast.
 
     Args:
         values: `Samples`, a function of time that returns an expression, or a number.
-        preview: whether the future is known too, as from a schedule or a forecast; False: only the value of the cycle, as from a
-            sensor.
     """
 
     values: Course
-    preview: bool = True
     told = True
 
 
@@ -72,13 +68,8 @@ def real_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function |
 
 
 def model_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function | None:
-    """Function (time, parameters) -> parameters with what the model is told at this time; None where it is told nothing."""
+    """Function (time, parameters) -> parameters with what the model is told of a time; None where it is told nothing."""
     return real_values(plant, {name: one for name, one in signals.items() if one.told})
-
-
-def previewed_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function | None:
-    """Function (time, parameters) -> parameters with what the model is told of a later time; None where it is told nothing."""
-    return model_values(plant, {name: one for name, one in signals.items() if one.preview})
 
 
 def known_places(plant: Plant, signals: Mapping[str, Exogenous]) -> tuple[int, ...]:

@@ -126,30 +126,24 @@ class Setpoint(Reference):
     """A motion towards set-points: Setpoint({"q1": 0.2, "q2": [(0.0, 1.0), (2.0, 1.5)]}, rate=10.0).
 
     Args:
-        values: set-points by coordinate: a number, or pairs (time, set-point), each in force from its time on. A run may be given
-            others (`simulate(..., setpoints=...)`, `Stepper.step(..., setpoints=...)`); what is decided before a run follows these,
-            and a horizon knows none before its time.
+        values: set-points by coordinate: a number, or pairs (time, set-point), each in force from its time on. The filter begins at
+            the first one, at rest. A run may be given others (`simulate(..., setpoints=...)`, `Stepper.step(..., setpoints=...)`);
+            what is decided before a run follows these, and a horizon knows none before its time.
         rate: a, the rate of the filter, per unit of time.
         order: m of every coordinate, at least the plant's order; None: the plant's order. With the plant's order the response jumps
             by a^m (w_new - w_old) at a change, with one more it is continuous.
-        start: where the filter begins, at rest, by coordinate; the others begin at their first set-point.
 
     Raises:
         InvalidValue: values that are no steps.
-        InvalidProblem: a start of a coordinate without set-point.
     """
 
     values: Mapping[str, Steps]
     rate: Positive = field(metadata={"structure": True})
     order: Count | None = None
-    start: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name, steps in self.values.items():
             pairs(name, steps)
-        mistakes = Mistakes("Setpoint")
-        mistakes.unknown("start: coordinate", self.start, self.values)
-        mistakes.raise_if_any()
 
     def coordinates(self, t: Expression) -> NoReturn:  # noqa: ARG002
         raise NotSupported(
@@ -165,7 +159,8 @@ class Setpoint(Reference):
         self._check_names(plant)
         t, chains = ca.SX.sym("t"), {}
         for name, order in self._orders(plant).items():
-            held, z = ca.SX(self._rest(name)), ca.SX(ca.DM([self._rest(name), *[0.0] * (order - 1)]))
+            rest = self._first(name)
+            held, z = ca.SX(rest), ca.SX(ca.DM([rest, *[0.0] * (order - 1)]))
             for time, change in self._changes(name):
                 rising = _transition(self.rate, ca.fmax(t - time, 0), order)[:, 0]
                 z = z + change * (ca.DM(np.eye(order)[:, 0]) - rising)
@@ -174,7 +169,7 @@ class Setpoint(Reference):
         return ca.Function("fpirhc_reference", [t], list(_arranged(plant, chains)), ["t"], ["state", "response"])
 
     def given(self, plant: Plant) -> tuple[Signal, ...]:
-        first = tuple(pairs(name, self.values[name])[0][1] for name in plant.chains)
+        first = tuple(map(self._first, plant.chains))
         return (Signal(_GIVEN, tuple(plant.chains), plant.output.units[: len(first)], start=first),)
 
     def own(self, plant: Plant) -> tuple[Signal, ...]:
@@ -183,7 +178,7 @@ class Setpoint(Reference):
 
     def block(self, plant: Plant, period: float) -> Block:
         (given,), (own,), elements = self.given(plant), self.own(plant), self._elements(plant)
-        motion, rest = self.motion_now(plant), {name: self._rest(name) for name in plant.chains}
+        motion, rest = self.motion_now(plant), {name: self._first(name) for name in plant.chains}
 
         def step(s: Signals) -> dict[str, Expression]:
             z, points = getattr(s, _FILTER), getattr(s, _GIVEN)
@@ -270,15 +265,14 @@ class Setpoint(Reference):
     def _orders(self, plant: Plant) -> dict[str, int]:
         return {c: self.order or r for c, r in plant.chains.items()}
 
-    def _rest(self, name: str) -> float:
+    def _first(self, name: str) -> float:
         """Where the filter of a coordinate begins."""
-        return float(self.start.get(name, pairs(name, self.values[name])[0][1]))
+        return pairs(name, self.values[name])[0][1]
 
     def _changes(self, name: str) -> list[tuple[float, float]]:
         """Times and sizes of the changes of one set-point."""
         steps = pairs(name, self.values[name])
-        before = [self._rest(name), *(value for _, value in steps[:-1])]
-        return [(time, value - old) for (time, value), old in zip(steps, before, strict=True) if value != old]
+        return [(time, value - old) for (_, old), (time, value) in pairwise(steps) if value != old]
 
     def _check_names(self, plant: Plant) -> None:
         mistakes = Mistakes("reference")

@@ -49,8 +49,8 @@ def closed_form(rate, order, starts, steps):
 @pytest.mark.parametrize("order", [2, 3])
 def test_nominal_motion_is_the_closed_form(order):
     """What is judged before a run is the closed form with its derivatives by differentiation."""
-    steps = {"y": [(0.0, 1.0), (0.5, -0.5), (1.25, 2.0)]}
-    ours = fp.Setpoint(steps, rate=4.0, order=order, start={"y": 0.3}).function(chain(2))
+    steps = {"y": [(0.0, 0.3), (0.1, 1.0), (0.5, -0.5), (1.25, 2.0)]}
+    ours = fp.Setpoint(steps, rate=4.0, order=order).function(chain(2))
     expected = closed_form(4.0, order, {"y": 0.3}, steps).function(chain(2))
     for t in (0.0, 0.2, 0.7, 1.5, 4.0):
         for result, value in zip(ours(t), expected(t), strict=True):
@@ -63,19 +63,19 @@ SHIPPED = {
     "cart_pole": ({"cart": 0.2, "angle": 0.0}, 2),
     "cart_pole_slots": ({"cart": -0.05, "angle": 0.0}, 4),
 }
-LONG = ("RHC, absolute effort", "RHC+FPI, absolute effort", "RHC, stiff", "RHC+FPI, stiff, small S")
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(name):
-    """The same motion as a trajectory: only rounding differs."""
+    """The same motion as a trajectory: only rounding differs. A horizon would know the trajectory ahead."""
     task, (aims, order) = getattr(tasks, name), SHIPPED[name]
     problem = task.problem
     starts = {c: float(problem.start.get(c, 0.0)) for c in problem.plant.names}
     rate = 8.0
-    ours = on(problem, fp.Setpoint(aims, rate=rate, order=order, start=starts), 0.2)
-    theirs = on(problem, closed_form(rate, order, starts, {c: [(0.0, w)] for c, w in aims.items()}), 0.2)
-    for controller in (one for label, one in task.controllers.items() if label not in LONG):
+    steps = {c: [(0.0, starts[c]), (problem.period, w)] for c, w in aims.items()}
+    ours = on(problem, fp.Setpoint(steps, rate=rate, order=order), 0.2)
+    theirs = on(problem, closed_form(rate, order, starts, steps), 0.2)
+    for controller in (one for one in task.controllers.values() if one.planner is None):
         runs = [fp.simulate(p, controller, seed=0, compiled=False) for p in (ours, theirs)]
         assert runs[0].cycles == runs[1].cycles > 0
         states = [run["plant_state"] for run in runs]
@@ -85,8 +85,6 @@ def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(na
         np.testing.assert_allclose(
             runs[0]["reference"], runs[1]["reference"], rtol=0, atol=1e-12, err_msg=repr(controller)
         )
-        if "cost" in runs[0].layout:
-            np.testing.assert_allclose(runs[0]["cost"], runs[1]["cost"], rtol=1e-6, atol=1e-9, err_msg=repr(controller))
 
 
 @pytest.mark.parametrize("controller", ["CTC", "CTC+FPI (eq 6)"])
@@ -169,8 +167,6 @@ def test_bad_references():
     ):
         with pytest.raises(InvalidProblem, match=words):
             two_mass(**changes)
-    with pytest.raises(InvalidProblem, match="start: coordinate 'q5' is unknown"):
-        fp.Setpoint(STEPS, rate=1.0, start={"q5": 0.0})
     limited = replace(tasks.two_mass.problem.limits, states={"q1": (2.0, 2.3)})
     with pytest.raises(InvalidProblem, match=r"'q1' is 2\.4, outside its limits of 2 to 2\.3"):
         replace(two_mass(), limits=limited)
@@ -208,9 +204,11 @@ def test_run_and_file_record_what_was_in_force(tmp_path):
 def test_a_slot_has_the_filter_of_its_chain():
     """Of rate a and order r a filter at rest begins with y^(r) = a^r (w - y): r = 2 for the lower tank, 1 for the upper one."""
     task, rate = fp.load_problem("two_tanks_slots"), 0.05
-    reference = fp.Setpoint({"h1": 2.5, "h2": 3.6}, rate=rate, start={"h1": 5.0, "h2": 5.0})
+    reference = fp.Setpoint(
+        {n: [(0.0, 5.0), (task.problem.period, w)] for n, w in (("h1", 2.5), ("h2", 3.6))}, rate=rate
+    )
     run = fp.simulate(on(task.problem, reference, 1.0), task.controllers["slots"], seed=0, compiled=False)
-    assert [run[f"nominal.{name}"][0] for name in ("h2", "h1")] == pytest.approx([rate**2 * -1.4, rate * -2.5])
+    assert [run[f"nominal.{name}"][1] for name in ("h2", "h1")] == pytest.approx([rate**2 * -1.4, rate * -2.5])
 
 
 def test_predicted_says_that_set_points_are_late():
