@@ -66,7 +66,7 @@ class Form:
     @property
     def pairs(self) -> bool:
         """Whether it says itself to which request a response belongs."""
-        return self.compares != "request" or self.late > 0
+        return self.compares != "request" or bool(self.late)
 
     @property
     def channels(self) -> int | None:

@@ -49,6 +49,7 @@ def test_without_a_leak_one_cycle_is_too_much():
     for cycles, same in ((30, 3), (20, 2), (1, 1), (0, 0)):  # a tenth of 30 is a little more than 3 in floating point
         assert first_step(cycles, None) == first_step(cycles, same)
     assert first_step(20, None) < first_step(1, None) < first_step(0, None) == 1.0
+    assert first_step(200, 100) == pytest.approx((1 - least_pole(1.0, 100)) / 2)  # however wrong, below one
     assert iteration_radius(fp.Increment(affine(1.0), cycles=20, uncertainty=0), 21) > 1
     # The bound is tight for one cycle: a pole 1 % below it leaves some dead time unstable.
     pole = 0.99 * least_pole(1.0, 1)

@@ -132,7 +132,6 @@ def test_facts_of_the_rotation():
     assert one.effective_gain() == 0.4
     assert one.secant_gain() == pytest.approx(0.4 * 2 * math.pi / (3 * math.sqrt(3)))
     assert one.with_effective_gain(0.3) == fp.Rotation(fraction=0.3, radius=10.0)
-    assert fp.Rotation(fraction=0.4, radius=0.5).radius == 0.5
     for wrong in ({"fraction": 0.0}, {"radius": 0.0}, {"radius": -1.0}, {"radius": math.inf}):
         with pytest.raises(InvalidValue, match="expected"):
             fp.Rotation(**{"fraction": 0.4, "radius": 1.0, **wrong})

@@ -81,7 +81,7 @@ def factors_of(tuned, noise):
 def test_the_tuner_is_its_rule_in_numpy(components):
     """Growing errors, two-cycles, and noise around them; the mean sign of white noise is that of scipy's beta function."""
     random, target, cap, half = np.random.default_rng(components), 0.5, 1.3, components / 2
-    swing = np.concatenate([np.cumprod(random.uniform(0.9, g, 60)) for g in (1.15, 1.3, 1.02)] + [np.ones(60)])
+    swing = np.concatenate([np.cumprod(random.uniform(0.9, g, 60)) for g in (2.5, 1.15, 1.3, 1.02)] + [np.ones(60)])
     noise = random.choice([0.0, 0.1, 3.0], len(swing)) * random.standard_normal((components, len(swing)))
     noise = np.tile(noise + swing * (-1) ** np.arange(len(swing)), 4)
     noise = np.hstack([np.cumsum(np.ones((components, 60)), axis=1), noise])  # a ramp first
@@ -153,7 +153,7 @@ def denoised(errors: np.ndarray, **settings: Any) -> np.ndarray:
 def test_a_denoiser_passes_jumps_at_once_and_averages_what_is_small():
     """A jump beyond the noise is whole; what is small is numpy's moving average over 2^J samples."""
     jump = np.concatenate([np.zeros(20), np.full(60, 7.0)])
-    np.testing.assert_allclose(denoised(jump, noise=0.1), jump, atol=1e-12)
+    np.testing.assert_allclose(denoised(jump, noise=7 / 13), jump, atol=1e-12)  # 3 2^(J/2) times and more
     errors = 0.01 * np.random.default_rng(1).normal(size=200)
     mean = np.convolve(errors, np.full(8, 1 / 8))[:200]
     np.testing.assert_allclose(denoised(errors, noise=1.0, levels=3), mean, atol=1e-15)
