@@ -52,11 +52,11 @@ def check_controller(
         compiled: whether to compare with compiled C too, which costs a second or more the first time; skipped without a
             compiler.
     """
-    keep(Trial(controller, problem or two_masses(), seed, left, compiled), seed)
+    keep(_Trial(controller, problem or two_masses(), seed, left, compiled), seed)
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class _Trial:
     """A controller on a problem."""
 
     controller: Controller
@@ -72,12 +72,10 @@ class Trial:
 
     @cached_property
     def run(self) -> Run:
-        """The closed loop with the wrong model."""
         return self.moved(self.problem)
 
     @cached_property
     def replay(self) -> Replay:
-        """The controller, given the motion of `run`."""
         return Replay(self.problem, self.controller, self.run)
 
     @property
@@ -99,7 +97,7 @@ class Trial:
         return Replay(self.problem, other, self.run)
 
 
-def exact_parameters_are_unknown(trial: Trial, draw: Draw) -> Broken:
+def exact_parameters_are_unknown(trial: _Trial, draw: Draw) -> Broken:
     """The command does not depend on the exact parameters, which nobody knows of a real plant, unless `plant_model` says so."""
     plant = trial.problem.plant
     if trial.controller.plant_model(trial.problem).exact or not plant.parameters:
@@ -115,7 +113,7 @@ def exact_parameters_are_unknown(trial: Trial, draw: Draw) -> Broken:
         )
 
 
-def deformation_acts(trial: Trial, draw: Draw) -> Broken:
+def deformation_acts(trial: _Trial, draw: Draw) -> Broken:
     """A weaker deformation gives other commands, and where `deforms` is "response" 'deformed' is its map of 'desired'."""
     gain = 0.5 * trial.ready.deformation.effective_gain()
     weaker = trial.with_deformation(Affine(gain=-2 * gain)) if trial.ready.deformation.adapts else None
@@ -143,7 +141,7 @@ def deformation_acts(trial: Trial, draw: Draw) -> Broken:
         )
 
 
-def learning_remembers(trial: Trial, draw: Draw) -> Broken:
+def learning_remembers(trial: _Trial, draw: Draw) -> Broken:
     """A controller that `learns` commands otherwise later: without its deformation, for the same measurement."""
     if not trial.controller.learns:
         return
@@ -157,7 +155,7 @@ def learning_remembers(trial: Trial, draw: Draw) -> Broken:
         )
 
 
-def model_is_of_the_plant(trial: Trial, draw: Draw) -> Broken:
+def model_is_of_the_plant(trial: _Trial, draw: Draw) -> Broken:
     """The parameters of its `plant_model` have the exact values of the plant that a run moves, or of the problem's."""
     plants = (trial.problem.plant, trial.problem.real_plant)
     for name, one in trial.controller.plant_model(trial.problem).plant.parameters.items():
@@ -167,7 +165,7 @@ def model_is_of_the_plant(trial: Trial, draw: Draw) -> Broken:
             yield f"{words}: results would be compared with a plant that is not there"
 
 
-def law_is_what_it_does(trial: Trial, draw: Draw) -> Broken:
+def law_is_what_it_does(trial: _Trial, draw: Draw) -> Broken:
     """Near the reference it feeds the error back with the gains of its `tracking` law, from which reviews read its speed."""
     law, output, replay, k = tracking_law(trial.ready), trial.problem.plant.output, trial.replay, trial.begun
     if law is None or trial.ready.planner is not None or trial.ready.inner is not None:
@@ -187,7 +185,7 @@ def law_is_what_it_does(trial: Trial, draw: Draw) -> Broken:
 
 
 @without_warning()
-def _moved(problem: Problem, trial: Trial) -> tuple[Run | None, str]:
+def _moved(problem: Problem, trial: _Trial) -> tuple[Run | None, str]:
     """A run on another problem, None where the controller refuses it for a reason of its own; what it raises where it does not."""
     try:
         return trial.moved(problem), ""
@@ -197,7 +195,7 @@ def _moved(problem: Problem, trial: Trial) -> tuple[Run | None, str]:
         return None, " ".join(str(error).split()) or type(error).__name__
 
 
-def what_it_takes_it_controls(trial: Trial, draw: Draw) -> Broken:
+def what_it_takes_it_controls(trial: _Trial, draw: Draw) -> Broken:
     """A plant with outputs of its states, or a map in coarse steps, known exactly, it refuses, or does not drive away."""
     cures = {
         "a plant with outputs": (by_states(), "read plant.output and not plant.state for what follows the reference"),
@@ -215,7 +213,7 @@ def what_it_takes_it_controls(trial: Trial, draw: Draw) -> Broken:
                 yield f"{words}; {cure}, or raise NotSupported in check() with the reason"
 
 
-def facts_hold(trial: Trial, draw: Draw) -> Broken:
+def facts_hold(trial: _Trial, draw: Draw) -> Broken:
     """Notes are sentences, no automatic setting is left, a planner plans, and what is inside can be exchanged."""
     ready, notes = trial.ready, trial.ready.notes(trial.problem)
     if not isinstance(notes, tuple) or not all(isinstance(one, str) and one.strip() for one in notes):
@@ -230,7 +228,7 @@ def facts_hold(trial: Trial, draw: Draw) -> Broken:
         yield "around its own inner controller, or with its own optimiser, it has another description"
 
 
-def exact_model_tracks(trial: Trial, draw: Draw) -> Broken:
+def exact_model_tracks(trial: _Trial, draw: Draw) -> Broken:
     """With an exact model, ideal sensors and no disturbance, the error of every judged coordinate goes to zero."""
     plant, signals = trial.problem.plant, really_known(trial.problem.signals)
     plant = replace(plant, parameters={n: replace(p, approximate=p.exact) for n, p in plant.parameters.items()})
@@ -246,7 +244,7 @@ def exact_model_tracks(trial: Trial, draw: Draw) -> Broken:
 
 
 @without_warning()
-def _commands(trial: Trial, *, compiled: bool) -> Array:
+def _commands(trial: _Trial, *, compiled: bool) -> Array:
     """Commands of a Stepper of an equal controller that is given what the run measured."""
     stepper = Stepper(trial.problem, copy(trial.controller), compiled=compiled, bounded=False)
     memory, commands = stepper.start(), []
@@ -256,10 +254,10 @@ def _commands(trial: Trial, *, compiled: bool) -> Array:
     return np.array(commands)
 
 
-def same_command_everywhere(trial: Trial, draw: Draw) -> Broken:
-    """The loop, Steppers of equal controllers, and compiled C, give the same command for the same measurements."""
+def same_command_everywhere(trial: _Trial, draw: Draw) -> Broken:
+    """The loop, a Stepper of an equal controller, and its compiled C give the same command for the same measurements."""
     own = trial.run["command"][:REPLAYED]
-    for compiled in (False, False, True)[: 2 + trial.compiled]:
+    for compiled in (False, True)[: 1 + trial.compiled]:
         its = _commands(trial, compiled=compiled)
         missed = np.abs(its - own[: len(its)]).max(axis=1)
         k = int(np.argmax(np.nan_to_num(missed, nan=np.inf)))
@@ -268,7 +266,7 @@ def same_command_everywhere(trial: Trial, draw: Draw) -> Broken:
             yield f"in cycle {k} the loop's command is {own[k]}, from {what} it is {its[k]}"
 
 
-def command_keeps_the_limits(trial: Trial, draw: Draw) -> Broken:
+def command_keeps_the_limits(trial: _Trial, draw: Draw) -> Broken:
     """No command leaves the limits of the inputs, also where they are half of the commands without limits."""
     plant, commands = trial.problem.plant, trial.run["command"]
     middle, most = 0.5 * (commands.max(axis=0) + commands.min(axis=0)), 0.5 * np.ptp(commands, axis=0)
@@ -285,7 +283,7 @@ def command_keeps_the_limits(trial: Trial, draw: Draw) -> Broken:
             yield f"{words}, outside ({lower[j]:g}, {upper[j]:g})"
 
 
-def bad_measurement_never_acts(trial: Trial, draw: Draw) -> Broken:
+def bad_measurement_never_acts(trial: _Trial, draw: Draw) -> Broken:
     """A measurement that is not finite gives a finite command within the limits and a status, and does no lasting harm."""
     for bad in (np.nan, np.inf):
         for k, name in enumerate(trial.problem.plant.state.elements):
@@ -293,7 +291,7 @@ def bad_measurement_never_acts(trial: Trial, draw: Draw) -> Broken:
         yield from _measured_once(trial, bad, None, f"a response measured as {bad} in cycle {_STEPS}")
 
 
-def _measured_once(trial: Trial, bad: float, entry: int | None, what: str) -> Broken:
+def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> Broken:
     """Replay a run with one bad value in one cycle: of an entry of the state, or (None) of the whole response."""
     run, lower, upper = trial.run, *trial.problem.limits.input_bounds(trial.problem.plant)
     # A stepper's gate keeps bad samples away; the controller itself must survive them too, inside of another one.

@@ -38,16 +38,6 @@ def check_observer(observer: StateObserver, *, seed: int, problem: Problem | Non
     keep(_Trial(observer, replace(task, sensing=believed)), seed)
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """Numbers of a cycle's evidence."""
-
-    measured: Array  # what the sensors show, in the order of the model's names
-    command: Array  # that acted
-    moves: float = 1.0  # 1, or 0 where the sample still shows the start
-    counts: float = 1.0  # 1, or 0 for a sample from before the run
-
-
 @dataclass(frozen=True, eq=False)
 class _Trial:
     """An observer on a problem, as (sample, memory) -> (estimated state, memory)."""
@@ -60,20 +50,18 @@ class _Trial:
         """What the observer is built from."""
         return observed_model(self.problem)
 
-    def step(
-        self, sample: _Sample, memory: Array | None = None, parameters: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Estimated state and next memory; from the start, and with the approximate parameters, where none are given."""
+    def step(self, measured: Array, command: Array, memory: Array | None = None, **given: Any) -> tuple[Array, Array]:
+        """Estimated state and next memory, from the start where no memory is given; `given`: parameters, moves, counts."""
         before = self.observer.memory(self.model).start() if memory is None else memory
-        known = self.problem.plant.approximate if parameters is None else parameters
-        numbers = self.evaluator(sample.measured, sample.command, known, sample.moves, sample.counts, before)
+        known: dict[str, Any] = {"parameters": self.problem.plant.approximate, "moves": 1.0, "counts": 1.0} | given
+        numbers = self.evaluator(measured, command, *known.values(), before)
         return numbers[0].copy(), numbers[1].copy()
 
-    def sample(self, draw: Draw, **changes: Any) -> _Sample:
-        """Any sample, near the start."""
+    def sample(self, draw: Draw) -> dict[str, Array]:
+        """What is measured, near the start, and a command."""
         start, inputs = self.problem.start_state, self.problem.plant.input.size
         state = start + 0.1 * draw.normal(size=start.size)
-        return replace(_Sample(self.seen(state, np.zeros(inputs)) + 0.1, draw.normal(size=inputs)), **changes)
+        return {"measured": self.seen(state, np.zeros(inputs)) + 0.1, "command": draw.normal(size=inputs)}
 
     def errors(self, places: list[int], size: float) -> Array:
         """Largest error of these states after every sample of a free motion that starts off by `size`; the model is exact."""
@@ -83,9 +71,8 @@ class _Trial:
         for k in range(_LONG):
             if k:
                 state = np.asarray(self.model.move(state, command, plant.exact, calm, 1.0).full())[:, 0]
-            estimated, memory = self.step(
-                _Sample(self.seen(state, command), command, float(k > 0)), memory, plant.exact
-            )
+            seen, exact = self.seen(state, command), dict[str, Any](parameters=plant.exact, moves=float(k > 0))
+            estimated, memory = self.step(seen, command, memory, **exact)
             errors.append(float(np.abs((estimated - state)[places]).max()))
         return np.array(errors)
 
@@ -117,7 +104,7 @@ def exact_parameters_are_unknown(trial: _Trial, draw: Draw) -> Broken:
     plant = trial.problem.plant
     problem = replace(trial.problem, plant=with_exact_parameters(plant, _OTHER * plant.exact))
     sample = trial.sample(draw)
-    answers = (one.step(sample) for one in (trial, replace(trial, problem=problem)))
+    answers = (one.step(**sample) for one in (trial, replace(trial, problem=problem)))
     if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(*answers, strict=True)):
         yield f"with exact parameters {_OTHER - 1:.0%} larger, and equal evidence, the estimate differs; use evidence.parameters"
 
@@ -126,9 +113,9 @@ def old_samples_do_nothing(trial: _Trial, draw: Draw) -> Broken:
     """A sample from before the run, which a dead time shows again, corrects (`counts` = 0) and moves (`moves` = 0) nothing."""
     cures = ("counts", "measured", "select with if_else"), ("moves", "command", "move by evidence.moves")
     for fact, what, cure in cures:
-        sample = trial.sample(draw, **{fact: 0.0})
-        other = replace(sample, **{what: getattr(sample, what) + 1.0})
-        change = float(np.abs(trial.step(sample)[0] - trial.step(other)[0]).max())
+        sample, old = trial.sample(draw), dict[str, Any]({fact: 0.0})
+        other = sample | {what: sample[what] + 1.0}
+        change = float(np.abs(trial.step(**sample, **old)[0] - trial.step(**other, **old)[0]).max())
         if change != 0:
             yield f"with {fact} = 0 a {what} that is larger by 1 changes the estimated state by {change:.3g}; {cure}"
 

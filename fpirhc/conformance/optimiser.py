@@ -76,7 +76,7 @@ def check_optimiser(
     Args:
         tolerance: stationarity, in the unit of the inputs, below which it calls a plan OK.
     """
-    keep(Trial(optimiser, tolerance), seed)
+    keep(_Trial(optimiser, tolerance), seed)
 
 
 class _Plan(NamedTuple):
@@ -157,12 +157,10 @@ class _Horizon:
 
     def solved(self, state: Array, memory: Array | None = None, most: int = _CALLS) -> _Plan:
         """Calls of an open-loop solve until the status is OK, at most so many."""
-        before, given = (
-            self.layout.start() if memory is None else memory,
-            (self.data, self.ocp.input_lower, self.ocp.input_upper),
-        )
+        given, before = (state, self.data, self.ocp.input_lower, self.ocp.input_upper), memory
+        before = self.layout.start() if before is None else before
         for _ in range(most):
-            inputs, numbers, after = worked(self.optimiser, self.ocp, (state, *given, before))
+            inputs, numbers, after = worked(self.optimiser, self.ocp, (*given, before))
             plan = _Plan(state, inputs, numbers[:, 0], after[:, 0])
             if plan.status not in (Status.NOT_CONVERGED, Status.INFEASIBLE):
                 break
@@ -187,15 +185,13 @@ class _Horizon:
         """Stationarity of a plan by central differences of V."""
         step = 1e-4 * max(1.0, float(np.abs(state).max()))
         moves = step * np.eye(_STAGES)[:, None, :]
-        slope = np.array([self.cost(state, inputs + move) - self.cost(state, inputs - move) for move in moves]) / (
-            2 * step
-        )
-        moved = inputs - slope / (_STEP * self.ocp.curvature[0])
+        rises = [self.cost(state, inputs + move) - self.cost(state, inputs - move) for move in moves]
+        moved = inputs - np.array(rises) / (2 * step) / (_STEP * self.ocp.curvature[0])
         return float(np.abs(inputs - np.clip(moved, self.ocp.input_lower, self.ocp.input_upper)).max())
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class _Trial:
     """An optimiser with the horizons of its laws."""
 
     optimiser: Optimiser
@@ -212,7 +208,7 @@ class Trial:
         return _Horizon(self.optimiser, 0.0, Limits(inputs={"u": (-_BOUND, _BOUND)}))
 
 
-def remembers_a_plan(trial: Trial, draw: Draw) -> Broken:
+def remembers_a_plan(trial: _Trial, draw: Draw) -> Broken:
     """The memory holds the plan that was given in `plan_inputs`, and step and shift keep its size."""
     horizon = trial.linear
     layout, step = horizon.layout, horizon.step
@@ -230,14 +226,14 @@ def remembers_a_plan(trial: Trial, draw: Draw) -> Broken:
         yield f"{words}: the next call would not begin with it"
 
 
-def work_is_bounded_as_told(trial: Trial, draw: Draw) -> Broken:
+def work_is_bounded_as_told(trial: _Trial, draw: Draw) -> Broken:
     """Where `unbounded` names a reason a solver is called; arithmetic of a fixed length takes no longer than it takes."""
     told, step = trial.optimiser.unbounded, trial.linear.step
     if told and not any(f.is_a(kind, True) for f in (step, *step.find_functions()) for kind in _SOLVERS):
         yield f"`unbounded` says '{told}', but its step calls no solver and always does the same work: a real loop would refuse it"
 
 
-def numbers_are_true(trial: Trial, draw: Draw) -> Broken:
+def numbers_are_true(trial: _Trial, draw: Draw) -> Broken:
     """Cost and stationarity are those of a simulation, and OK only where it is stationary: far away, nonlinear, at bounds."""
     nonlinear = _Horizon(trial.optimiser, 1.0, Limits())
     yield from _judged(trial, trial.linear, trial.linear.called(_FAR * draw.normal(size=2)))
@@ -251,7 +247,7 @@ def numbers_are_true(trial: Trial, draw: Draw) -> Broken:
             yield from _judged(trial, horizon, horizon.called(3 * draw.normal(size=2), start))
 
 
-def _judged(trial: Trial, horizon: _Horizon, plan: _Plan) -> Iterator[str]:
+def _judged(trial: _Trial, horizon: _Horizon, plan: _Plan) -> Iterator[str]:
     """Compare the reported numbers of a plan with its true ones."""
     if plan.status not in (Status.OK, Status.NOT_CONVERGED):
         return
@@ -272,7 +268,7 @@ def _judged(trial: Trial, horizon: _Horizon, plan: _Plan) -> Iterator[str]:
         yield f"it reports NOT_CONVERGED at the stationarity {stationarity:.3g}, which is within {trial.tolerance:g}"
 
 
-def iterations_are_counted(trial: Trial, draw: Draw) -> Broken:
+def iterations_are_counted(trial: _Trial, draw: Draw) -> Broken:
     """The number of iterations that it reports is what the plan took: allowed that many, it finds the same plan."""
     most, horizon, state = getattr(trial.optimiser, "iterations", None), trial.linear, draw.normal(size=2)
     if not isinstance(most, int):
@@ -290,7 +286,7 @@ def iterations_are_counted(trial: Trial, draw: Draw) -> Broken:
         yield f"{words} an input of its plan is off by {missed:.3g}"
 
 
-def bounds_of_a_call_count(trial: Trial, draw: Draw) -> Broken:
+def bounds_of_a_call_count(trial: _Trial, draw: Draw) -> Broken:
     """The bounds of a call hold from the first call on, and not those of the problem."""
     horizon, lower, upper = trial.bounded, -0.5 * _BOUND, 0.1 * _BOUND
     if horizon.served:
@@ -301,7 +297,7 @@ def bounds_of_a_call_count(trial: Trial, draw: Draw) -> Broken:
             yield f"given bounds ({lower:g}, {upper:g}), it plans an input {worst:.3g} outside of them"
 
 
-def infeasible_is_told(trial: Trial, draw: Draw) -> Broken:
+def infeasible_is_told(trial: _Trial, draw: Draw) -> Broken:
     """A limit of a state that cannot be kept is never called OK; or limits of states are refused."""
     limits = Limits(inputs={"u": (-_BOUND, _BOUND)}, states={"y": (-_CORRIDOR, _CORRIDOR)})
     horizon = _Horizon(trial.optimiser, 0.0, limits)
@@ -315,7 +311,7 @@ def infeasible_is_told(trial: Trial, draw: Draw) -> Broken:
         yield f"it reports a limit violated by {plan.diagnostics[2]:.3g}, simulation gives {worst:.3g}"
 
 
-def nan_is_told(trial: Trial, draw: Draw) -> Broken:
+def nan_is_told(trial: _Trial, draw: Draw) -> Broken:
     """A state or data that are no numbers give NON_FINITE and a finite plan; no memory, NaN itself included, stays not finite."""
     horizon, state = trial.linear, draw.normal(size=2)
     memory, spoilt = horizon.begun(horizon.solved(state).inputs[0]), horizon.data.copy()
@@ -337,7 +333,7 @@ def nan_is_told(trial: Trial, draw: Draw) -> Broken:
             yield f"after {what} it does not recover: its status is {plan.status.name}, its memory {plan.memory}"
 
 
-def solution_stays(trial: Trial, draw: Draw) -> Broken:
+def solution_stays(trial: _Trial, draw: Draw) -> Broken:
     """A call at a solution stays there with the status OK, and one stage later the shifted plan serves as well."""
     horizon, state, allowed = trial.linear, draw.normal(size=2), 2 * _SLACK * _REACH * trial.tolerance + 1e-9
     solved = horizon.solved(state)
