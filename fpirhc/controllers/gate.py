@@ -72,7 +72,7 @@ HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 TAKEN = "taken"  # time stamp of a sample
 REPLAYS = Signal("replays")  # in the memory of a loop: whether its sample is that of `replayed_...`
 LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a machine is one that is not finite
-_SAMPLE = ("time", "state", "output", "realised", "measured", "arrived", TAKEN, LOST.name)
+_SAMPLE = ("state", "output", "realised", "measured", "arrived", TAKEN, LOST.name)
 INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 
@@ -95,8 +95,7 @@ class Gate:
 
     problem: Problem  # that the step is composed for
     inner: Composite  # the step of a controller, with the output 'command'
-    # what is always good and not checked, such as the 'time' of a simulated clock, or the 'memory' that a loop keeps
-    trusted: Sequence[str] = ()
+    simulated: bool = False  # whether clock and memory are those of a simulated loop, which are always good
     # intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where there is none
     ranges: Mapping[str, Interval] = field(default_factory=dict)
     loses: bool = False  # whether the step also reads `LOST`
@@ -115,7 +114,8 @@ class Gate:
     @cached_property
     def sample(self) -> Layout:
         """The signals of one sample that are checked."""
-        return Layout(tuple([s for s in self.reads.signals if s.name in _SAMPLE and s.name not in self.trusted]))
+        names = _SAMPLE if self.simulated else ("time", *_SAMPLE)
+        return Layout(tuple([s for s in self.reads.signals if s.name in names]))
 
     @cached_property
     def stored(self) -> Layout:
@@ -137,7 +137,7 @@ class Gate:
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)))
         good = [replace(s, name=f"good_{s.name}", start=starts.get(s.name, s.start)) for s in self.stored.signals]
-        failed = [] if "memory" in self.trusted else [scalar(FAILED)]
+        failed = [] if self.simulated else [scalar(FAILED)]
         older = [replace(s, name=f"{s.name}@{k}") for k in range(2, self.samples + 1) for s in good]
         return Layout((held, *good, *failed, *older, *([MISSING] if self.samples else [])))
 
@@ -145,7 +145,7 @@ class Gate:
     def replayed(self) -> Layout:
         """Whether a cycle is a replay, and its sample; nothing where a caller gives the samples."""
         own = [s for s in self.reads.signals if s.name in ("time", *self.stored.names)]
-        given = not self.samples or "memory" not in self.trusted
+        given = not (self.samples and self.simulated)
         return Layout(() if given else (REPLAYS, *(Signal(f"replayed_{s.name}", s.elements, s.units) for s in own)))
 
     @cached_property
@@ -175,7 +175,7 @@ class Gate:
             sample = [told[r] if r in told and self.inner.opaque else getattr(s, r) for r in self.inner.reads.names]
             memory = self.controller_memory.join(vars(s))
             usable = expression(True)
-            if "memory" not in self.trusted:
+            if not self.simulated:
                 failed = is_trial(getattr(s, FAILED))
                 usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(failed))
             memory_next, shown, command, fine = self._stepped(fits, usable, memory, sample)
@@ -235,8 +235,7 @@ class Gate:
         held = values[HELD]
         good = ca.vertcat(ca.SX(0, 1), *(values[f"good_{n}"] for n in self.stored.names))
         command, last = held, good
-        trusted = "memory" in self.trusted
-        if not trusted:
+        if not self.simulated:
             names = (HELD, *(f"good_{n}" for n in self.stored.names))
             start = ca.DM(np.concatenate([self.kept[n].start_vector() for n in names]))
             column = ca.vertcat(held, good)
@@ -280,7 +279,7 @@ class Gate:
     ) -> tuple[Expression, Expression, Expression, Expression]:
         """(memory to keep, trace, command, whether the step is fine); scalar code is evaluated, and its results are selected."""
         inner, opaque, remembered = self.inner, self.inner.opaque, memory
-        if "memory" not in self.trusted:
+        if not self.simulated:
             # Of a graph it is copied as a whole.
             remembered = ca.if_else(usable, memory, ca.DM(inner.memory.start()), opaque)
         memory_next, trace, command = inner.function.call([remembered, *sample], opaque)

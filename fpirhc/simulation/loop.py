@@ -46,7 +46,7 @@ def _closed(built: Built) -> Composite:
     mover, inner = moving(problem), compose_with_sensing(built)
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
     samples = known_samples(problem) if lost or ranges else 0
-    acting = Gate(problem, inner, trusted=("time", "memory"), ranges=ranges, loses=bool(lost), samples=samples)
+    acting = Gate(problem, inner, simulated=True, ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = disturbance_signals(problem)
     seeing = sensing_blocks(mover, predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
@@ -68,8 +68,8 @@ def start_memory(
         numbers: of all live settings, by path; None: those of the build.
     """
     mover, whole = moving(problem), loop.memory.start()
-    sensing = [] if problem.sees_plant else sensing_blocks(mover, predicts=False)
-    signals = [s for block in (*sensing, *seeing_blocks(problem)[0]) for s in block.memory.signals]
+    blocks = (*sensing_blocks(mover, predicts=False), *seeing_blocks(problem)[0])
+    signals = [signal for block in blocks for signal in block.memory.signals]
     signals += [delay.now for delay in _plant_delays(mover, controller.plant_model(problem))]
     if INNER in loop.memory and plans_exactly(loop, problem, controller):
         whole[loop.memory.slice(INNER)] = compose_with_sensing(build(problem, controller)).memory.start()
@@ -84,10 +84,9 @@ def start_memory(
 
 def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
     """Return whether plans know the exact parameters, and those of this problem are not those of the build."""
-    if controller.planner is None or not controller.plant_model(problem).exact:
-        return False
-    model = controller.plant_model(problem)
-    return not np.array_equal(loop.memory["parameters"].start_vector(), model.parameters(model.plant))
+    model, of_build = controller.plant_model(problem), loop.memory["parameters"].start_vector()
+    exact = controller.planner is not None and model.exact
+    return exact and not np.array_equal(of_build, model.parameters(model.plant))
 
 
 def _plant_delays(mover: Mover, model: PlantModel) -> list[Delay]:
