@@ -333,19 +333,14 @@ class Pairs:
     age: int = 0  # cycles by which the state is older; a map's response belongs to the state of the cycle before
 
     @property
-    def waiting(self) -> bool:
-        """Whether a response belongs to another pair than the measured state and the last command."""
-        return self._states.length > 1 or self._commands.length > 1
-
-    @property
     def state(self) -> Signal:
         """The signal of the measured state; behind dead time a controller may act on a predicted one."""
-        return measured(self.problem.plant.state) if self.waiting else self.problem.plant.state
+        return measured(self.problem.plant.state)
 
     @property
     def seen(self) -> Signal:
         """The signal of the measured outputs."""
-        return measured(self.problem.plant.output) if self.waiting else self.problem.plant.output
+        return measured(self.problem.plant.output)
 
     @property
     def cycles(self) -> float:

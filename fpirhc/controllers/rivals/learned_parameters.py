@@ -87,11 +87,10 @@ class Learning:
         equation = equation_function(regressor)
         learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
         pairs = built.pairs
-        late = (pairs.state,) if pairs.waiting else ()
         begins = built.warm_up if self.rule.reads_response else 1
         reads = (
             plant.state,
-            *late,
+            pairs.state,
             plant.response_signal("realised"),
             plant.parameter,
             like(plant.input, "_command_before"),
