@@ -179,9 +179,7 @@ def without(module: str, valid: Sequence[str]) -> Callable[[str], Never]:
     """Return the `__getattr__` of a module of public names: it raises InvalidName with the nearest one."""
 
     def missing(name: str) -> Never:
-        if name.startswith(
-            "_"
-        ):  # tools look for such names in whatever they meet, and nobody means a public one by them
+        if name.startswith("_"):  # tools ask whatever they meet for such names
             raise AttributeError(f"module '{module}' has no attribute '{name}'")
         raise InvalidName(f"{module} has no name '{name}'.{nearest(name, valid)}")
 

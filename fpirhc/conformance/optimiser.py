@@ -68,7 +68,7 @@ def compiled(function: ca.Function, flags: Sequence[str] = ()) -> ca.Function:
 def check_optimiser(
     optimiser: Optimiser,
     *,
-    tolerance: Annotated[float, Range("a number above 0 and up to 1e-3", 0.0, 1e-3, open_low=True)],
+    tolerance: Annotated[float, Range("a number above 0 and up to 1e-3", lambda v: 0 < v <= 1e-3)],
     seed: Seed,
 ) -> None:
     """Check every law on an optimiser.

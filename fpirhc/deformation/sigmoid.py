@@ -22,7 +22,7 @@ from fpirhc.fields.kinds import NotZero, Positive, Range
 from fpirhc.symbolic.layout import Expression
 
 # Beyond it zeta'(x*) is below 2e-4: the map hardly moves and loses digits.
-_SHIFTS = Range("a number from -5 to 5, such as 0.3", low=-5.0, high=5.0)
+_SHIFTS = Range("a number from -5 to 5, such as 0.3", lambda v: -5 <= v <= 5)
 _FLOOR = 1e-9  # |h| / S below which the norm is rounded off, so that its derivatives exist at zero
 _BISECTIONS = 60
 

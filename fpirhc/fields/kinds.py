@@ -73,56 +73,38 @@ def takes(function: Callable[..., object], arguments: int) -> bool:
 
 @dataclass(frozen=True)
 class Range:
-    """The interval of a number, with its words for a user."""
+    """Which numbers are meant, with the words for a user."""
 
     words: str  # of the whole expectation: "a positive number"
-    low: float = -math.inf  # least value
-    high: float = math.inf  # largest value
-    open_low: bool = False  # whether `low` itself is refused
-    open_high: bool = False  # whether `high` itself is refused
-
-    def holds(self, value: float) -> bool:
-        """Whether the value lies in the range; NaN does not."""
-        above = value > self.low if self.open_low else value >= self.low
-        below = value < self.high if self.open_high else value <= self.high
-        return above and below
-
-
-class _NotZero(Range):
-    """A finite number other than zero."""
-
-    def holds(self, value: float) -> bool:
-        return math.isfinite(value) and value != 0
-
-
-class _JudgedByOwner(Range):
-    """Any number, NaN among them: whoever holds it by name refuses what is not finite, with this name."""
-
-    def holds(self, value: float) -> bool:
-        del value
-        return True
+    holds: Callable[[float], bool]  # no comparison holds of NaN
 
 
 def whole(low: int, high: int) -> Range:
     """Return the range of a whole number."""
-    return Range(f"a whole number from {low} to {high}", low, high)
+    return Range(f"a whole number from {low} to {high}", lambda v: low <= v <= high)
 
 
-JudgedByOwner: TypeAlias = Annotated[float, _JudgedByOwner("a finite number")]
-Positive: TypeAlias = Annotated[float, Range("a finite number above 0", 0.0, open_low=True, open_high=True)]
-AboveZero: TypeAlias = Annotated[float, Range("a number above 0", 0.0, open_low=True)]  # infinite too
-Finite: TypeAlias = Annotated[float, Range("a finite number", open_low=True, open_high=True)]
-NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", 0.0, open_high=True)]
-AtLeastOne: TypeAlias = Annotated[float, Range("a finite number of at least 1", 1.0, open_high=True)]
-NotZero: TypeAlias = Annotated[float, _NotZero("a finite number other than zero (no adaptation is Identity())")]
-BelowOne: TypeAlias = Annotated[float, Range("a number from 0 to below 1", 0.0, 1.0, open_high=True)]
-Deviation: TypeAlias = Annotated[float, Range("a positive number from 1e-100 to 1e100", 1e-100, 1e100)]  # has a square
-Duration: TypeAlias = Annotated[float, Range("a number from 1e-12 to 1e12 in the plant's unit of time", 1e-12, 1e12)]
-Accuracy: TypeAlias = Annotated[float, Range("a number above 0 and below 1", 0.0, 1.0, open_low=True, open_high=True)]
+JudgedByOwner: TypeAlias = Annotated[float, Range("a finite number", lambda _: True)]  # NaN too: who holds it names it
+Positive: TypeAlias = Annotated[float, Range("a finite number above 0", lambda v: 0 < v < math.inf)]
+AboveZero: TypeAlias = Annotated[float, Range("a number above 0", lambda v: v > 0)]  # infinite too
+Finite: TypeAlias = Annotated[float, Range("a finite number", lambda v: -math.inf < v < math.inf)]
+NotNegative: TypeAlias = Annotated[float, Range("a finite number of at least 0", lambda v: 0 <= v < math.inf)]
+AtLeastOne: TypeAlias = Annotated[float, Range("a finite number of at least 1", lambda v: 1 <= v < math.inf)]
+NotZero: TypeAlias = Annotated[
+    float, Range("a finite number other than zero (no adaptation is Identity())", lambda v: math.isfinite(v) and v != 0)
+]
+BelowOne: TypeAlias = Annotated[float, Range("a number from 0 to below 1", lambda v: 0 <= v < 1)]
+Deviation: TypeAlias = Annotated[  # its square is finite, and not zero
+    float, Range("a positive number from 1e-100 to 1e100", lambda v: 1e-100 <= v <= 1e100)
+]
+Duration: TypeAlias = Annotated[
+    float, Range("a number from 1e-12 to 1e12 in the plant's unit of time", lambda v: 1e-12 <= v <= 1e12)
+]
+Accuracy: TypeAlias = Annotated[float, Range("a number above 0 and below 1", lambda v: 0 < v < 1)]
 Count: TypeAlias = Annotated[int, whole(1, 1_000_000)]
 FEW = 1000
 Few: TypeAlias = Annotated[int, whole(1, FEW)]
-CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", low=0)]
+CountOrZero: TypeAlias = Annotated[int, Range("a whole number of at least 0", lambda v: v >= 0)]
 Seed: TypeAlias = CountOrZero  # of random numbers
 
 

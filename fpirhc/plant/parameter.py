@@ -265,7 +265,7 @@ class Normal(_Wide):
         return exact + share * self._width(exact) * _standard(probability)
 
 
-_FACTOR = Range("a number above 1, such as 1.3 for 30 %", 1.0, open_low=True, open_high=True)
+_FACTOR = Range("a number above 1, such as 1.3 for 30 %", lambda v: 1 < v < math.inf)
 
 
 @dataclass(frozen=True)

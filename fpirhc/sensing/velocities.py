@@ -75,7 +75,7 @@ class VelocityDifference(_OfHighest):
 
 
 _TIME_CONSTANT = Range(
-    "a positive number of seconds (without a filter use VelocityDifference())", 0.0, open_low=True, open_high=True
+    "a positive number of seconds (without a filter use VelocityDifference())", lambda v: 0 < v < math.inf
 )
 
 

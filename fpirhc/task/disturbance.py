@@ -99,10 +99,7 @@ class Noise(Disturbance):
 
 
 _CORRELATION = Range(
-    "a positive number of seconds (for noise without correlation use Noise(deviation=...))",
-    0.0,
-    open_low=True,
-    open_high=True,
+    "a positive number of seconds (for noise without correlation use Noise(deviation=...))", lambda v: 0 < v < math.inf
 )
 
 

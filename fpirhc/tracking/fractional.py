@@ -28,10 +28,7 @@ _REACH = 20.0  # memory x rate by default
 
 _ORDERS = Range(
     "a number between 0 and 2: below 1 decays without overshoot, and from 2 on the error does not decay",
-    0.0,
-    2.0,
-    open_low=True,
-    open_high=True,
+    lambda v: 0 < v < 2,
 )
 
 

@@ -40,7 +40,7 @@ class RepetitiveControl(PairedAtOnce):
     tracking: Tracking
     repeats: Duration = field(metadata={"structure": True})
     gain: Positive = 0.5
-    smoothing: Annotated[float, Range("a number from 0 to 0.25", low=0.0, high=0.25)] = 0.0
+    smoothing: Annotated[float, Range("a number from 0 to 0.25", lambda v: 0 <= v <= 0.25)] = 0.0
 
     def cycles(self, problem: Problem) -> int:
         """Return N.

@@ -26,7 +26,7 @@ _RETURNED = 0.3  # relative distance below which an error counts as equal to the
 _SMALLEST = 1e-3  # smallest factor that oscillation may lead to
 
 
-_PRODUCTS = Range("a product of gain and plant between 0 and 2, such as 0.5", 0.0, 2.0, open_low=True, open_high=True)
+_PRODUCTS = Range("a product of gain and plant between 0 and 2, such as 0.5", lambda v: 0 < v < 2)
 
 
 @dataclass(frozen=True)

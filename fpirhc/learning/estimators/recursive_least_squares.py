@@ -38,7 +38,7 @@ class RecursiveLeastSquares(ParameterEstimator):
 
     parameters: Mapping[str, Uncertain]
     noise: Mapping[str, Deviation]
-    time: Annotated[float, Range("a positive number of seconds, or math.inf", 0.0, open_low=True)]
+    time: Annotated[float, Range("a positive number of seconds, or math.inf", lambda v: v > 0)]
 
     def __post_init__(self) -> None:
         if not self.parameters:

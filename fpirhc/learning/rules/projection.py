@@ -16,7 +16,7 @@ from fpirhc.symbolic.layout import Expression
 _RELATIVE = 1e-9  # of the diagonal of the matrix that is inverted: a response without information changes nothing
 
 
-_CONVERGENT = Range("a number between 0 and 2, both excluded", 0.0, 2.0, open_low=True, open_high=True)
+_CONVERGENT = Range("a number between 0 and 2, both excluded", lambda v: 0 < v < 2)
 
 
 @dataclass(frozen=True)
