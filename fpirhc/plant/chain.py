@@ -125,13 +125,6 @@ def _derivatives(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function
     return ca.Function("fpirhc_derivatives", list(symbols), [ca.densify(column)])
 
 
-def input_reaches_at(plant: Plant, name: str, count: int) -> int | None:
-    """Return the first derivative of a quantity that depends on an input at once; None where none up to `count` does."""
-    x, u, p = plant.symbols()
-    chain = derivatives(plant, {name: count}, (x, u, p, ca.SX.sym("w", len(plant.names))))[name]
-    return next((k for k, y in enumerate(chain) if ca.depends_on(y, u)), None)
-
-
 def response_names(plant: Plant) -> tuple[str, ...]:
     """Names of the highest derivatives of the controlled coordinates: "q1''"; of order 0 it is the output's own name."""
     return tuple(name + "'" * order for name, order in plant.response_orders.items())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -54,24 +54,25 @@ def unlike(plant: Plant, model: Plant) -> str:
     return "differential equations, and the model is a map" if plant.step is None else "steps, and the model has none"
 
 
-def check_time(plant: Plant, model: Plant, orders: Mapping[str, int], mistakes: Mistakes, *, at_once: bool) -> None:
-    """Add to `mistakes` where one of model and reality steps and the other does not, and a response needs both alike.
-
-    Args:
-        orders: of the model's outputs.
-        at_once: whether the command moves everything controlled at once, so that no derivative is looked for.
-    """
-    if not unlike(plant, model):
+def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
+    """Add to `mistakes` where a response needs model and reality to step alike, and what is not covered on a map."""
+    instant, later = model.at_once, [name for name, order in model.chains.items() if order > 1]
+    others = {*(model.controlled or model.chains)} - {*instant}  # for which a derivative is looked for
+    if model.step is not None and instant and others:
+        mistakes.add(
+            f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
+            "cycles, which is not covered; control them by two problems"
+        )
+    if not unlike(real, model):
         return
-    later = [name for name, order in orders.items() if order > 1]
-    if model.step is None and not at_once:
+    if model.step is None and others:
         mistakes.add(
             "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write "
             "the model as a map with the same step"
         )
     elif model.step is not None and later:
         mistakes.add(
-            f"reality: '{later[0]}' has the order {orders[later[0]]} in the model's steps, and the reality has "
+            f"reality: '{later[0]}' has the order {model.chains[later[0]]} in the model's steps, and the reality has "
             "differential equations, in which every input shows within one cycle; write a model in which it does too"
         )
 

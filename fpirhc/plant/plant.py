@@ -210,6 +210,11 @@ class Plant(Checked):
         return Equations(self)
 
     @cached_property
+    def followed(self) -> Mapping[str, Output]:
+        """What may follow a reference, as outputs: these, or without any the coordinates."""
+        return self.outputs or {n: Output(unit, lambda *q, n=n: q[0][n]) for n, unit in self.coordinates.items()}
+
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates."""
         return tuple(self.coordinates)

@@ -22,7 +22,7 @@ from fpirhc.horizon.cost import Cost, view_of_symbols
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
-from fpirhc.plant.maps import check_time, over, response_age
+from fpirhc.plant.maps import check_maps, over, response_age
 from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -92,7 +92,7 @@ def check_problem(problem: Problem) -> None:
         with mistakes.caught():
             check()
     mistakes.raise_if_any()
-    _check_maps(plant, problem.real_plant, mistakes)
+    check_maps(plant, problem.real_plant, mistakes)
     mistakes.raise_if_any()
     _check_stage(plant, problem.cost, problem.limits, mistakes)
     _check_inverse(problem, mistakes)
@@ -246,20 +246,6 @@ def _check_disturbances(problem: Problem) -> None:
         with mistakes.caught():
             problem.disturbances[name].derivative(instants, 1)
     mistakes.raise_if_any()
-
-
-def _check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
-    """Add what is not covered beside a map to `mistakes`."""
-    instant = model.at_once
-    at_once = bool(instant) and set(instant) == set(model.controlled or model.chains)  # no derivative is looked for
-    check_time(real, model, model.chains, mistakes, at_once=at_once)
-    if model.step is None:
-        return
-    if instant and not at_once:
-        mistakes.add(
-            f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
-            "cycles, which is not covered; control them by two problems"
-        )
 
 
 def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:

@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
-from fpirhc.plant.chain import derivatives_function, input_reaches_at, output_order
+from fpirhc.plant.chain import derivatives_function, output_order
 from fpirhc.plant.integrators import Integrator, stiffness
 from fpirhc.plant.maps import over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
@@ -121,13 +121,13 @@ class Reality(Checked):
         if not needed or seen not in units:
             return
         order = model.equations.output_orders[name] if what == "output" else model.orders[model.names.index(name)]
-        at_once = input_reaches_at(plant, seen, order - 1) if order else None
-        if at_once is not None:
+        own = output_order(plant, seen)
+        if own is not None and own < order:
             mistakes.add(
-                f"its derivative {seen}{chr(39) * at_once} jumps with the command, but '{name}' has order {order} in the model; "
+                f"its derivative {seen}{chr(39) * own} jumps with the command, but '{name}' has order {order} in the model; "
                 "give the model this order, or the reality an actuator or a coordinate of its own"
             )
-        elif name in (model.controlled or model.chains) and output_order(plant, seen) is None:
+        elif own is None and name in (model.controlled or model.chains):
             mistakes.add(f"no input reaches its {what} '{seen}', however often it is differentiated")
 
     def shown(self, quantities: Sequence[str]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ sends the command of the one whose turn it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,7 +25,7 @@ from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
 from fpirhc.plant.motion import followed_units
-from fpirhc.plant.plant import Output, Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite, left_after
@@ -115,7 +115,7 @@ class Slotted(Controller):
         blocks += [self.schedule.block(list(self.slots), built.problem), _switch_block(turns)]
         delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(discrete("_slot_before"), "slot")]
         for one in turns:
-            own, remembered = _own_cycle(built.plant, one, left_after(built.period, self.blend))
+            own, remembered = _own_cycle(one, left_after(built.period, self.blend))
             blocks, delays = [*blocks, *own], [*delays, *remembered]
         counted = warm_up_block(max(one.built.warm_up for one in turns))
         blocks += [_command_block(built, turns), judge_block(), counted]
@@ -152,14 +152,9 @@ def slot_problem(problem: Problem, name: str) -> Problem:
 
 def _slot_problem(problem: Problem, name: str) -> Problem:
     plant = problem.plant
-    outputs = plant.outputs or {n: Output(unit, _coordinate(n)) for n, unit in plant.coordinates.items()}
     inverse = plant.inverse if plant.controlled_names == (name,) else None
-    light = replace(plant, outputs=outputs, controlled=(name,), inverse=inverse)
+    light = replace(plant, outputs=plant.followed, controlled=(name,), inverse=inverse)
     return replace(problem, plant=light, judged=(name,), cost=None)
-
-
-def _coordinate(name: str) -> Callable[..., Expression]:
-    return lambda *motion: motion[0][name]
 
 
 def _by_slot(plants: Sequence[Plant], name: str) -> Signal:
@@ -181,22 +176,22 @@ def _against(problem: Problem, deformation: Deformation) -> Iterator[str]:
         )
 
 
-_OUTPUT = "_slot_outputs"  # the outputs of every slot's plant, where the plant itself has none
+_OUTPUT = "_slot_outputs"  # the outputs of every slot's plant
 
 
 def _seeing_blocks(built: Built, turns: Sequence[Turn]) -> list[Block]:
     """Blocks from what is measured to the outputs and the response of every slot."""
     plant, model, motion = built.plant, turns[0].built.plant, measured(built.plant.output)
+    same = plant.output.elements == model.output.elements
     every = _by_slot([one.built.plant for one in turns], "realised_of_slots")
     still, calm = ca.DM.zeros(plant.input.size), ca.DM.zeros(len(plant.names))
     memory = Layout(tuple(scalar(one.own("below")) for one in turns if one.place is None))
 
-    def shown(state: Expression, parameters: Expression) -> Expression:
-        return model.equations.output(state, still, parameters, calm)
+    def shown(seen: Expression, parameters: Expression) -> Expression:
+        return seen if same else model.equations.output(seen, still, parameters, calm)
 
     def step(s: Signals) -> dict[str, Expression]:
-        seen = getattr(s, motion.name)
-        outputs = seen if plant.outputs else shown(seen, s.parameters)
+        outputs = shown(getattr(s, motion.name), s.parameters)
         values = {one.own("realised"): s.realised[one.place] for one in turns if one.place is not None}
         for one in turns:
             if one.place is None:
@@ -208,9 +203,10 @@ def _seeing_blocks(built: Built, turns: Sequence[Turn]) -> list[Block]:
     reads = (plant.response_signal("realised"), motion, plant.parameter)
     writes = Layout((every, *(scalar(one.own("realised")) for one in turns)))
     responses = Block("slot_responses", Layout(reads), writes, step, memory)
-    state, output = Layout((plant.state, plant.parameter)), Layout((replace(model.output, name=_OUTPUT),))
-    outputs = Block("slot_outputs", state, output, lambda s: {_OUTPUT: shown(s.state, s.parameters)})
-    return [responses] if plant.outputs else [outputs, responses]
+    given, output = Layout((plant.output, plant.parameter)), Layout((replace(model.output, name=_OUTPUT),))
+    now = plant.output.name
+    outputs = Block("slot_outputs", given, output, lambda s: {_OUTPUT: shown(getattr(s, now), s.parameters)})
+    return [outputs, responses]
 
 
 def _switch_block(turns: Sequence[Turn]) -> Block:
@@ -231,7 +227,7 @@ _OF_ALL = {"_command_before", "warm_up"}  # remembered once for all slots
 _OF_TURN = "_law", "_offset", "_request", "_goes_on"  # what the handover adds
 
 
-def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list[Delay]]:
+def _own_cycle(one: Turn, decay: float) -> tuple[list[Block], list[Delay]]:
     """The slot's own blocks, under names of its own, and what they remember. Its law begins a run with every turn."""
     given, delays = one.slot.blocks(one.built)
     blocks = [b for b in with_aim(one.built, given) if not {"status", "_warm_up_now"} & {*b.writes.names}]
@@ -239,9 +235,7 @@ def _own_cycle(outer: Plant, one: Turn, decay: float) -> tuple[list[Block], list
         raise NotSupported(f"slot '{one.name}': {one.slot} has no law whose response a map deforms; use ComputedTorque")
     delays = [d for d in delays if d.now.name not in _OF_ALL]
     told = {n for b in blocks for n in (*b.writes.names, *b.memory.names)} | {d.now.name for d in delays}
-    names = {n: one.own(n) for n in (*told, *_OF_TURN, "realised", "warm_up")}
-    if not outer.outputs:
-        names["output"] = _OUTPUT
+    names = {n: one.own(n) for n in (*told, *_OF_TURN, "realised", "warm_up")} | {"output": _OUTPUT}
     begins, asked = names | {"warm_up": names["_goes_on"]}, names | {Form().request: names["_request"]}
     cycle: list[Block] = []
     for block in blocks:
