@@ -130,11 +130,10 @@ class Sensing(Checked):
         mistakes.unknown("measured: quantity", self.measured or (), every)
         for mistake in self._uncovered(plant):
             mistakes.add(mistake)
-        instant = [name for name, order in plant.response_orders.items() if not order]
-        if instant and not self.estimator.measures_all:
+        if plant.at_once and not self.estimator.measures_all:
             mistakes.add(
-                f"{type(self.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(instant)}) need none; "
-                "leave the estimator out: Sensing(sensors=...)"
+                f"{type(self.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(plant.at_once)}) need "
+                "none; leave the estimator out: Sensing(sensors=...)"
             )
         with mistakes.caught():
             self.estimator.check(plant)
