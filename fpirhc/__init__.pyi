@@ -9,8 +9,7 @@ from .controllers.receding_horizon import RecedingHorizon as RecedingHorizon
 from .controllers.replanning import FromMeasurement as FromMeasurement
 from .controllers.replanning import FromPlan as FromPlan
 from .controllers.rivals.pid import PID as PID
-from .controllers.slots.schedules import Periodic as Periodic
-from .controllers.slots.slotted import Slotted as Slotted
+from .controllers.slotted import Slotted as Slotted
 from .controllers.wrappers.cascade import Cascade as Cascade
 from .controllers.wrappers.cascade import ThroughModel as ThroughModel
 from .controllers.wrappers.estimating import Estimating as Estimating

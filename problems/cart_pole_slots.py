@@ -68,7 +68,7 @@ sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in m/s^2 or rad
 def slotted(deformation):
     angle = fp.ComputedTorque(fp.Exponential(rate=8.0, integral=False), deformation)  # 1/s
     cart = fp.ComputedTorque(fp.Exponential(rate=0.5, integral=False), deformation)
-    return fp.Slotted({"angle": angle, "cart": cart}, fp.Periodic({"angle": 0.5, "cart": 0.1}), blend=0.02)
+    return fp.Slotted({"angle": angle, "cart": cart}, {"angle": 0.5, "cart": 0.1}, blend=0.02)
 
 
 controllers = {

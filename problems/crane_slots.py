@@ -65,7 +65,7 @@ problem = fp.Problem(
     judged=("cart", "angle"),
 )
 
-schedule = fp.Periodic({"cart": 1.4, "angle": 3.9})  # s
+turns = {"cart": 1.4, "angle": 3.9}  # s
 optimiser = fp.FixedPoint()
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=10.0)  # scale in m/s^2 or rad/s^2
 
@@ -73,7 +73,7 @@ sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=10.0)  # scale in m/s^2 or rad/
 def slotted(deformation):
     cart = fp.ComputedTorque(fp.Exponential(rate=1.0, integral=False), deformation)  # 1/s
     angle = fp.ComputedTorque(fp.Exponential(rate=3.0, integral=False), deformation)
-    return fp.Slotted({"cart": cart, "angle": angle}, schedule, blend=0.1)
+    return fp.Slotted({"cart": cart, "angle": angle}, turns, blend=0.1)
 
 
 controllers = {

@@ -56,7 +56,7 @@ problem = fp.Problem(
     judged=("q1", "q2"),
 )
 
-schedule = fp.Periodic({"q2": 1.0, "q1": 3.0})  # s
+turns = {"q2": 1.0, "q1": 3.0}  # s
 optimiser = fp.FixedPoint()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=100.0)  # scale in m/s^2 or m/s^4
 
@@ -64,7 +64,7 @@ sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=100.0)  # scale in m/s^2 or m/s
 def slotted(deformation):
     second = fp.ComputedTorque(fp.Exponential(rate=4.0, integral=False), deformation)  # 1/s
     first = fp.ComputedTorque(fp.Exponential(rate=4.0, integral=False), deformation)
-    return fp.Slotted({"q2": second, "q1": first}, schedule, blend=0.1)
+    return fp.Slotted({"q2": second, "q1": first}, turns, blend=0.1)
 
 
 controllers = {

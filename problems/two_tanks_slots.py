@@ -60,7 +60,7 @@ problem = fp.Problem(
     judged=("h1", "h2"),
 )
 
-schedule = fp.Periodic({"h2": 80.0, "h1": 40.0})  # s
+turns = {"h2": 80.0, "h1": 40.0}  # s
 optimiser = fp.FixedPoint()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0)  # scale in dm/s or dm/s^2
 
@@ -69,7 +69,7 @@ def slotted(deformation):
     # From the start the law asks for more than ten times what the inflow can do, and its integral counts the error all the same.
     lower = fp.ComputedTorque(fp.Exponential(rate=0.1, largest=(math.inf,)), deformation)  # 1/s
     upper = fp.ComputedTorque(fp.Exponential(rate=0.2, integral=False), deformation)
-    return fp.Slotted({"h2": lower, "h1": upper}, schedule, blend=2.0)
+    return fp.Slotted({"h2": lower, "h1": upper}, turns, blend=2.0)
 
 
 controllers = {

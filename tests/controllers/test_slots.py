@@ -52,7 +52,7 @@ def pendulum_problem() -> fp.Problem:
 
 def alone(name: str, law: Any, deformation: Any) -> fp.Slotted:
     """One slot that lasts the whole run."""
-    return fp.Slotted({name: fp.ComputedTorque(law, deformation)}, fp.Periodic({name: 0.5}), blend=0.1)
+    return fp.Slotted({name: fp.ComputedTorque(law, deformation)}, {name: 0.5}, blend=0.1)
 
 
 @pytest.mark.parametrize("integral", [False, True])
@@ -210,7 +210,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 @pytest.mark.parametrize(("given", "words"), WRONG.values(), ids=WRONG)
 def test_wrong_slots_are_refused(given, words):
     slots, durations = given
-    assert words in refused(crane({"cart": -1.0}), fp.Slotted(slots, fp.Periodic(durations), blend=0.1))
+    assert words in refused(crane({"cart": -1.0}), fp.Slotted(slots, durations, blend=0.1))
 
 
 def test_slots_are_refused_on_several_inputs_and_where_nobody_judges():

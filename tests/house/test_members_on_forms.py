@@ -66,7 +66,7 @@ CONTROLLERS: dict[str, Callable[[int], Controller]] = {
     "RepetitiveControl": lambda order: fp.rivals.RepetitiveControl(TRACK, repeats=0.5, gain=0.2, smoothing=0.05),
     "ResolvedAccelerationRate": lambda order: fp.rivals.ResolvedAccelerationRate(6.0),
     "SlidingMode": lambda order: fp.rivals.SlidingMode(rate=6.0, gain=30.0, width=1.0),
-    "Slotted": lambda order: fp.Slotted({"y": fp.ComputedTorque(TRACK, MAP)}, fp.Periodic({"y": 1.0}), blend=0.1),
+    "Slotted": lambda order: fp.Slotted({"y": fp.ComputedTorque(TRACK, MAP)}, {"y": 1.0}, blend=0.1),
 }
 ELSEWHERE = {  # members that need a plant of their own, with the tests that try them on forms
     "AdaptiveInverseDynamics": "controllers/test_adaptive_rivals.py",

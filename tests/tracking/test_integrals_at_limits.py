@@ -39,7 +39,7 @@ def last(problem: fp.Problem, controller: Controller, signal: str) -> float:
     [
         fp.ComputedTorque(LAW),
         fp.ComputedTorque(fp.ShiftPolynomial(poles=0.96, step=0.02)),
-        fp.Slotted({"x": fp.ComputedTorque(LAW)}, fp.Periodic({"x": 1.0}), blend=0.1),
+        fp.Slotted({"x": fp.ComputedTorque(LAW)}, {"x": 1.0}, blend=0.1),
         fp.PID({"x": 2.0}, {"x": 1.0}),
         fp.rivals.LyapunovMRAC(2.0, adaptation=1.0),
     ],

@@ -9,7 +9,8 @@ sends the command of the one whose turn it is.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from typing import NamedTuple
 
 import casadi as ca
@@ -18,13 +19,12 @@ from fpirhc.controllers.base import Controller, judge_block, reference_block, wa
 from fpirhc.controllers.built import Built, build, checked, with_aim
 from fpirhc.controllers.contract import resolved
 from fpirhc.controllers.path import measured
-from fpirhc.controllers.slots.schedules import Schedule
 from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import Mistakes, NotSupported
-from fpirhc.fields.kinds import NotNegative
+from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
-from fpirhc.plant.motion import followed_units
+from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
@@ -35,7 +35,7 @@ from fpirhc.task.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Slotted(Controller):
-    """One coordinate at a time, by a schedule.
+    """One coordinate at a time, in turn, again and again.
 
         desired = law + o,    o = (realised - law) at the start of a turn, and then o e^(-T / blend) in every cycle of T
 
@@ -44,7 +44,7 @@ class Slotted(Controller):
 
     Args:
         slots: coordinate -> what controls it, ComputedTorque(tracking, deformation). Its relative order is found from the symbols.
-        schedule: chooses the active slot (Periodic).
+        durations: coordinate -> how long its turn lasts, in the order of the turns.
         blend: time constant with which the offset of a switch decays, s; 0: the law is joined at once, and the command jumps
             one cycle after the switch.
 
@@ -55,7 +55,7 @@ class Slotted(Controller):
     """
 
     slots: Mapping[str, Controller]
-    schedule: Schedule
+    durations: Mapping[str, Positive] = field(metadata={"structure": True})
     blend: NotNegative
 
     @property
@@ -75,10 +75,10 @@ class Slotted(Controller):
         return self if same else replace(self, slots=slots)
 
     def check(self, problem: Problem) -> None:
-        """Raise if the slots or the schedule do not fit the problem.
+        """Raise if the slots or their durations do not fit the problem.
 
         Raises:
-            InvalidProblem: mistakes of slots and schedule, all together.
+            InvalidProblem: mistakes of slots and durations, all together.
         """
         self._check_names(problem)
         mistakes = Mistakes("Slotted")
@@ -87,7 +87,15 @@ class Slotted(Controller):
                 checked(slot_problem(problem, name), slot)
             for reason in _against(problem, slot.deformation):
                 mistakes.add(f"slot '{name}': {reason}")
-        self.schedule.check(list(self.slots), problem, mistakes)
+        mistakes.unknown("durations: slot", self.durations, list(self.slots))
+        for name in (n for n in self.slots if n not in self.durations):
+            mistakes.add(f"slot '{name}' is never active; give it time, or leave the slot out")
+        period, unit = problem.period, problem.time_unit
+        for name, value in self.durations.items():
+            if value < period * (1 - 1e-9):
+                mistakes.add(
+                    f"duration of '{name}' is {value:g} {unit}, shorter than one control cycle of {period:g} {unit}"
+                )
         mistakes.raise_if_any()
 
     def _check_names(self, problem: Problem) -> None:
@@ -112,7 +120,7 @@ class Slotted(Controller):
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         turns = [self._turn(built, k, name) for k, name in enumerate(self.slots)]
         blocks = [reference_block(built), *_seeing_blocks(built, turns)]
-        blocks += [self.schedule.block(list(self.slots), built.problem), _switch_block(turns)]
+        blocks += [self._schedule_block(built), _switch_block(turns)]
         delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(discrete("_slot_before"), "slot")]
         for one in turns:
             own, remembered = _own_cycle(one, left_after(built.period, self.blend))
@@ -120,6 +128,19 @@ class Slotted(Controller):
         counted = warm_up_block(max(one.built.warm_up for one in turns))
         blocks += [_command_block(built, turns), judge_block(), counted]
         return blocks, [*delays, Delay(built.before, "command")]
+
+    def _schedule_block(self, built: Built) -> Block:
+        """Block time -> slot, its place among the slots."""
+        period, order = built.period, [list(self.slots).index(name) for name in self.durations]
+        *starts, whole = accumulate((round(value / period) for value in self.durations.values()), initial=0)
+
+        def step(s: Signals) -> dict[str, Expression]:
+            phase, slot = ca.fmod(ca.floor(s.time / period + 0.5), whole), ca.SX(order[0])
+            for before, number, start in zip(order, order[1:], starts[1:], strict=False):
+                slot += (number - before) * (phase > start - 0.5)
+            return {"slot": slot}
+
+        return Block("schedule", Layout((time_signal(built.plant),)), Layout((scalar("slot"),)), step)
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
         one = build(slot_problem(built.problem, name), self.slots[name], opened=built.opened)

@@ -1,1 +1,0 @@
-"""One input for several coordinates in turn: time slots."""
