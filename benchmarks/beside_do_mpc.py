@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 import fpirhc as fp
@@ -134,16 +135,20 @@ def theirs(controller: Any) -> Step:
 
 def problem(alpha: float, beta: float) -> fp.Problem:
     """The example; do-mpc weighs changes of inputs that it divides by 100 and 2000, so those are in the weights here."""
-    plant = cstr.reactor(1.0, 1.0)
-    values = {"alpha": alpha, "beta": beta}
+    plant, values = cstr.reactor(1.0, 1.0), {"alpha": alpha, "beta": beta}
     exact = {name: replace(one, exact=values[name]) for name, one in plant.parameters.items()}
-    hot = dict.fromkeys(("T_R", "T_K"), (50.0, WARMEST))
     return replace(
         cstr.task(replace(plant, parameters=exact)),
         sensing=fp.Sensing(estimator=fp.PositionDifference()),
-        cost=fp.Quadratic(states={"C_b": 1.0}, rate={"F": 0.1 / 100**2, "Q": 1e-3 / 2000**2}),
-        limits=fp.Limits(inputs={"F": (5.0, 100.0), "Q": (-8500.0, 0.0)}, states=hot, soft=dict.fromkeys(hot, 1e4)),
+        cost=fp.CustomCost(terms, terminal=lambda v: cstr.PERIOD * terms(v)["errors"]),
+        limits=fp.Limits(inputs={"F": (5.0, 100.0), "Q": (-8500.0, 0.0)}),
     )
+
+
+def terms(v: Any) -> dict[str, Any]:
+    beyond = [ca.fmax(t - WARMEST, 0) + ca.fmax(50.0 - t, 0) for t in (v.state.T_R, v.state.T_K)]
+    rate = 0.1 * ((v.input.F - v.input_before.F) / 100) ** 2 + 1e-3 * ((v.input.Q - v.input_before.Q) / 2000) ** 2
+    return {"errors": (v.state.C_b - v.reference.C_b) ** 2 + 1e4 * ca.sumsqr(ca.vertcat(*beyond)), "rate": rate}
 
 
 plain = fp.RecedingHorizon(fp.FixedPoint(iterations=30, tolerance=1e-4))

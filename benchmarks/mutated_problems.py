@@ -37,24 +37,19 @@ problem = fp.Problem(
     plant=plant,
     reference=fp.Trajectory(lambda t: {"y": ca.sin(t), "z": 0.1 * ca.cos(t)}),
     start={"y": 0.1, "z": 0.0},
-    period=1e-2,
-    duration=0.1,
+    period=1e-2, duration=0.1,
     limits=fp.Limits(
-        inputs={"force": (-20.0, 20.0)},
-        states={"y": (-2.0, 2.0)},
+        inputs={"force": (-20.0, 20.0)}, states={"y": (-2.0, 2.0)},
         paths={"sum": fp.PathConstraint(lambda view: view.state.y + view.state.z, upper=3.0, unit="m")},
-        soft={"y": 10.0},
     ),
-    disturbances={"force": fp.Formula(lambda t: 0.1 * ca.sin(2 * np.pi * 1.0 * t)), "y": fp.Formula(lambda t: ca.tanh(t))},
+    disturbances={"force": fp.Formula(lambda t: 0.1 * ca.sin(6.28 * t)), "y": fp.Formula(lambda t: ca.tanh(t))},
     dead_time=fp.DeadTime(inputs={"force": 0.01}),
     sensing=fp.Sensing(sensors={"y": fp.Sensor(noise=fp.Noise(deviation=1e-4))}),
     horizon=fp.Horizon(stages=4, step=1e-2),
     cost=fp.Quadratic(states={"y": 10.0, "z": 10.0, "y'": 0.1}, deviation={"force": 1e-3, "lift": 1e-3}),
-    measure_from=0.02,
-    judged=("y", "z"),
+    measure_from=0.02, judged=("y", "z"),
 )
-tracking = fp.Exponential(rate=6.0)
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)
+tracking, optimiser = fp.Exponential(rate=6.0), fp.FixedPoint(iterations=1, tolerance=1e-2)
 controllers = {
     "CTC": fp.ComputedTorque(tracking),
     "CTC+FPI": fp.ComputedTorque(tracking, fp.Paired(fp.Sigmoid(gain=-0.2, scale=10.0), cycles=1)),
