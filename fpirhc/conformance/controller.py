@@ -184,6 +184,21 @@ def law_is_what_it_does(trial: _Trial, draw: Draw) -> Broken:
                 yield f"{words}, its law {type(law).__name__} says {gain:.6g}"
 
 
+def exact_model_tracks(trial: _Trial, draw: Draw) -> Broken:
+    """With an exact model, ideal sensors and no disturbance, the error of every judged coordinate goes to zero."""
+    plant, signals = trial.problem.plant, really_known(trial.problem.signals)
+    plant = replace(plant, parameters={n: replace(p, approximate=p.exact) for n, p in plant.parameters.items()})
+    run = trial.moved(replace(trial.problem, plant=plant, disturbances={}, sensing=Sensing(), signals=signals))
+    errors = np.abs(run["true_error"])
+    first, late = float(errors[0].max()), errors[-run.cycles // 4 :].max(axis=0)
+    if run.stop is not None or first == 0:
+        yield f"with the exact model the run begins with the error {first:g} and ends with {run.stop}; start off the reference"
+    for name, rest in zip(trial.problem.judged_names, late, strict=True):
+        if not within(rest, trial.left * first):
+            words = f"with the exact model the error of '{name}' is still {rest:.3g} in the last quarter of the run"
+            yield f"{words}, of {first:.3g} at first; more than the share {trial.left:g}"
+
+
 @without_warning()
 def _moved(problem: Problem, trial: _Trial) -> tuple[Run | None, str]:
     """A run on another problem, None where the controller refuses it for a reason of its own; what it raises where it does not."""
@@ -226,21 +241,6 @@ def facts_hold(trial: _Trial, draw: Draw) -> Broken:
     same += [with_field(ready, "optimiser", ready.planner.optimiser)] if ready.planner is not None else []
     if any(describe(one) != describe(ready) for one in same):
         yield "around its own inner controller, or with its own optimiser, it has another description"
-
-
-def exact_model_tracks(trial: _Trial, draw: Draw) -> Broken:
-    """With an exact model, ideal sensors and no disturbance, the error of every judged coordinate goes to zero."""
-    plant, signals = trial.problem.plant, really_known(trial.problem.signals)
-    plant = replace(plant, parameters={n: replace(p, approximate=p.exact) for n, p in plant.parameters.items()})
-    run = trial.moved(replace(trial.problem, plant=plant, disturbances={}, sensing=Sensing(), signals=signals))
-    errors = np.abs(run["true_error"])
-    first, late = float(errors[0].max()), errors[-run.cycles // 4 :].max(axis=0)
-    if run.stop is not None or first == 0:
-        yield f"with the exact model the run begins with the error {first:g} and ends with {run.stop}; start off the reference"
-    for name, rest in zip(trial.problem.judged_names, late, strict=True):
-        if not within(rest, trial.left * first):
-            words = f"with the exact model the error of '{name}' is still {rest:.3g} in the last quarter of the run"
-            yield f"{words}, of {first:.3g} at first; more than the share {trial.left:g}"
 
 
 @without_warning()

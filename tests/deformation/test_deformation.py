@@ -13,7 +13,7 @@ from fpirhc.conformance import check_deformation, examples
 from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidValue, NotSupported
 
-MAPS = examples("deformations")
+MAPS = examples("deformations", fp.Affine(gain=-0.5))
 ITERATING = tuple(m for m in MAPS if m.effective_gain() != 0)
 
 

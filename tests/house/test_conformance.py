@@ -172,22 +172,12 @@ def name_of(example: Any) -> str:
     return one.controller or type(one.value).__name__
 
 
-OWN_KIND = (
-    "ADRC",
-    "Cascade",
-    "ComputedTorque",
-    "ExactModel",
-    "PID",
-    "Predicted",
-    "RecedingHorizon",
-    "slots",
-    "L1 adaptive",
-)
+QUICK = "ADRC", "Cascade", "ComputedTorque", "ExactModel", "PID", "Predicted", "RecedingHorizon", "slots", "L1 adaptive"
 
 
 @pytest.mark.parametrize(
     "example",
-    [pytest.param(one, marks=[] if name_of(one) in OWN_KIND else pytest.mark.slow) for one in CONTROLLERS],
+    [pytest.param(one, marks=[] if name_of(one) in QUICK else pytest.mark.slow) for one in CONTROLLERS],
     ids=name_of,
 )
 def test_controller_laws(example):

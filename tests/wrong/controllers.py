@@ -145,6 +145,17 @@ class SaysItControlsMaps(Gentle):
         """Wrong."""
 
 
+class PushesAway(Gentle):
+    """Answers an error with the wrong sign."""
+
+    def blocks(self, built):
+        def turned(step, s):
+            said = step(s)
+            return {**said, "desired": 2 * said["nominal"] - said["desired"]}
+
+        return self.changed(built, "law", turned)
+
+
 class NotesAreOneText(Gentle):
     """Its notes are a text, which a report would write letter by letter."""
 

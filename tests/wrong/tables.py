@@ -14,6 +14,7 @@ CONTROLLERS = {
     controllers.TakesTheStateForTheOutput: ("what it takes it controls", "read plant.output and not plant.state"),
     controllers.IgnoresItsDeformation: ("deformation acts", "half of the effective gain 0.198"),
     controllers.NamesAnotherLaw: ("law is what it does", "fed back with 36, its law Exponential says 3600"),
+    controllers.PushesAway: ("exact model tracks", "with the exact model"),
     controllers.NotesAreOneText: ("facts hold", "its notes are 'It feeds"),
     controllers.SaysItControlsMaps: (
         "what it takes it controls",
