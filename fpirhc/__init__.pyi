@@ -11,7 +11,6 @@ from .controllers.replanning import FromPlan as FromPlan
 from .controllers.rivals.pid import PID as PID
 from .controllers.slotted import Slotted as Slotted
 from .controllers.wrappers.cascade import Cascade as Cascade
-from .controllers.wrappers.cascade import ThroughModel as ThroughModel
 from .controllers.wrappers.estimating import Estimating as Estimating
 from .controllers.wrappers.exact_model import ExactModel as ExactModel
 from .controllers.wrappers.predicted import Predicted as Predicted

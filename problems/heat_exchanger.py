@@ -69,8 +69,8 @@ problem = fp.Problem(
 static = fp.FeedforwardOnly()
 controllers = {
     "static inverse": static,
-    "Cascade": fp.Cascade(static, fp.Affine(gain=-1.0), fp.ThroughModel(lag=20.0)),  # s
-    "Cascade, last target": fp.Cascade(static, fp.Affine(gain=-0.1), paired=None),
+    "Cascade": fp.Cascade(static, fp.Affine(gain=-1.0), lag=20.0),  # s
+    "Cascade, last target": fp.Cascade(static, fp.Affine(gain=-0.1), lag=None),
     "static inverse, exact map": fp.ExactModel(static),
 }
 headline = ("static inverse", "Cascade")

@@ -130,7 +130,9 @@ controllers = {
         deformation=replace(
             people.controllers["cascade in mg/l"].deformation, map=fp.Filtered(fp.Affine(gain=-1.6), pole=0.85)
         ),
-        paired=fp.ThroughModel(lag=3.0, dead_time=0.65, plain=True),
+        lag=3.0,
+        dead_time=0.65,
+        plain=True,
     ),
 }
 headline, headline_metric = people.headline, people.headline_metric

@@ -281,7 +281,7 @@ problem = fp.Problem(
     measure_from=10.0,
 )
 pump = fp.FeedforwardOnly()
-late, paired = 0.65, fp.ThroughModel(lag=1.2, dead_time=0.65, plain=True)  # min
+late = 0.65  # min
 slow = fp.Filtered(fp.Affine(gain=-0.8), pole=0.85)
 MEDIAN = SimpleNamespace(**{name: one.approximate for name, one in model.parameters.items()})
 
@@ -309,12 +309,10 @@ controllers = {
         fp.Estimating(plan, filter, dead_time=fp.DeadTime(inputs={"target": late})), inputs=late
     ),
     "cascade in mg/l, model-referenced": fp.Cascade(
-        pump, InConcentration(fp.Affine(gain=-0.08)), fp.ThroughModel(lag=2.5, dead_time=late)
+        pump, InConcentration(fp.Affine(gain=-0.08)), lag=2.5, dead_time=late
     ),
-    "cascade": fp.Cascade(
-        pump, fp.Filtered(fp.Affine(gain=-0.6), pole=0.85), fp.ThroughModel(lag=1.3, dead_time=late, plain=True)
-    ),
-    "cascade in mg/l": fp.Cascade(pump, InConcentration(slow), paired),
+    "cascade": fp.Cascade(pump, fp.Filtered(fp.Affine(gain=-0.6), pole=0.85), lag=1.3, dead_time=late, plain=True),
+    "cascade in mg/l": fp.Cascade(pump, InConcentration(slow), lag=1.2, dead_time=late, plain=True),
 }
 headline = ("pump alone", "cascade in mg/l")
 why = (

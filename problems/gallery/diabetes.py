@@ -269,9 +269,7 @@ optimiser = fp.FixedPoint()
 controllers = {
     "PID": PerBasal({"sensor": -0.00275}),  # basal doses per mg/dl
     "RHC": fp.RecedingHorizon(optimiser),
-    "RHC+FPI on the target": fp.Cascade(
-        fp.RecedingHorizon(optimiser), fp.Affine(gain=-0.0005), fp.ThroughModel(lag=60.0)
-    ),
+    "RHC+FPI on the target": fp.Cascade(fp.RecedingHorizon(optimiser), fp.Affine(gain=-0.0005), lag=60.0),
 }
 headline = ("RHC", "RHC+FPI on the target")
 why = (

@@ -118,7 +118,7 @@ problem = fp.Problem(
 static = fp.FeedforwardOnly()
 controllers = {
     "static map": static,
-    "static map+FPI": fp.Cascade(static, fp.Affine(gain=-2.5), fp.ThroughModel(lag=0.0)),
+    "static map+FPI": fp.Cascade(static, fp.Affine(gain=-2.5), lag=0.0),
     "PI": fp.PID({"emission": 0.006}, {"emission": 0.4}),  # h/kg, 1/kg
 }
 headline = ("static map", "static map+FPI")

@@ -13,7 +13,7 @@ from helpers.plants import simulated
 import fpirhc as fp
 
 STATIC = fp.FeedforwardOnly()
-SETTLING, LAGGED = fp.ThroughModel(lag=20.0), fp.ThroughModel(lag=5.0)  # the heat exchanger's, and that of `linear`
+SETTLING, LAGGED = 20.0, 5.0  # the heat exchanger's, and that of `linear`
 
 
 def rms(problem: fp.Problem, controller: Any) -> tuple[float, float]:
@@ -37,9 +37,9 @@ def test_paired_through_the_model_every_gain_serves():
 def test_with_the_last_target_only_a_small_gain_serves():
     """The iteration goes on while the output is under way: from .2 it is a limit cycle, worse than no iteration."""
     without, _ = rms(tasks.heat_exchanger.problem, STATIC)
-    assert rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.05), paired=None))[0] < 0.125 * without
+    assert rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(0.05), lag=None))[0] < 0.125 * without
     for gain in (0.2, 0.5):
-        error, step = rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(gain), paired=None))
+        error, step = rms(tasks.heat_exchanger.problem, fp.Cascade(STATIC, affine(gain), lag=None))
         assert error > without
         assert step > 0.2
 
@@ -95,7 +95,7 @@ def test_the_limit_is_that_of_the_theory(gain):
 @pytest.mark.parametrize("gain", [0.5, 1.0])
 def test_the_plain_form_bears_every_slope_below_two_over_the_gain(gain):
     """Shift = F (1 - gain slope) shift with F a lag of gain one: |1 - gain slope| < 1 is enough where it is right."""
-    plain = fp.Cascade(STATIC, affine(gain), fp.ThroughModel(lag=5.0, plain=True))
+    plain = fp.Cascade(STATIC, affine(gain), lag=5.0, plain=True)
     for share, settles in ((0.97, True), (1.5, False)):  # the lag damps what is beyond the bound by less than a third
         problem = linear(share * 2 / gain, dead_time=fp.DeadTime(inputs={"u": 8.0}), period=1.0, duration=900.0)
         run = fp.simulate(problem, plain, seed=1, compiled=False)
@@ -135,9 +135,7 @@ def test_two_channels_have_lags_of_their_own():
         start={"a": 0.0, "b": 0.0},
         reference=fp.Trajectory(lambda t: {"a": 1 + 0 * t, "b": 0 * t - 1}),
     )
-    run = fp.simulate(
-        problem, fp.Cascade(STATIC, affine(0.6), fp.ThroughModel(lag=(5.0, 40.0))), seed=1, compiled=False
-    )
+    run = fp.simulate(problem, fp.Cascade(STATIC, affine(0.6), lag=(5.0, 40.0)), seed=1, compiled=False)
     assert run["error"][-1] == pytest.approx([0.0, 0.0], abs=1e-5)
 
 
@@ -146,8 +144,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "paired inside": (fp.Cascade(STATIC, fp.Paired(affine(0.5), cycles=3), LAGGED), "Paired pairs by itself"),
     "model-referenced inside": (fp.Cascade(STATIC, fp.ModelReferenced(affine(0.5)), LAGGED), "already compares"),
     "no scale": (fp.Cascade(STATIC, fp.Sigmoid(gain=-0.5), LAGGED), "scale"),
-    "two lags": (fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=(5.0, 3.0))), "1 controlled coordinates"),
-    "too late": (fp.Cascade(STATIC, affine(0.5), fp.ThroughModel(lag=5.0, dead_time=1e5)), "more than 1000"),
+    "two lags": (fp.Cascade(STATIC, affine(0.5), lag=(5.0, 3.0)), "1 controlled coordinates"),
+    "too late": (fp.Cascade(STATIC, affine(0.5), lag=5.0, dead_time=1e5), "more than 1000"),
 }
 
 
@@ -161,7 +159,7 @@ def test_what_cannot_work_is_refused(name):
 
 def test_what_adds_up_without_feedback_is_refused_inside() -> None:
     with pytest.raises(fp.FpirhcError, match="FeedforwardOnly does not cover outputs"):
-        simulated(sedated(hill(5.5)), fp.Cascade(STATIC, affine(0.3), fp.ThroughModel(lag=1.0)))
+        simulated(sedated(hill(5.5)), fp.Cascade(STATIC, affine(0.3), lag=1.0))
 
 
 # A cascade on outputs that are expressions of the state, and its way back from a limit
@@ -177,7 +175,7 @@ def test_a_cascade_around_a_controller_of_an_output_takes_its_error_away(inner: 
         "computed torque": (sedated(hill(5.5)), LAW),
         "receding horizon": (planned(), fp.RecedingHorizon(OPTIMISER)),
     }[inner]
-    cascade = fp.Cascade(controller, affine(0.3), fp.ThroughModel(lag=1.0))
+    cascade = fp.Cascade(controller, affine(0.3), lag=1.0)
     errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (controller, cascade)]
     assert errors[1] < 0.75 * errors[0]
 

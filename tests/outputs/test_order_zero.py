@@ -15,7 +15,7 @@ import fpirhc as fp
 from fpirhc.contracts import Controller
 
 STATIC = fp.FeedforwardOnly()
-AT_ONCE = fp.ThroughModel(lag=0.0)
+AT_ONCE = 0.0
 COLD, WARMER = 20.0, 4e-3  # Ohm, 1/K
 HEAT, LOSS = 50.0, 2.0  # J/K, W/K
 
@@ -91,7 +91,7 @@ def test_a_wrong_static_map_is_made_up_for() -> None:
     assert without > 50
     for gain in (0.3, 0.6, 1.0):
         assert rms(problem, fp.Cascade(STATIC, affine(gain), AT_ONCE)) < 0.06 * without, gain
-        assert rms(problem, fp.Cascade(STATIC, affine(gain), paired=None)) < 0.06 * without, gain
+        assert rms(problem, fp.Cascade(STATIC, affine(gain), lag=None)) < 0.06 * without, gain
 
 
 def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:

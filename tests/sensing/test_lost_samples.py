@@ -106,7 +106,7 @@ LOOPS: dict[str, tuple[fp.Problem, Controller]] = {
     ),
     "cascade": (
         seen(estimator=fp.PositionDifference()),
-        fp.Cascade(fp.ComputedTorque(TRACK), GENTLE, fp.ThroughModel(lag=0.01)),
+        fp.Cascade(fp.ComputedTorque(TRACK), GENTLE, lag=0.01),
     ),
     **{f"{type(b).__name__}-{k}": (seen(estimator=fp.Measured(), measured=["a", "b"], observer=b), fp.ComputedTorque(TRACK))
        for k, b in enumerate(BELIEFS)},

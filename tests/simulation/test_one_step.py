@@ -58,7 +58,7 @@ def sensed(estimator: Any, lost: float = 0.0) -> Callable[[], Loop]:
 def on_form(name: str) -> Callable[[], Loop]:
     """A form of the problem of one moved thing, with adaptation where its output has an order."""
     problem, order = FORMS[name]
-    static = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.3), fp.ThroughModel(lag=0.0))
+    static = fp.Cascade(fp.FeedforwardOnly(), fp.Affine(gain=-0.3), lag=0.0)
     return lambda: (problem, FPI if order else static)
 
 

@@ -19,7 +19,6 @@ from fpirhc.controllers.built import Built, compose_controller, embedded
 from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import InvalidValue, NotContractive, require
-from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
 from fpirhc.plant.motion import followed_units
@@ -94,48 +93,6 @@ def _places(plant: Plant) -> ca.DM:
     return ca.DM([[float(element == name) for name in plant.controlled_names] for element in plant.output.elements])
 
 
-@dataclass(frozen=True)
-class ThroughModel(Checked):
-    """The target passed through the model's dead time and lag.
-
-    Args:
-        lag: time constant with which the model follows a shift of its target, in the plant's unit of time; a tuple has one per
-            controlled coordinate, 0 settles within a cycle, as outputs of order 0 do.
-        dead_time: from a target to its measured output; None: that of the problem, for the slowest input.
-        plain: whether the output is compared with the reference, as in the published form, and the next target begins at the one in
-            force. It corrects a right model too, while that is under way, and is quiet at gains that limit-cycle otherwise.
-    """
-
-    lag: NotNegative | tuple[NotNegative, ...] = field(metadata={"structure": True})
-    dead_time: NotNegative | None = field(default=None, metadata={"structure": True})
-    plain: bool = field(default=False, metadata={"setting": "where given", "structure": True})
-
-    def decays(self, problem: Problem) -> ca.DM:
-        """Return rho of every controlled coordinate.
-
-        Raises:
-            InvalidValue: a wrong number of lags.
-        """
-        count, lags = len(problem.plant.controlled_names), every(self.lag)
-        if len(lags) not in (1, count):
-            raise InvalidValue(
-                f"{self!r}: there are {count} controlled coordinates; give one lag for each, or one for all"
-            )
-        rho = [math.exp(-problem.period / lag) if lag else 0.0 for lag in lags]
-        return ca.DM(rho * count if len(rho) == 1 else rho)
-
-    def queue(self, problem: Problem) -> Queue:
-        """Return the queue of targets, newest first: that of the last cycle.
-
-        Raises:
-            InvalidValue: more than 1000 cycles.
-        """
-        cycles = (problem.dead_time.longest if self.dead_time is None else self.dead_time) / problem.period
-        if cycles > MOST:
-            raise InvalidValue(f"{self!r}: {cycles:g} cycles of dead time, more than {MOST}")
-        return Queue(cycles)
-
-
 _RENAMED = {"reference": "target", "error": "target_error"}  # what the inner controller calls these
 _COMMANDS = {"_unclipped_last": "command_unclipped", "_command_last": "command"}
 
@@ -147,12 +104,19 @@ class Cascade(Controller):
     Args:
         controller: the inner one: `FeedforwardOnly()`, or any that follows the reference.
         deformation: the map on targets; a scale is in units of the output, and stated.
-        paired: which target an output belongs to, `ThroughModel(lag=...)`; None: that of the last cycle.
+        lag: an output belongs to the target that has passed the model's dead time and lag: the time constant with which the model
+            follows a shift of its target; a tuple has one per controlled coordinate, 0 settles within a cycle, as outputs of order
+            0 do. None: it belongs to the target of the last cycle.
+        dead_time: from a target to its measured output; None: that of the problem, for the slowest input.
+        plain: whether the output is compared with the reference, as in the published form, and the next target begins at the one in
+            force. It corrects a right model too, while that is under way, and is quiet at gains that limit-cycle otherwise.
     """
 
     controller: Controller
     deformation: Deformation
-    paired: ThroughModel | None
+    lag: NotNegative | tuple[NotNegative, ...] | None = field(metadata={"structure": True})
+    dead_time: NotNegative | None = field(default=None, metadata={"structure": True})
+    plain: bool = field(default=False, metadata={"setting": "where given", "structure": True})
 
     deforms = "target"
 
@@ -179,7 +143,7 @@ class Cascade(Controller):
             NotContractive: a gain of the wrong sign.
             NotSupported: a model-referenced map, or one with a pairing of its own; a controller that predicts over the dead time
                 inside.
-            InvalidValue: see `ThroughModel`; a scale that is not stated.
+            InvalidValue: a wrong number of lags; more than 1000 cycles of dead time; a scale that is not stated.
         """
         self.controller.check(self.inner_problem(problem))
         form, name = self.deformation.form, type(self.deformation).__name__
@@ -189,19 +153,26 @@ class Cascade(Controller):
             )
         require(
             not form.modelled,
-            "Cascade cannot use a model-referenced deformation: `paired` already compares with the model; use the map itself",
+            "Cascade cannot use a model-referenced deformation: `lag` already compares with the model; use the map itself",
         )
-        require(
-            not form.pairs, f"Cascade: {name} pairs by itself; give the map inside, and ThroughModel(dead_time=...)"
-        )
+        require(not form.pairs, f"Cascade: {name} pairs by itself; give the map inside, and Cascade(dead_time=...)")
         gain = self.deformation.effective_gain()
         if gain < 0:
             raise NotContractive(
                 f"Cascade: an effective gain of {gain:.3g} moves the target away from the reference; use the other sign"
             )
-        if self.paired is not None:
-            self.paired.decays(problem)
-            self.paired.queue(problem)
+        count, cycles = len(problem.plant.controlled_names), self._cycles(problem)
+        if len(every(self.lag or 0.0)) not in (1, count):
+            raise InvalidValue(
+                f"Cascade(lag={self.lag!r}): there are {count} controlled coordinates; give one lag for each, or one for all"
+            )
+        if cycles > MOST:
+            raise InvalidValue(f"Cascade: {cycles:g} cycles of dead time, more than {MOST}")
+
+    def _cycles(self, problem: Problem) -> float:
+        """Cycles from a target to its measured output."""
+        late = max((0.0, *problem.dead_time.inputs.values())) + problem.dead_time.measurement
+        return (late if self.dead_time is None else self.dead_time) / problem.period
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         inner = compose_controller(built.inner(self))
@@ -211,20 +182,21 @@ class Cascade(Controller):
 
     def _shift_block(self, built: Built) -> Block:
         """Block (reference, measured outputs, what a limit did to the last command) -> shift of the target."""
-        problem, plant, names, pairing = built.problem, built.plant, built.plant.controlled_names, self.paired
+        problem, plant, names, pairs = built.problem, built.plant, built.plant.controlled_names, self.lag is not None
         seen, places = plant.output, [plant.output.elements.index(n) for n in names]
         begun = problem.start_output[places]
         first = np.asarray(problem.reference.function(plant)(0.0)[0].full()).ravel()[places]
         away = tuple(map(float, begun - first))
-        own, plain = self.deformation.memory(names), pairing is not None and pairing.plain
-        queue, rho = (pairing.queue(problem), pairing.decays(problem)) if pairing else (Queue(0.0), ca.DM())
+        own, plain, queue = self.deformation.memory(names), pairs and self.plain, Queue(self._cycles(problem))
+        rho = ca.DM([math.exp(-built.period / lag) if lag else 0.0 for lag in every(self.lag or 0.0)])
+        rho = rho if rho.numel() == len(names) else ca.repmat(rho, len(names), 1)
         last: tuple[Signal, ...] = (
             # The plain form begins at the target in force from its first cycle on, and moves it once samples count.
             Signal("shift_last", names, start=away if plain else ()),
             Signal("target_last", names, start=tuple(map(float, begun))),
             scalar("shift_cycles"),
         )
-        if pairing:
+        if pairs:
             last += queue.memory("references_sent", names, tuple(map(float, first)))
             last += queue.memory("shifts_sent", names, (0.0,) * len(names))
             last += (Signal("shift_in_force", names, start=away),)
@@ -233,7 +205,7 @@ class Cascade(Controller):
         def step(s: Signals) -> dict[str, Expression]:
             wanted, output, before = s.reference[places], getattr(s, seen.name)[places], s.shift_last
             in_force, undeformed, later = s.target_last, wanted, dict[str, Expression]()
-            if pairing:
+            if pairs:
                 target, later = queue.arrived(s, "references_sent", wanted)
                 in_force = target + s.shift_in_force
                 undeformed = in_force - (s.shift_in_force if plain else before)
@@ -245,7 +217,7 @@ class Cascade(Controller):
             onwards = ca.logic_not(ca.dot(change - before, beyond - sent) < 0)  # NaN is no way back
             grows = ca.logic_and(ca.logic_and(s.clipped_last > 0.5, onwards), ca.fabs(change) > ca.fabs(before))
             shift = ca.if_else(running, ca.if_else(grows, before, change), before)
-            if pairing:
+            if pairs:
                 arrived, shifts = queue.arrived(s, "shifts_sent", shift)
                 later |= shifts | {"shift_in_force_next": rho * s.shift_in_force + (1 - rho) * arrived}
             return {
