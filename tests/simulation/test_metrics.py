@@ -120,16 +120,10 @@ def test_solves_are_summed_up_over_the_whole_run():
     iterations = np.repeat(np.arange(1.0, 11.0), 10)
     solve = np.column_stack([0 * iterations, iterations / 10, iterations / 100, iterations, 0 * iterations])
     metrics = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
-    assert metrics.solve == pytest.approx(
-        {
-            "median_iterations": 5.5,
-            "worst_iterations": 10,
-            "median_stationarity": 0.55,
-            "worst_stationarity": 1.0,
-            "worst_feasibility": 0.1,
-            "plans": 10,
-        }
-    )
+    wanted = {"median_iterations": 5.5, "worst_iterations": 10, "median_stationarity": 0.55, "worst_stationarity": 1.0}
+    assert metrics.solve == pytest.approx({**wanted, "worst_feasibility": 0.1, "plans": 10})
+    assert [metrics.text(f"solve.{name}") for name in ("worst_iterations", "worst_feasibility")] == ["10", "0.1"]
+    assert of_solves(np.zeros(CYCLES)).text("solve.worst_iterations") == "-"  # an optimiser that tells none
     assert fp.measure(problem(), run(0.0)).solve == {}
 
 
