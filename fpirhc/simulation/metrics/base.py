@@ -63,7 +63,7 @@ class Metric(Checked):
         finite: whether a run that finished must have a finite number.
         floor: size of a difference up to which two numbers count as equal.
         step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
-        order: place among the columns, smallest first.
+        order: place among the columns, smallest first; metrics of one place stand as they are listed.
         reads: names of the signals that its function reads; with 'cost' or 'contraction' a study computes these of every run.
 
     Raises:

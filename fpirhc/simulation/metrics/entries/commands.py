@@ -80,7 +80,7 @@ METRICS = (
         title="variation",
         headline=True,
         finite=True,
-        order=55,
+        order=50,
     ),
     Metric(
         "at_limit",
@@ -91,6 +91,6 @@ METRICS = (
         headline=True,
         finite=True,
         step=lambda _, cycles: 1.0 / cycles,
-        order=60,
+        order=50,
     ),
 )

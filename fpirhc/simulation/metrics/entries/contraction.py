@@ -100,8 +100,8 @@ METRICS = (
         title="contraction above 1",
         text=in_percent,
         compared="not",
-        order=85.5,
+        order=85,
         reads=("contraction",),
     ),
-    Metric("contraction.measured", measured, floor=1e-4, order=86, reads=("contraction",)),
+    Metric("contraction.measured", measured, floor=1e-4, order=85, reads=("contraction",)),
 )

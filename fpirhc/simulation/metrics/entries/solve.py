@@ -81,7 +81,7 @@ METRICS = (
         finite=True,
         order=90,
     ),
-    Metric("solve.worst_iterations", _over("iterations", np.max), text=iterations, report=False, finite=True, order=91),
+    Metric("solve.worst_iterations", _over("iterations", np.max), text=iterations, report=False, finite=True, order=90),
     Metric(
         "solve.median_stationarity",
         _over("stationarity", np.median),
@@ -90,9 +90,9 @@ METRICS = (
         short="residual",
         report=False,
         compared="not",
-        order=92,
+        order=90,
     ),
-    Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", compared="not", order=93),
-    Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=94),
-    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=95),
+    Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", compared="not", order=90),
+    Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, compared="not", order=90),
+    Metric("plans", plans, better="neither", report=False, compared="exact", finite=True, order=90),
 )
