@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fpirhc.errors import Mistakes
-from fpirhc.horizon.cost import Cost, View, read_by, read_by_cost
+from fpirhc.horizon.cost import View, read_by
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.layout import Expression, Named, Signal
@@ -34,16 +34,6 @@ class ConstraintState:
 def limited(limits: Limits, plant: Plant, view: View, step: float) -> list[ConstraintState]:
     """Limited expressions of state and input of stages 0 ... N-1: rates of inputs, and paths."""
     return [_entry_of(name, one, view) for name, one in limits.written(plant, step).items()]
-
-
-def check_feedforward(limits: Limits, plant: Plant, cost: Cost) -> None:
-    """Raise where a path reads the feedforward, which plans have only where the cost reads it."""
-    mistakes, known = Mistakes("limits"), read_by_cost(plant, cost)
-    for name, one in limits.paths.items():
-        if "feedforward" in _read_by(name, one, plant) - known:
-            way = "leave it out, or take a cost that reads it, such as Quadratic(deviation=...)"
-            mistakes.add(f"paths['{name}'] uses feedforward, which plans do not have here; {way}")
-    mistakes.raise_if_any()
 
 
 def read_before(limits: Limits, plant: Plant, step: float) -> bool:

@@ -13,7 +13,6 @@ from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import (
     ConstraintState,
-    check_feedforward,
     check_names,
     inside,
     limited,
@@ -164,7 +163,6 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
             x_next = stretched(x, applied, view.parameters.vector, length)
         else:
             x_next = advance(x, applied, view.parameters.vector)
-        check_feedforward(limits, plant, cost)
         written = _written(plant, horizon, limits, limited_view, x_next, data)
         terms = _scalar_terms(cost.stage(view))
         if horizon.blocks:
@@ -346,7 +344,7 @@ def _check_finite_limits(stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.
         if bad.size:
             mistakes.add(
                 f"'{entry.name}' is {row[bad[0]]} on the reference at stage {bad[0]}, expected a finite number; limit the "
-                f"argument of a root or a logarithm in its place"
+                "argument of a root or a logarithm in its place, and feedforward only where the cost reads it (deviation)"
             )
     mistakes.raise_if_any()
 
