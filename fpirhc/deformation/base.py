@@ -21,7 +21,7 @@ from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
-from fpirhc.task.dead_time import Cycles, every, several
+from fpirhc.task.dead_time import Cycles, every
 
 Wrapping = TypeVar("Wrapping")
 
@@ -71,8 +71,8 @@ class Form:
     @property
     def channels(self) -> int | None:
         """Number of controlled coordinates that it is made for; None: any number."""
-        rows = self.weights if self.weights is not None else several(self.cycles)
-        return len(rows) or None
+        rows = self.cycles if self.weights is None else self.weights
+        return len(rows) or None if isinstance(rows, tuple) else None
 
     def weighted(self, jacobian: np.ndarray) -> np.ndarray:
         """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""

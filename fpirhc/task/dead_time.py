@@ -185,8 +185,3 @@ def whole(cycles: float) -> int:
 def every(cycles: Cycles) -> tuple[float, ...]:
     """The dead times as a tuple, one entry where all channels share one."""
     return cycles if isinstance(cycles, tuple) else (cycles,)
-
-
-def several(cycles: Cycles) -> tuple[float, ...]:
-    """The dead times where each entry has its own; else an empty tuple."""
-    return cycles if isinstance(cycles, tuple) else ()
