@@ -293,24 +293,25 @@ def bad_measurement_never_acts(trial: _Trial, draw: Draw) -> Broken:
 
 def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> Broken:
     """Replay a run with one bad value in one cycle: of an entry of the state, or (None) of the whole response."""
-    run, lower, upper = trial.run, *trial.problem.limits.input_bounds(trial.problem.plant)
+    run, replay, lower, upper = trial.run, trial.replay, *trial.problem.limits.input_bounds(trial.problem.plant)
     # A stepper's gate keeps bad samples away; the controller itself must survive them too, inside of another one.
-    memory, status = trial.replay.memory, 0.0
-    for cycle in range(min(2 * _STEPS + 1, run.cycles)):
-        state, realised = run["state"][cycle].copy(), run["realised"][cycle]
-        matters = False
-        if cycle == _STEPS and entry is None:
-            realised = np.full_like(realised, bad)
-        elif cycle == _STEPS and entry is not None:
-            state[entry] += 0.1
-            moved = trial.replay.cycle(cycle, memory, state=state, realised=realised)
-            matters = not np.array_equal(moved["command"], run["command"][cycle])
-            state[entry] = bad
-        said = trial.replay.cycle(cycle, memory, state=state, realised=realised)
+    memory, matters, instead = (
+        replay.cycles[_STEPS - 1]["memory"],
+        False,
+        {"realised": np.full_like(run["realised"][0], bad)},
+    )
+    if entry is not None:
+        state = run["state"][_STEPS] + 0.1 * (np.arange(run["state"].shape[1]) == entry)
+        moved = replay.cycle(_STEPS, memory, state=state)["command"]
+        matters = not np.array_equal(moved, run["command"][_STEPS])
+        state[entry] = bad
+        instead = {"state": state}
+    for cycle in range(_STEPS, 2 * _STEPS + 1):
+        said = replay.cycle(cycle, memory, **(instead if cycle == _STEPS else {}))
         memory, command, status = said["memory"], said["command"], float(said["status"][0])
         if not (np.isfinite(command).all() and (command >= lower).all() and (command <= upper).all()):
             yield f"{what}: the command of cycle {cycle} is {command}"
-        if matters and status == Status.OK:
+        if cycle == _STEPS and matters and status == Status.OK:
             yield f"{what}: the status of that cycle is OK"
     if status == Status.NON_FINITE:
         yield f"{what}: {_STEPS} good measurements later the status is still NON_FINITE"

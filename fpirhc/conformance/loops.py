@@ -108,16 +108,11 @@ class Replay:
     @cached_property
     def cycles(self) -> list[Cycle]:
         """The first cycles of the run, each from the memory of the one before."""
-        cycles, memory = [], self.memory
+        cycles, memory = [], self._composite.memory.start()
         for k in range(min(self.run.cycles, REPLAYED)):
             cycles.append(self.cycle(k, memory))
             memory = cycles[-1]["memory"]
         return cycles
-
-    @property
-    def memory(self) -> Array:
-        """Before the first cycle."""
-        return self._composite.memory.start()
 
     @property
     def commands(self) -> Array:
