@@ -53,9 +53,9 @@ def task(name: str) -> tuple[fp.Problem, fp.RecedingHorizon]:
     limits = replace(case.limits, rates={})  # what they cut is not covered
     facts = {"limits": limits, "horizon": case.horizon, "cost": case.cost, "period": loop.period}
     problem = fp.Problem(plant=plant, reference=case.reference, start=start, duration=loop.duration, **facts)
-    plans = fp.FromPlan(fp.Exponential(loop.rate, integral=False), room=loop.room)
+    plans = {"tracking": fp.Exponential(loop.rate, integral=False), "room": loop.room}
     map_ = fp.ModelReferenced(fp.Affine(-2 * loop.gain))
-    return problem, fp.RecedingHorizon(fp.FixedPoint(iterations=200, tolerance=1e-7), map_, plans)
+    return problem, fp.RecedingHorizon(fp.FixedPoint(iterations=200, tolerance=1e-7), map_, **plans)
 
 
 def drawn(box: dict[str, tuple[float, float]], count: int) -> np.ndarray:

@@ -54,7 +54,7 @@ controllers = {
     "CTC": fp.ComputedTorque(tracking),
     "CTC+FPI": fp.ComputedTorque(tracking, fp.Paired(fp.Sigmoid(gain=-0.2, scale=10.0), cycles=1)),
     "RHC": fp.RecedingHorizon(optimiser),
-    "RHC+FPI": fp.RecedingHorizon(optimiser, fp.Filtered(fp.Affine(gain=-0.3), pole=0.2), replanning=fp.FromPlan(tracking)),
+    "RHC+FPI": fp.RecedingHorizon(optimiser, fp.Filtered(fp.Affine(gain=-0.3), pole=0.2), tracking=tracking),
     "late": fp.Predicted(fp.ComputedTorque(tracking), inputs=0.01),
     "PID": fp.PID(proportional={"y": 9.0, "z": 9.0}, derivative={"y": (5.0,), "z": (5.0,)}),
 }

@@ -6,8 +6,6 @@ from .controllers import rivals as rivals
 from .controllers.computed_torque import ComputedTorque as ComputedTorque
 from .controllers.computed_torque import FeedforwardOnly as FeedforwardOnly
 from .controllers.receding_horizon import RecedingHorizon as RecedingHorizon
-from .controllers.replanning import FromMeasurement as FromMeasurement
-from .controllers.replanning import FromPlan as FromPlan
 from .controllers.rivals.pid import PID as PID
 from .controllers.slotted import Slotted as Slotted
 from .controllers.wrappers.cascade import Cascade as Cascade

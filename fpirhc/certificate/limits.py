@@ -72,7 +72,7 @@ def certify_limits(
         if certificate.holds:
             fp.simulate(certificate.problem, certificate.controller, seed=0)
 
-    The controller tracks its reference or its plans (`ComputedTorque`, `RecedingHorizon` with `FromPlan(..., room=...)`) with a law
+    The controller tracks its reference or its plans (`ComputedTorque`, `RecedingHorizon(..., tracking=law, room=...)`) with a law
     without integral and the deformation `ModelReferenced(Affine(...))`. Plans get margins where limits of states may be passed.
     The theorem and its proof: docs/certificate.md.
 
@@ -143,9 +143,9 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     if planner is None and tracking_law(ready) is None:
         yield "it has no tracking law"
     if planner is not None and planner.restarts:
-        yield "its plans start from the measured state; use RecedingHorizon(..., replanning=FromPlan(law, room=...))"
+        yield "its plans start from the measured state; use RecedingHorizon(..., tracking=law, room=...)"
     if planner is not None and not planner.independent:
-        yield "its plans depend on the plant; say what they leave for feedback, FromPlan(law, room={...})"
+        yield "its plans depend on the plant; say what they leave for feedback, RecedingHorizon(..., room={...})"
 
 
 def _hard(problem: Problem) -> list[str]:
@@ -195,7 +195,7 @@ def _centre(problem: Problem, loop: Simulator, lower: np.ndarray, upper: np.ndar
         when = problem.period * int(np.argmax(run["clipped"].ravel() > 0))
         return (
             f"the run with the parameters {middle} clips a command at t = {when:g} {problem.time_unit}; wider limits of inputs, "
-            "more room of FromPlan or a slower law may mend it"
+            "more room or a slower law may mend it"
         )
     return Centre(run["state"].T, run["command"].T, run["desired"].T, lower, upper)
 
@@ -233,7 +233,7 @@ def _beyond_inputs(problem: Problem, commands: Mapping[str, tuple[float, float]]
         if over > 0:
             yield (
                 f"input '{name}' may need {low:.4g} to {high:.4g} {unit}, beyond its limits ({least:g}, {most:g}) by {over:.3g}; "
-                "so much more room of FromPlan, wider limits or a smaller mismatch may mend it"
+                "so much more room, wider limits or a smaller mismatch may mend it"
             )
 
 

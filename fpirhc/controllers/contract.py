@@ -290,7 +290,8 @@ def _require_once(wrapper: Controller) -> None:
 
 def tracking_law(controller: Controller) -> Tracking | None:
     """Return the law with which a controller tracks the reference: the field `tracking` of the innermost one; None without."""
-    return getattr(innermost(controller), "tracking", None)
+    inner = innermost(controller)
+    return None if inner.planner is not None else getattr(inner, "tracking", None)
 
 
 _Own = TypeVar("_Own", bound=Controller)

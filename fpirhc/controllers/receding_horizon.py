@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -12,17 +12,18 @@ from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Planner
 from fpirhc.controllers.replanning import (
-    FromMeasurement,
-    Replanning,
     as_planned,
     at_consistent_start,
     consistent_start,
     first_memory_of,
+    from_measurement,
+    from_plan,
     held_model,
 )
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.stage_data import offset_limits, shifted_reference
@@ -39,6 +40,7 @@ from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, l
 from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
+from fpirhc.tracking.base import Tracking
 
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
@@ -50,29 +52,40 @@ class RecedingHorizon(Controller):
     Args:
         optimiser: finds the plan.
         deformation: the map between desired response and request; Identity() is plain receding-horizon control.
-        replanning: where each horizon starts and what is tracked in between (FromMeasurement, FromPlan).
+        tracking: the law that keeps the plant on the planned motion, which then starts from the model's own state; None: every plan
+            starts from the measured state, and its first response is the desired one.
         cost: of the plan; None: the problem's.
+        room: by name of an input, what plans leave of its range at both ends, for `tracking` and deformation; 0 where not named. A
+            plan then depends on the plans before it alone, whatever the plant does, which a certificate needs. None: plans have the
+            range less the deformation of the last cycle, so they depend on the plant.
+        consistent: whether a plan on outputs from the measured state starts at the state at which the model has measured outputs
+            and derivatives, see `fpirhc.horizon.nominal`; None: where a deformation, or a believed disturbance of the response,
+            makes the plant's response that of the plan: the plant then moves as it foresees. Coordinates are always consistent.
         follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
             `fpirhc.controllers.replanning` and `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
 
     optimiser: Optimiser
     deformation: Deformation = field(default_factory=Identity)
-    replanning: Replanning = field(default_factory=FromMeasurement)
+    tracking: Tracking | None = None
     cost: Cost | None = None
+    room: Mapping[str, NotNegative] | None = field(
+        default=None, kw_only=True, hash=False, metadata={"setting": "where given"}
+    )
+    consistent: bool | None = field(default=None, kw_only=True, metadata={"setting": False})
     follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
 
     @property
     def planner(self) -> Planner:
-        ways = self.replanning
-        facts = (ways.consistent, self.deformation.adapts, self.follows_model, ways.room is not None)
-        return Planner(self.optimiser, self.cost, ways.restarts, ways.law, *facts)
+        restarts, law = self.tracking is None, self.tracking
+        facts = (not restarts or self.consistent, self.deformation.adapts, self.follows_model, self.room is not None)
+        return Planner(self.optimiser, self.cost, restarts, law, *facts)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         sensing, planner = problem.sensing, self.planner
         given = sensing.observer is None and sensing.delay(problem.plant, problem.period) > 0
         text = "its plans start where the model has the estimated outputs, and those without adaptation at the given state, so the "
-        text += "pair differs with a right model too; FromMeasurement(consistent=False) starts both at the state"
+        text += "pair differs with a right model too; consistent=False starts both at the state"
         return (text,) if given and planner.consistent is None and planner.starts_consistent(problem.plant) else ()
 
     def check(self, problem: Problem) -> None:
@@ -86,16 +99,20 @@ class RecedingHorizon(Controller):
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
-        _room(problem, self.replanning)
+        if self.room is not None and self.tracking is None:
+            raise InvalidProblem(
+                "RecedingHorizon: room is what plans leave for `tracking`; give the law, or leave it out"
+            )
+        _room(problem, self.room)
         self.planner.check_weights(problem)
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         problem, plant, cycles = built.planned, built.plant, built.every
         assert problem is not None
-        before, after, late, remembered = self.replanning.parts(built)
-        room = _room(problem, self.replanning)
-        same = built.problem, self.optimiser, self.replanning, self.cost
+        parts = from_measurement(built) if self.tracking is None else from_plan(built, self.tracking)
+        (before, after, late, remembered), room = parts, _room(problem, self.room)
+        same = built.problem, self.optimiser, self.tracking, self.cost, self.room, self.consistent
         others = self.deformation.adapts, self.follows_model, plans_are_compiled()
         plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
         closing, delays = closing_blocks(built, self.deformation, [scalar("_solve_status")])
@@ -143,19 +160,19 @@ def _due_block(cycles: int) -> Block:
 _PLANNED_BEFORE = "_planned_before"
 
 
-def _room(problem: Problem, replanning: Replanning) -> np.ndarray | None:
+def _room(problem: Problem, given: Mapping[str, float] | None) -> np.ndarray | None:
     """What plans leave of the range of every input, shape (nu,); None: their range less the deformation of the last cycle."""
-    if replanning.room is None:
+    if given is None:
         return None
     names = list(problem.plant.inputs)
-    for name in replanning.room:
+    for name in given:
         if name not in names:
-            raise InvalidName(f"{type(replanning).__name__}: room of input '{name}' is unknown.{nearest(name, names)}")
-    room = np.array([float(replanning.room.get(name, 0.0)) for name in names])
+            raise InvalidName(f"RecedingHorizon: room of input '{name}' is unknown.{nearest(name, names)}")
+    room = np.array([float(given.get(name, 0.0)) for name in names])
     for name, low, high, own in zip(names, *problem.limits.input_bounds(problem.plant), room, strict=True):
         if low + own >= high - own:
             raise InvalidProblem(
-                f"{type(replanning).__name__}: a room of {own:g} leaves nothing of input '{name}' between {low:g} and {high:g}; "
+                f"RecedingHorizon: a room of {own:g} leaves nothing of input '{name}' between {low:g} and {high:g}; "
                 f"less than {0.5 * (high - low):g} leaves something"
             )
     return room
@@ -165,7 +182,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
-    optimiser, restarts = controller.optimiser, controller.replanning.restarts
+    optimiser, restarts = controller.optimiser, controller.tracking is None
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
     preview = problem.reference.preview(plant, horizon.nodes)
     data_of = ocp.data_of(previewed=preview is not None)

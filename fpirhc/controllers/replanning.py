@@ -1,17 +1,13 @@
-"""Where a horizon starts and what is tracked between two plans: three choices. Theory: docs/theory.md."""
+"""Where a horizon starts and what is tracked between two plans. Theory: docs/theory.md."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.built import Built
-from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.nominal import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser, first_memory
@@ -26,100 +22,36 @@ from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
+# blocks before the plan (-> _plan_state), after it (-> nominal, desired), after the command is limited; what is remembered
 Parts = tuple[list[Block], list[Block], list[Block], list[Delay]]
 
 
-class Replanning(Checked, ABC):
-    """Contract: blocks before the plan (-> _plan_state), after it (-> nominal, desired), after the command; delays."""
+def from_measurement(built: Built) -> Parts:
+    """Plan from the measured state; the plan's first response is the desired one."""
+    plant = built.plant
+    start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
+    response = without_disturbances(plant).equations.controlled_response
+    reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
+    writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
 
-    @property
-    @abstractmethod
-    def restarts(self) -> bool:
-        """Whether every plan starts from the measured state."""
+    def step(s: Signals) -> dict[str, Expression]:
+        planned = response(s.state, s.planned, s.parameters)
+        return {"nominal": planned, "desired": planned}
 
-    @property
-    def consistent(self) -> bool | None:
-        """Whether a plan on outputs starts at the state at which the model has the measured ones; see `FromMeasurement`."""
-        return True
-
-    @property
-    def law(self) -> Tracking | None:
-        """The law that keeps the plant on the planned motion between plans, by default `tracking`; None: nothing does.
-
-        Then the plan's response is the desired one.
-        """
-        return getattr(self, "tracking", None)
-
-    @property
-    def room(self) -> Mapping[str, float] | None:
-        """What plans leave of every input's range at both ends; None: its range less the last cycle's deformation."""
-        return None
-
-    @abstractmethod
-    def parts(self, built: Built) -> Parts:
-        """Return the blocks before the plan, after the plan, and after the command is limited; and what is remembered."""
-
-
-@dataclass(frozen=True)
-class FromMeasurement(Replanning):
-    """Plan from the measured state; the plan's first response is the desired one, without a tracking law.
-
-    Args:
-        consistent: whether a plan on outputs starts at the state at which the model has the measured outputs and derivatives, see
-            `fpirhc.horizon.nominal`; None: where a deformation, or a believed disturbance of the response, makes the
-            plant's response that of the plan: the plant then moves as that plan foresees. Coordinates are always consistent.
-    """
-
-    consistent: bool | None = field(default=None, kw_only=True, metadata={"setting": False})
-
-    restarts = True
-
-    def parts(self, built: Built) -> Parts:
-        plant = built.plant
-        start = _choose("plan_state", plant, lambda s: {"_plan_state": s.state}, ["_plan_state"])
-        response = without_disturbances(plant).equations.controlled_response
-        reads = Layout((plant.state, like(plant.input, "planned"), plant.parameter))
-        writes = Layout((plant.response_signal("nominal"), plant.response_signal("desired")))
-
-        def step(s: Signals) -> dict[str, Expression]:
-            planned = response(s.state, s.planned, s.parameters)
-            return {"nominal": planned, "desired": planned}
-
-        return [start], [Block("nominal", reads, writes, step)], [], []
-
-
-@dataclass(frozen=True)
-class FromPlan(Replanning):
-    """Plan from the model's own state and track the planned motion.
-
-    Args:
-        tracking: the law that keeps the plant on the planned motion.
-        room: by name of an input, what plans leave of its range at both ends, for tracking and deformation; 0 where not named.
-            A plan then depends on the plans before it alone, whatever the plant does, which a certificate needs. None: plans have
-            the range less the deformation of the last cycle, so they depend on the plant.
-    """
-
-    tracking: Tracking
-    room: Mapping[str, NotNegative] | None = field(
-        default=None, kw_only=True, hash=False, metadata={"setting": "where given"}
-    )
-
-    restarts = False
-
-    def parts(self, built: Built) -> Parts:
-        def start(s: Signals) -> dict[str, Expression]:
-            target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
-            return {"_plan_state": target, _FOLLOWED: target}
-
-        return _tracked(built, self.tracking, start)
+    return [start], [Block("nominal", reads, writes, step)], [], []
 
 
 _FOLLOWED = "_followed_state"  # of the model on the planned motion
 
 
-def _tracked(built: Built, tracking: Tracking, start: Callable[[Signals], dict[str, Expression]]) -> Parts:
-    plant = built.plant
-    law = tracking.within(built.largest)
+def from_plan(built: Built, tracking: Tracking) -> Parts:
+    """Plan from the model's own state, and keep the plant on the planned motion by a law."""
+    plant, law = built.plant, tracking.within(built.largest)
+
+    def start(s: Signals) -> dict[str, Expression]:
+        target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)
+        return {"_plan_state": target, _FOLLOWED: target}
+
     begin = _choose("plan_state", plant, start, ["_plan_state", _FOLLOWED])
     delay = Delay(like(plant.state, "_target_before"), "target")
     after = [_propagate(plant, built.period), law.law(plant, built.period)]

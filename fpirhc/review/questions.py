@@ -420,9 +420,7 @@ def cures(case: Case) -> dict[str, str]:
     late = "have the stated dead time right to one cycle" if predictor(own) else late
     other = [late] * bool(problem.dead_time.queued) + ["shorten the window of the estimator"] * window
     starts = own.planner and own.planner.restarts and own.planner.starts_consistent(problem.plant)
-    ways = (
-        "RecedingHorizon(replanning=FromMeasurement(consistent=False)), " * bool(starts) + "a shorter window, " * window
-    )
+    ways = "RecedingHorizon(consistent=False), " * bool(starts) + "a shorter window, " * window
     ways = f"the start of the plan or the estimator's window is the cause: {ways}or leave" if ways else "leave"
     known = f"Its map is model-referenced already: {ways}", "Use ModelReferenced(map), or leave"
     told = {"referenced": known[own.deformation.form.compares != "model"], "sensor": sensor, "settings": settings, "dead": late,

@@ -119,7 +119,7 @@ controllers = {
     "CTC+FPI, fractional": fp.ComputedTorque(fp.Fractional(rate=1.5, order=0.7), sigmoid),
     "CTC+FPI, model-referenced": fp.ComputedTorque(tracking, fp.ModelReferenced(sigmoid)),
     "RHC": fp.RecedingHorizon(optimiser),
-    "RHC consistent": fp.RecedingHorizon(optimiser, replanning=fp.FromMeasurement(consistent=True)),
+    "RHC consistent": fp.RecedingHorizon(optimiser, consistent=True),
     "RHC+FPI, model-referenced": fp.RecedingHorizon(optimiser, fp.ModelReferenced(sigmoid)),
     "RHC+FPI": fp.RecedingHorizon(optimiser, sigmoid),
     "RHC exact model": fp.ExactModel(fp.RecedingHorizon(optimiser)),

@@ -52,7 +52,7 @@ def test_plans_with_room_do_not_depend_on_the_plant():
     for name in ("planned", "target", "nominal"):
         assert np.array_equal(one[name], two[name])
     assert np.abs(one["planned.Q1"]).max() <= 4.0 - 0.8 + 1e-9
-    without = replace(controller, replanning=replace(controller.replanning, room=None))
+    without = replace(controller, room=None)
     one, two = (fp.simulate(p, without, seed=0) for p in (problem, other))
     assert not np.array_equal(one["planned"], two["planned"])
 
@@ -166,17 +166,16 @@ def test_what_else_the_theorem_does_not_cover_is_refused():
     rated = replace(problem, limits=fp.Limits(inputs={"F": (-10.0, 10.0)}, rates={"F": (-50.0, 50.0)}))
     with pytest.raises(NotSupported, match="hard limits of rates"):
         fp.certify_limits(rated, controller, mismatch=5)
-    for ways, words in (
-        (fp.FromMeasurement(), "FromPlan"),
-        (replace(planned.replanning, room=None), "depend on the plant"),
-    ):
+    for ways, words in (({"tracking": None, "room": None}, "tracking=law"), ({"room": None}, "depend on the plant")):
         with pytest.raises(NotSupported, match=words):
-            fp.certify_limits(tanks, replace(planned, replanning=ways), mismatch=5)
+            fp.certify_limits(tanks, replace(planned, **ways), mismatch=5)
     for room, words, error in (
         ({"Q3": 1.0}, "'Q3' is unknown", InvalidName),
         ({"Q1": 2.0}, "leaves nothing", InvalidProblem),
     ):
         with pytest.raises(error, match=words):
-            replace(planned, replanning=replace(planned.replanning, room=room)).check(tanks)
+            replace(planned, room=room).check(tanks)
     with pytest.raises(InvalidValue, match="room"):
-        replace(planned.replanning, room={"Q1": -1.0})
+        replace(planned, room={"Q1": -1.0})
+    with pytest.raises(InvalidProblem, match="give the law"):
+        replace(planned, tracking=None).check(tanks)

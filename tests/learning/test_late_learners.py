@@ -129,10 +129,8 @@ def test_a_response_shows_its_disturbance_at_once():
 # Estimates that act in every cycle
 
 
-def offset_free(at_once: bool, replanning: Any = None) -> fp.Estimating:
-    plan = fp.RecedingHorizon(
-        fp.FixedPoint(iterations=3, tolerance=1e-6), replanning=replanning or fp.FromMeasurement()
-    )
+def offset_free(at_once: bool, tracking: Any = None) -> fp.Estimating:
+    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6), tracking=tracking)
     return fp.Estimating(plan, fp.DisturbanceKalman({"y": 20.0}, {"y": 1e-4, "y'": 1e-3}), at_once=at_once)
 
 

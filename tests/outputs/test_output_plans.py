@@ -60,10 +60,10 @@ def test_behind_an_estimator_a_right_model_is_left_alone_by_plans_from_the_given
     problem = replace(servo(1.3, states={}), sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=15, degree=2)))
     right = problem.with_exact(problem.plant.approximate)
     plain, usual = fp.RecedingHorizon(SOLVED), fp.RecedingHorizon(SOLVED, ADAPTIVE)
-    given = fp.RecedingHorizon(SOLVED, ADAPTIVE, fp.FromMeasurement(consistent=False))
+    given = fp.RecedingHorizon(SOLVED, ADAPTIVE, consistent=False)
     errors = [fp.measure(right, simulated(right, one)).rms_error["y"] for one in (plain, given, usual)]
     assert errors[1] == pytest.approx(errors[0], rel=1e-6)
     assert errors[2] > 1.5 * errors[0]
     assert [len(one.notes(problem)) for one in (plain, given, usual)] == [0, 0, 1]
-    assert "FromMeasurement(consistent=False)" in usual.notes(problem)[0]
+    assert "consistent=False" in usual.notes(problem)[0]
     assert usual.notes(replace(problem, sensing=fp.Sensing())) == ()

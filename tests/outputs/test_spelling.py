@@ -45,7 +45,7 @@ LOOPS: dict[str, Callable[[], tuple[Controller, fp.Problem]]] = {
         for name, controller, changes in (
             ("rate", fp.rivals.ResolvedAccelerationRate(rate=6.0), {}),  # the measured responses move the states of a wrong model
             ("disturbed", "RHC+FPI", PUSHED),
-            ("plan", fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), MAP, fp.FromPlan(TRACK)), {}),
+            ("plan", fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), MAP, TRACK), {}),
             ("late", "RHC+FPI", LATE),
             ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
@@ -161,7 +161,7 @@ def agree(states: fp.Problem, coordinates: fp.Problem, controller: Controller) -
     return run
 
 
-REPLANNING = {"measured": fp.FromMeasurement(), "own": fp.FromPlan(fp.Exponential(rate=4.0))}
+REPLANNING = {"measured": None, "own": fp.Exponential(rate=4.0)}
 
 
 @pytest.mark.parametrize("way", slow_but(REPLANNING, "own"))
@@ -177,7 +177,7 @@ def test_so_are_tracked_plans_without_adaptation(name: str) -> None:
     """From a start at which model and plant have other derivatives; what the law adds is passed through the same inverse."""
     wrong = np.random.default_rng(3).uniform(0.6, 1.6, 3)
     states, coordinates = both(PLANTS[name](wrong), {"x0": 0.4, "x1": -0.2})
-    run = agree(states, coordinates, fp.RecedingHorizon(OPTIMISER, replanning=REPLANNING["own"]))
+    run = agree(states, coordinates, fp.RecedingHorizon(OPTIMISER, tracking=REPLANNING["own"]))
     assert np.abs(run["desired"] - run["nominal"]).max() > 0.1
 
 
@@ -186,7 +186,7 @@ def test_so_are_plans_without_adaptation_that_start_there(name: str) -> None:
     """From a start at which model and plant have other derivatives; the inverse returns the planned input."""
     wrong = np.random.default_rng(3).uniform(0.6, 1.6, 3)
     states, coordinates = both(PLANTS[name](wrong), {"x0": 0.4, "x1": -0.2})
-    controller = fp.RecedingHorizon(OPTIMISER, replanning=fp.FromMeasurement(consistent=True))
+    controller = fp.RecedingHorizon(OPTIMISER, consistent=True)
     run = agree(states, coordinates, controller)
     np.testing.assert_allclose(run["command"], run["planned"], atol=1e-12)
     free = simulated(states, fp.RecedingHorizon(OPTIMISER))

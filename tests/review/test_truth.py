@@ -138,7 +138,7 @@ CASES: dict[str, Case] = {
     "a map of a right model behind a window that is too long": Case(
         lambda: (replace(reviewed.lift(), sensing=fp.Sensing({}, fp.SavitzkyGolay(41, 3))), {"it": sigmoid(-2.0)}),
         {("it", "model"): "no"},
-        changes={("it", "model"): f"{START}replanning=FromMeasurement(consistent=False)), a shorter window, {LEAVE}"},
+        changes={("it", "model"): f"{START}consistent=False), a shorter window, {LEAVE}"},
     ),
     "an inverse with two branches": Case(
         foreign("cstr", "RHC", "RHC+FPI"),
