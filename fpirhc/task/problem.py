@@ -93,6 +93,7 @@ class Problem(Checked):
         for name, value in settled_maps(self, mistakes).items():
             object.__setattr__(self, name, value)
         mistakes.raise_if_any()
+        object.__setattr__(self, "dead_time", self.dead_time.over(self.period))
         check_problem(self)
 
     def __repr__(self) -> str:
