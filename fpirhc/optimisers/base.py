@@ -93,11 +93,6 @@ def built(optimiser: Optimiser, ocp: OptimalControl, make: Callable[[OptimalCont
     return ocp.functions[key]
 
 
-def stage_later(columns: ca.MX) -> ca.MX:
-    """Return the columns without the first stage and with the last one twice."""
-    return columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])
-
-
 def shift(columns: ca.MX, ocp: OptimalControl, node: int = 0) -> ca.MX:
     """Return one column per stage for the next horizon: the warm start of the next call.
 
@@ -105,7 +100,8 @@ def shift(columns: ca.MX, ocp: OptimalControl, node: int = 0) -> ca.MX:
     of the first column: 1 for s_1 ... s_N.
     """
     shares = np.append(ocp.shares, ocp.shares[-1])[None, node : node + columns.shape[1]]
-    return _moved(columns, stage_later(columns), shares)
+    later = columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])  # the last one twice
+    return _moved(columns, later, shares)
 
 
 def shift_gains(gains: ca.MX, size: int, ocp: OptimalControl) -> ca.MX:

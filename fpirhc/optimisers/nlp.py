@@ -74,10 +74,12 @@ class MultipleShooting(Optimiser):
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         parts = self.memory(ocp).split(memory)
+        states, inputs = separate(ocp, parts["plan_variable_multipliers"])
+        dynamics = ca.reshape(parts["plan_dynamics_multipliers"], ocp.state.size, ocp.stages)
         shifted_parts = {
             "plan_inputs": ca.vec(shift(ca.reshape(parts["plan_inputs"], ocp.input.size, ocp.stages), ocp)),
-            "plan_variable_multipliers": shift_variables(ocp, parts["plan_variable_multipliers"]),
-            "plan_dynamics_multipliers": shift_dynamics(ocp, parts["plan_dynamics_multipliers"]),
+            "plan_variable_multipliers": interleave(shift(states, ocp), shift(inputs, ocp)),
+            "plan_dynamics_multipliers": ca.vec(shift(dynamics, ocp)),
         }
         return self.memory(ocp).join(shifted_parts)
 
@@ -185,18 +187,6 @@ def separate(ocp: OptimalControl, column: ca.MX) -> tuple[ca.MX, ca.MX]:
 def _stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
     """Return the bounds of s_0 ... s_N; the first state is fixed."""
     return ca.horzcat(s0, ca.repmat(ca.DM(bound), 1, ocp.stages))
-
-
-def shift_variables(ocp: OptimalControl, column: ca.MX) -> ca.MX:
-    """Return variables, or their multipliers, one stage later."""
-    states, inputs = separate(ocp, column)
-    return interleave(shift(states, ocp), shift(inputs, ocp))
-
-
-def shift_dynamics(ocp: OptimalControl, column: ca.MX) -> ca.MX:
-    """Return multipliers of the dynamics one stage later."""
-    stages: ca.MX = ca.reshape(column, ocp.state.size, ocp.stages)
-    return ca.vec(shift(stages, ocp))
 
 
 class Units(NamedTuple):

@@ -129,15 +129,12 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[st
     }
     folder = resources.files("fpirhc.optimisers")
     texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
-    costates = _costates(ocp, leaves["hessian"])
+    hessian = leaves["hessian"]
+    needed = any(hessian.jac_sparsity(k, 3).nnz() for k in range(hessian.n_out()))
+    # Those of all nodes stay where second derivatives need them, else of the end and two others.
+    costates = ocp.stages + 1 if needed else min(ocp.stages + 1, 3)
     constants = {**_sizes(ocp), "COSTATES": costates, **_metric(ocp), **_constants(ocp, settings), **stops}
     return Driver("\n".join(texts), leaves, constants, _room(ocp, costates))
-
-
-def _costates(ocp: OptimalControl, hessian: ca.Function) -> int:
-    """Number of costates that stay: those of all nodes where second derivatives need them, else of the end and two others."""
-    needed = any(hessian.jac_sparsity(k, 3).nnz() for k in range(hessian.n_out()))
-    return ocp.stages + 1 if needed else min(ocp.stages + 1, 3)
 
 
 def _room(ocp: OptimalControl, costates: int) -> int:

@@ -196,10 +196,9 @@ def _bends(plant: Plant, k: int) -> bool:
 def _point(plant: Plant, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A random (state, response, parameters)."""
     state = random.standard_normal(plant.state.size)
-    return state, 10 * random.standard_normal(len(plant.names)), _varied(plant, random)
-
-
-def _varied(plant: Plant, random: np.random.Generator) -> np.ndarray:
-    sizes = np.maximum(np.abs(plant.approximate), np.abs(plant.exact))
+    response, sizes = (
+        10 * random.standard_normal(len(plant.names)),
+        np.maximum(abs(plant.approximate), abs(plant.exact)),
+    )
     sizes[sizes == 0] = 1.0
-    return np.asarray(plant.approximate + _SPREAD * sizes * random.uniform(-1, 1, size=sizes.size))
+    return state, response, plant.approximate + _SPREAD * sizes * random.uniform(-1, 1, size=sizes.size)
