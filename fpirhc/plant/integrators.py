@@ -300,8 +300,9 @@ def stiffness(
     remedy = f"RungeKutta4(substeps={substeps})" if few else "Collocation()"
     needed = "" if few else f"; RungeKutta4 would need {substeps} sub-steps"
     rate = f"1/{plant.time_unit}"
+    beside = "" if abs(fastest.imag) <= 1e-9 * abs(fastest) else f" +- {abs(fastest.imag):.4g}i"
     return (
-        f"a mode decays with the pole {_text(fastest)} {rate}, which times the period of {period:g} {plant.time_unit} is "
+        f"a mode decays with the pole {fastest.real:.4g}{beside} {rate}, which times the period of {period:g} {plant.time_unit} is "
         f"{abs(fastest) * period:.3g}, and {integrator!r} makes it grow by {float(growth[wrong].max()):.3g} per cycle{needed}; use "
         f"integrator={remedy}"
     )
@@ -340,7 +341,3 @@ def poles(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.n
 def _slope_of(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     return ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.equations.rate(x, u, p), x))])
-
-
-def _text(pole: complex) -> str:
-    return f"{pole.real:.4g}" if abs(pole.imag) <= 1e-9 * abs(pole) else f"{pole.real:.4g} +- {abs(pole.imag):.4g}i"
