@@ -7,8 +7,9 @@ held since t_{k-1}; the controller turns them into a command; the plant moves on
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, reference_block
@@ -23,7 +24,7 @@ from fpirhc.simulation.replay import known_samples
 from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
 from fpirhc.simulation.tables import disturbance_signals
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like
 from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
@@ -104,22 +105,21 @@ def _clock_block(time: Signal, period: float) -> Block:
     return Block("clock", Layout(), Layout((time,)), step, Layout((discrete("cycle"),)))
 
 
-HELD_INPUT = "_held_input"  # signal in the memory of the loop, with one entry per input
-
-
 @dataclass(frozen=True)
 class HeldInput(Undeformed):
-    """Sends the input that stands in its memory, within the limits."""
+    """Sends the input before the run, within the limits."""
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        plant, (closing, delays) = built.plant, commanding_blocks(built)
-        held = replace(built.before, name=HELD_INPUT)
+        plant, (closing, delays), held = built.plant, commanding_blocks(built), ca.DM(built.before.start_vector())
         responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
 
         def step(s: Signals) -> dict[str, Expression]:
-            response = plant.equations.controlled_response(s.state, getattr(s, HELD_INPUT), s.parameters)
-            return {"command_unclipped": getattr(s, HELD_INPUT), **{r.name: response for r in responses}}
+            response = plant.equations.controlled_response(s.state, held, s.parameters)
+            return {"command_unclipped": expression(held), **{r.name: response for r in responses}}
 
         writes = Layout((*responses, like(plant.input, "command_unclipped")))
-        hold = Block("hold", Layout((held, plant.state, plant.parameter)), writes, step)
-        return [reference_block(built), hold, *closing], [*delays, Delay(held, HELD_INPUT)]
+        return [
+            reference_block(built),
+            Block("hold", Layout((plant.state, plant.parameter)), writes, step),
+            *closing,
+        ], delays
