@@ -31,7 +31,6 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
-from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
@@ -60,7 +59,6 @@ class Built:
     warm_up: float  # number of the first cycle whose response may be used
     sample: tuple[Signal, ...]  # what a step is given
     planned: Problem | None  # the problem as plans have it, with their cost and limits
-    every: int  # control cycles from plan to plan
     opened: bool  # whether some numbers are open
 
     @property
@@ -136,7 +134,6 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         warm_up=problem.warm_up_cycles,
         sample=problem.sample,
         planned=planned,
-        every=cycles_per_plan(planned.horizon, problem.period) if planned and planned.horizon else 1,
         opened=opened,
     )
 
@@ -168,7 +165,7 @@ def checked(problem: Problem, controller: Controller, *, numbers_only: bool = Fa
 def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
     ready = resolved(problem, controller)
     if numbers_only and ready.inner is None and ready.planner is not None:
-        ready.planner.check_weights(problem)
+        ready.planner.planned(problem)  # which checks the weights of a cost of its own
     else:
         ready.check(problem)
     refuse([*_against_form(problem, ready.deformation), *against_believed(problem, ready)])

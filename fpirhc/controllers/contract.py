@@ -95,12 +95,6 @@ class Planner:
             horizon = replace(horizon, share=cycles / stage)
         return costed if horizon is costed.horizon else replace(costed, horizon=horizon)
 
-    def check_weights(self, problem: Problem) -> None:
-        """Raise where the weights of the cost are not valid."""
-        cost = self.cost or problem.cost
-        if cost is not None:
-            cost.check(problem.plant)
-
     def _measured(self, problem: Problem) -> tuple[str, ...]:
         """The limited states that no output shows, where a plan starts at another state than the measured one."""
         plant = problem.plant

@@ -38,6 +38,7 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, like, scalar
 from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
+from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -104,12 +105,13 @@ class RecedingHorizon(Controller):
                 "RecedingHorizon: room is what plans leave for `tracking`; give the law, or leave it out"
             )
         _room(problem, self.room)
-        self.planner.check_weights(problem)
         self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        problem, plant, cycles = built.planned, built.plant, built.every
+        problem, plant = built.planned, built.plant
         assert problem is not None
+        assert problem.horizon is not None
+        cycles = cycles_per_plan(problem.horizon, problem.period)
         parts = from_measurement(built) if self.tracking is None else from_plan(built, self.tracking)
         (before, after, late, remembered), room = parts, _room(problem, self.room)
         same = built.problem, self.optimiser, self.tracking, self.cost, self.room, self.consistent

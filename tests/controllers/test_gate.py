@@ -16,7 +16,7 @@ from fpirhc.contracts import Block, Controller, Deformation, Layout, scalar
 INF, PATIENCE, AGE = np.inf, 10, 0.012
 LIMITS = {"Fa": (-300.0, 300.0), "Fb": (-6000.0, 40.0)}
 TWO = two_masses()
-RANGES = {"a": (-1.0, 3.0), "b": (-INF, 5.0), "a'": (-4.0, INF)}
+RANGES = {"a": (-1.0, 3.0), "b": (-INF, 5.0), "a'": (-4.0, INF), "b''": (-INF, 9.0)}
 PROBLEM = replace(
     TWO,
     sensing=fp.Sensing({name: fp.Sensor(range=ends) for name, ends in RANGES.items()}),
@@ -68,7 +68,7 @@ class Rules:
 
     def fits(self, time, state, realised, taken):
         """Finite, inside its ranges, and newer than the last good sample, but not from the future and not too old."""
-        inside = -1 <= state[0] <= 3 and state[1] <= 5 and state[2] >= -4
+        inside = -1 <= state[0] <= 3 and state[1] <= 5 and state[2] >= -4 and realised[1] <= 9
         new = self.taken < taken <= time and time - taken <= AGE
         return bool(np.isfinite([*state, *realised]).all() and inside and new)
 
@@ -97,14 +97,15 @@ def sample(random, bad):
     """A state, a response and the age of the sample; of the bad ones each is bad in one thing."""
     state, realised, age = np.array([*random.uniform(-0.5, 0.5, 2), 0.0, 0.0]), np.zeros(2), random.uniform(0, 3e-3)
     if random.uniform() < bad:
-        kind = int(random.integers(0, 14))
+        kind = int(random.integers(0, 15))
         if kind < 3:
             state[1] = (0.125, 0.25, 0.375)[kind]
         elif kind < 11:
             wrong = ((0, np.nan), (1, INF), (3, -INF), (0, 3.01), (0, -1.01), (1, 5.01), (2, -4.01), (1, np.nan))
             state[wrong[kind - 3][0]] = wrong[kind - 3][1]
         else:
-            realised[kind % 2], age = (np.nan, age) if kind == 11 else (0.0, -1e-4 if kind == 12 else 1.01 * AGE)
+            realised[1] = {11: np.nan, 14: 9.1}.get(kind, 0.0)
+            age = {12: -1e-4, 13: 1.01 * AGE}.get(kind, age)
     elif random.uniform() < 0.2:  # at the edge of what is good, and on the side that is open
         state[:] = ((3.0, 5.0, -4.0, 1e9), (-1.0, -1e9, 1e9, -1e9))[int(random.integers(0, 2))]
     return state, realised, age

@@ -128,6 +128,7 @@ CASES = (
     (fp.Filtered(fp.Filtered(affine(0.5), pole=0.5), pole=0.5), "Filtered stands around another Filtered"),
     (fp.ModelReferenced(affine(0.5), lag=(0.1, 0.1, 0.1)), r"the plant has 2 inputs \(Q1, Q2\)"),
     (fp.ModelReferenced(affine(0.5), cycles=(1, 2, 3)), "3 dead times are given, but the plant has 2"),
+    (fp.Affine(gain=-0.5, weights=(1.0, 2.0, 3.0)), r"3 weights are given, but the plant has 2 .* \(q1, q2\)"),
 )
 
 

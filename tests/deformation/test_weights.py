@@ -8,7 +8,7 @@ import pytest
 
 import fpirhc as fp
 from fpirhc.contracts import Deformation
-from fpirhc.errors import InvalidValue, NotContractive, NotSupported
+from fpirhc.errors import InvalidValue, NotContractive
 
 GAINS = np.array([[0.8, 0.3], [-0.5, 0.4]])
 
@@ -79,9 +79,3 @@ def test_a_gain_that_converges_with_its_weights_alone_is_not_refused():
 def test_weights_that_are_no_regular_matrix_are_refused(weights):
     with pytest.raises(InvalidValue, match="expected a tuple with a finite number other than zero"):
         fp.Affine(gain=-0.5, weights=weights)
-
-
-def test_a_wrong_number_of_weights_is_refused():
-    problem, controller = coupled(fp.Affine(gain=-0.5, weights=(1.0, 2.0, 3.0)))
-    with pytest.raises(NotSupported, match=r"3 weights are given, but the plant has 2 controlled coordinates \(q, p\)"):
-        fp.simulate(problem, controller, seed=0, compiled=False)

@@ -139,6 +139,11 @@ def test_two_channels_have_lags_of_their_own():
     assert run["error"][-1] == pytest.approx([0.0, 0.0], abs=1e-5)
 
 
+def test_without_adaptation_it_is_what_it_is_around():
+    wrapped = fp.ExactModel(fp.Cascade(STATIC, affine(0.4), None)).with_deformation(fp.Identity())
+    assert wrapped.controller is STATIC
+
+
 BAD: dict[str, tuple[Any, str]] = {
     "wrong sign": (fp.Cascade(STATIC, fp.Affine(gain=0.5), LAGGED), "use the other sign"),
     "paired inside": (fp.Cascade(STATIC, fp.Paired(affine(0.5), cycles=3), LAGGED), "Paired pairs by itself"),
