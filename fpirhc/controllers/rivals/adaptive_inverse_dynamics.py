@@ -85,7 +85,7 @@ class AdaptiveInverseDynamics(Controller):
 
     def _learn_block(self, built: Built) -> Block:
         plant, learning = built.plant, self._learning
-        equation = equation_function(learning.regressor(built.problem))
+        equation = equation_function(learning.regressor(built.plant))
         weights = self.lyapunov_row()
 
         target, reads = self._target(built)

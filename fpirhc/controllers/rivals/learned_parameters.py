@@ -44,10 +44,10 @@ class Learning:
     rule: Rule
     bounds: Bounds
 
-    def regressor(self, problem: Problem) -> Regressor:
+    def regressor(self, plant: Plant) -> Regressor:
         """Return the plant's regressor for the learned parameters; the same one for the same plant."""
         names = tuple(self.bounds)
-        return _REGRESSORS.of((problem.plant,), names, lambda: Regressor(problem.plant, names))
+        return _REGRESSORS.of((plant,), names, lambda: Regressor(plant, names))
 
     def check(self, problem: Problem, *, inverts: bool) -> None:
         """Raise if plant, bounds, or rule do not fit each other.
@@ -61,7 +61,7 @@ class Learning:
                 that is not positive definite where the controller inverts it.
         """
         refuse(_against(problem.plant))
-        regressor = self.regressor(problem)
+        regressor = self.regressor(problem.plant)
         self.rule.check(self.bounds)
         _check_bounds(regressor, self.bounds)
         states = _states(problem)
@@ -81,7 +81,7 @@ class Learning:
             extra: signals that `gradient` reads.
             gradient: of the Lyapunov function, for rules that follow it.
         """
-        plant, regressor = built.plant, self.regressor(built.problem)
+        plant, regressor = built.plant, self.regressor(built.plant)
         believed = like(plant.parameter, "_believed")
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)

@@ -67,7 +67,7 @@ class SlotineLi(Controller):
             )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        regressor = self._learning.regressor(built.problem)
+        regressor = self._learning.regressor(built.plant)
         front = [reference_block(built), self._sliding_block(built), self._learn_block(built, regressor)]
         closing, delays = closing_blocks(built, self.deformation)
         if self._deforms:
