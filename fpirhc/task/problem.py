@@ -129,11 +129,6 @@ class Problem(Checked):
         return self.reality.foreign if self.reality is not None else None
 
     @property
-    def simulated_dead_time(self) -> DeadTime:
-        """What a run adds of the dead time: an object outside has that of its inputs itself."""
-        return replace(self.dead_time, inputs={}) if self.foreign else self.dead_time
-
-    @property
     def equations_known(self) -> bool:
         """Whether what moves has equations, so that it can be run again to answer a question."""
         return self.foreign is None
