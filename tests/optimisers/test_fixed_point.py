@@ -184,3 +184,13 @@ def test_feedback_keeps_unstable_plants_together():
     without = np.where(np.arange(memory.size) < ocp.stages, memory.ravel(), 0.0)
     _, diagnostics, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, without)
     assert int(diagnostics.ravel()[4]) != fp.Status.OK
+
+
+def test_a_second_start_takes_the_iterations_of_both():
+    """Those of a call with the remembered plan and of one without, and the plan that is cheaper."""
+    ocp, data = CACHE["ocp"]
+    one, given = fp.FixedPoint(iterations=25, tolerance=1e-8), (ocp, data, np.array([2.0, 0.0]), [-3.0], [3.0])
+    memory, two = call(one, *given)[2], replace(one, second_start=True)
+    warm, cold, both = (call(o, *given, m)[1].ravel() for o, m in ((one, memory), (one, None), (two, memory)))
+    assert (both[3], both[4]) == (warm[3] + cold[3], warm[4])
+    assert both[0] == min(warm[0], cold[0])
