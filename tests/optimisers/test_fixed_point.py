@@ -194,3 +194,19 @@ def test_a_second_start_takes_the_iterations_of_both():
     warm, cold, both = (call(o, *given, m)[1].ravel() for o, m in ((one, memory), (one, None), (two, memory)))
     assert (both[3], both[4]) == (warm[3] + cold[3], warm[4])
     assert both[0] == min(warm[0], cold[0])
+
+
+def test_a_multiplier_counts_at_its_own_bound_alone():
+    """Positive at the upper one, negative at the lower one: elsewhere a plan is judged as without it; NaN is no small residual."""
+    gain = {"b": fp.Parameter(1.0, 1.0, "1")}
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, gain, lambda q, u, p: {"y": p.b * u.u}, order=1)
+    task = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Horizon(stages=4, step=0.1), fp.Quadratic({"y": 1.0}, {"u": 1.0})
+    free, bound = (horizon_of(plant, *task, fp.Limits(states=one)) for one in ({}, {"y": (-0.3, 0.4)}))
+
+    def residual(of, at, size):
+        return float(judge(of[0])(np.zeros((1, 4)), [at], of[1], [-9.0], [9.0], np.full((1, 4), size))[1])
+
+    pairs = {(at, size) for at in (-0.3, 0.1, 0.4) for size in (-2.0, 0.0, 2.0)}
+    counts = {pair for pair in pairs if residual(bound, *pair) != pytest.approx(residual(free, pair[0], 0.0))}
+    assert counts == {(-0.3, -2.0), (0.4, 2.0)}
+    assert residual(bound, 0.1, np.nan) > 1

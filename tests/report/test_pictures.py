@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import fpirhc as fp
 from fpirhc.contracts import Layout, Signal, scalar
-from fpirhc.errors import InvalidProblem, InvalidValue, ProblemFileError
+from fpirhc.errors import InvalidProblem, InvalidValue
 
 
 def spring(time=1.0):
@@ -95,20 +95,6 @@ def test_a_raster_counts_passages_upwards(runs):
 
 
 FILE = line_text("period=5e-3, duration=0.1", more="pictures = (%s,)\n")
-
-
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        ("'phase'", r"line \d+: pictures\[0\]: expected a Picture, got the text 'phase'"),
-        ("fp.Portrait('p', x='state.y', y='state.y', controllers=('CTX',))", r"picture 'p': controller 'CTX'.*CTC"),
-    ],
-)
-def test_mistakes_in_a_file_are_told_when_it_is_loaded(written, message, tmp_path):
-    path = tmp_path / "line.py"
-    path.write_text(FILE % written)
-    with pytest.raises(ProblemFileError, match=message):
-        fp.load_problem(str(path))
 
 
 def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path):
