@@ -188,12 +188,12 @@ def test_feedback_keeps_unstable_plants_together():
 
 def test_a_second_start_takes_the_iterations_of_both():
     """Those of a call with the remembered plan and of one without, and the plan that is cheaper."""
-    ocp, data = CACHE["ocp"]
-    one, given = fp.FixedPoint(iterations=25, tolerance=1e-8), (ocp, data, np.array([2.0, 0.0]), [-3.0], [3.0])
-    memory, two = call(one, *given)[2], replace(one, second_start=True)
-    warm, cold, both = (call(o, *given, m)[1].ravel() for o, m in ((one, memory), (one, None), (two, memory)))
-    assert (both[3], both[4]) == (warm[3] + cold[3], warm[4])
-    assert both[0] == min(warm[0], cold[0])
+    one, box = fp.FixedPoint(iterations=4, tolerance=1e-8), ([-3.0], [3.0])
+    memory, two = call(one, *CACHE["ocp"], np.array([4.0, 4.0]), *box)[2], replace(one, second_start=True)
+    for state in ([2.0, 0.0], [0.5, 0.0]):  # the remembered plan is the cheaper one, and the other one is
+        ways = (one, memory), (one, None), (two, memory)
+        warm, cold, both = (call(o, *CACHE["ocp"], np.array(state), *box, m)[1].ravel() for o, m in ways)
+        assert [*both[[0, 3, 4]]] == [min(warm[0], cold[0]), warm[3] + cold[3], fp.Status.OK]
 
 
 def test_a_multiplier_counts_at_its_own_bound_alone():
