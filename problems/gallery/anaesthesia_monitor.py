@@ -75,7 +75,7 @@ def monitored(x, u, p):
     inner = ca.DM(MOVES) @ ca.vertcat(*(x[n] for n in PARTS)) + ca.DM(ENTERS) * x.before
     index = ca.dot(ca.DM(LEAD[::-1]), inner) + p.artefact
     later = dict(zip(PARTS, ca.vertsplit(inner), strict=True))
-    return {**patient.next(x, u, p), **later, "before": patient.outputs["bis"].expression(x, p), "index": index}
+    return {**patient.response(x, u, p), **later, "before": patient.outputs["bis"].expression(x, p), "index": index}
 
 
 def artefact(t):
