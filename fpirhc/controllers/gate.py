@@ -170,7 +170,8 @@ class Gate:
             given = {n: ca.if_else(s.replays, value, getattr(s, n)) for n, value in replayed.items()}
             s = Signals({**vars(s), **given})
             now, own = ca.vertcat(*(getattr(s, n) for n in self.sample.names)), self.kept.join(vars(s))
-            fits, column = before(now, own, s.time if self.samples else 0)
+            clock = s.time if self.samples else 0
+            fits, column = before(now, own, clock)
             told = self.stored.split(column)
             sample = [told[r] if r in told and self.inner.opaque else getattr(s, r) for r in self.inner.reads.names]
             memory = self.controller_memory.join(vars(s))
@@ -180,7 +181,7 @@ class Gate:
                 usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(failed))
             memory_next, shown, command, fine = self._stepped(fits, usable, memory, sample)
             values = trace.split(shown)
-            status, own_next = after(now, own, s.time if self.samples else 0, usable, fine, values["status"], command)
+            status, own_next = after(now, own, clock, usable, fine, values["status"], command)
             kept = self.kept.split(own_next)
             remembered = {**self.controller_memory.split(memory_next), **kept}
             remembered |= {m.name: expression(ca.DM.zeros(m.size)) for m in self.replayed.signals}

@@ -31,15 +31,17 @@ def called(both: Pair, first: np.ndarray, memory: np.ndarray, bounds=None, data=
     return plan, diagnostics[:, 0], after
 
 
-@pytest.mark.parametrize("turns", [1, 3, 8, END])
-def test_calls_that_are_cut_off_after_every_turn(turns):
+@pytest.mark.parametrize(("turns", "way"), [(1, 3568.508178), (3, 5046.259527), (8, 5474.593530), (END, 5713.760566)])
+def test_calls_that_are_cut_off_after_every_turn(turns, way):
     """From nothing and from what was remembered of a state nearby, of one far away, and of one outside its limits."""
-    both, random, statuses = loops(turns), np.random.default_rng(0), set()
+    both, random, statuses, total = loops(turns), np.random.default_rng(0), set(), 0.0  # a solution hides the way to it
     for size in (0.1, 0.4, 0.7, 1.0, 1.5, 2.5):
         memory = np.zeros(both.size)
         for _ in range(3):
-            _, diagnostics, memory = called(both, size * random.normal(size=3), memory)
+            plan, diagnostics, memory = called(both, size * random.normal(size=3), memory)
             statuses.add(int(diagnostics[4]))
+            total += diagnostics[3] + np.abs(plan).sum()
+    assert total == pytest.approx(way, rel=1e-7)
     assert statuses >= ({fp.Status.OK, fp.Status.INFEASIBLE} if turns == END else {fp.Status.NOT_CONVERGED})
 
 

@@ -113,8 +113,8 @@ def test_what_a_response_error_leaves(beta):
 
 LARGEST = (0.05,)  # m/s^n: what limits are said to allow
 LAWS = (  # with (g_0, g_1) for order 1 and for order 2
-    (fp.Exponential(2.0, largest=LARGEST), (4, 4), (8, 12)),
-    (fp.ShiftPolynomial(0.98, step=0.01, bumpless=False, largest=LARGEST), (4, 4), (8, 12)),
+    (fp.Exponential(2.0, bumpless=False, largest=LARGEST), (4, 4), (8, 12)),
+    (fp.ShiftPolynomial(0.98, step=0.01, largest=LARGEST), (4, 4), (8, 12)),
     (fp.Fractional(2.0, 0.8, memory=0.5, largest=LARGEST), (4, 2), (8, 8)),
 )
 
@@ -126,7 +126,7 @@ def test_an_error_counts_within_ten_times_of_what_limits_allow(law, first, secon
     task = problem(order, period=0.01, start={"y": -0.3}, disturbances={"u": fp.Step(at=1.0, size=0.5)})
     result, (i, e) = run(task, law), first if order == 1 else second
     error, after = result["error.y"], result["integral.y"]
-    start = -e / i * error[0] if isinstance(law, fp.Exponential) else 0.0  # alone begins bumpless
+    start = -e / i * error[0] if isinstance(law, fp.ShiftPolynomial) else 0.0  # alone begins bumpless
     before = np.append(start, after[:-1])
     counts = np.abs(i * before + e * error) <= 0.5
     expected = before + 0.01 * counts * error
