@@ -146,12 +146,12 @@ def test_adrc_estimates_the_total_disturbance_of_a_motion_system():
 
 @pytest.mark.parametrize(("order", "window"), [(1, 1), (1, 12), (2, 2), (2, 15)])
 def test_intelligent_pid_estimates_a_constant_rest_exactly(order, window):
-    """Y^(n) = 1.3 u - 2 with alpha = 1: F = 0.3 u - 2 once u has come to rest."""
+    """Y^(n) = u - 2 with alpha = 0.7: F = 0.3 u - 2 once u has come to rest at 2."""
     plant = chain(order)
-    law = fp.rivals.IntelligentPID(fp.Exponential(4.0), {"y": 1.0}, window)
-    result = run(pushed(plant, duration=4.0), law)
-    assert result["ultra_local.y"][-1] == pytest.approx(-2.0, abs=1e-6)
-    assert abs(result["error.y"][-1]) < 1e-5
+    law = fp.rivals.IntelligentPID(fp.Exponential(4.0), {"y": 0.7}, window)
+    result = run(pushed(plant, duration=7.0), law)
+    assert (result["ultra_local.y"][-1], result["error.y"][-1]) == pytest.approx((-1.4, 0.0), abs=1e-5)
+    assert 0.7 * result["command.u"] == pytest.approx(result["desired.y"] - result["ultra_local.y"], rel=1e-9)
 
 
 def test_disturbance_observer_approaches_a_load_with_its_pole():

@@ -118,7 +118,7 @@ def test_a_dead_time_for_every_channel():
         (lambda: fp.Increment(affine(0.5), cycles=4, pole=1.0), "Increment.pole: expected a number from 0"),
         (lambda: fp.Increment.within(affine(0.5), -1), r"Increment.within\(most=-1\): expected a dead time between 0"),
         (lambda: fp.Increment(affine(0.5), cycles=()), "or a tuple with one for every controlled coordinate"),
-        (lambda: fp.ModelReferenced(affine(0.5), cycles=900, measurement=200), "between 0 and 1000"),
+        (lambda: fp.ModelReferenced(affine(0.5), cycles=(900, 300), measurement=200), "between 0 and 1000"),
     ],
 )
 def test_bad_settings(build, sentence):
