@@ -143,9 +143,9 @@ _CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same cont
 
 
 @contextmanager
-def any_gain() -> Iterator[None]:
-    """Within it no gain is refused: a review asks loops that no run would begin."""
-    token = _REFUSES.set(False)
+def any_gain(*, yes: bool = True) -> Iterator[None]:
+    """Within it no gain is refused: a review asks loops that no run would begin; `yes` False: it is again."""
+    token = _REFUSES.set(not yes)
     try:
         yield
     finally:

@@ -132,10 +132,9 @@ def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, f
     """
     all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
     if not 0 <= mismatch < (math.inf if all_spread else 100):
-        more = " (100 is the whole spread, more is possible here)"
+        signs = "and less than 100 %, where no parameter changes its sign; a wider range needs a `spread` of every Parameter"
         raise InvalidValue(
-            f"mismatch {mismatch:g}: expected percent of at least 0 and below 100, where a parameter keeps its sign"
-            f"{more if all_spread else '; where all have a spread, 100 is all of it'}"
+            f"mismatch {mismatch:g} %: use at least 0 %{'; 100 % is the whole spread' if all_spread else f' {signs}'}"
         )
     ranges = {name: _range(parameter, mismatch) for name, parameter in plant.parameters.items()}
     mistakes = Mistakes("mismatch")

@@ -32,7 +32,7 @@ from fpirhc.review.experiments import Bench, Case
 from fpirhc.review.questions import Verdict, gain_by_run
 from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensor
-from fpirhc.simulation.model_as_plant import ModelAsPlant, behind_actuators, shortened
+from fpirhc.simulation.model_as_plant import behind_actuators, shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
 from fpirhc.simulation.trials import errors_of, weighed
@@ -92,7 +92,7 @@ class Choice:
         self._alone = _run(self.problem, bare)
         ends = {(one.cycles, one.lags): one for one in estimates.ends}.values()
         plants = [estimated_problem(problem, e.gains, [c + 1 for c in e.cycles], e.lags) for e in ends]
-        self._plants = [(plant, dict[object, Bench](), ModelAsPlant(plant, seed=0)) for plant in plants]
+        self._plants = [(plant, dict[object, Bench]()) for plant in plants]
 
     def shortlist(self) -> dict[str, Deformation]:
         """Return what makes the error on the plant as estimated clearly less, by name of its form, the best first."""
@@ -114,10 +114,10 @@ class Choice:
     def _admitted(self, one: Deformation) -> float:
         """Half of the largest gain that comes back on every plant, as a multiple; 0 where there is none."""
         admitted = math.inf
-        for plant, known, models in self._plants:
+        for plant, known in self._plants:
             try:
-                bench = Bench.of(plant, self._bare.with_deformation(one))
-                case = Case(bench, np.zeros((0, 0)), False, known, models)
+                bench = Bench(plant, self._bare.with_deformation(one))
+                case = Case(bench, known=known)
                 if case.plain.back.left > 1:  # the controller alone does not come back either
                     continue
                 fact = gain_by_run(case)

@@ -290,13 +290,13 @@ def _plan_row(solved: Solved) -> list[str]:
 def show_review(found: Review, *, verbose: bool = False) -> None:
     """Print the answers about the problem and every controller, those that are yes as a count."""
     for name, answers in found.answers.items():
-        better = [one for one in answers if one.numbers.get("recommended_times", 1.0) != 1.0]
-        shown = [one for one in answers if verbose or one.verdict != "yes" or one in better]
+        shown = [one for one in answers if verbose or one.verdict != "yes"]
         say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
         for one in shown:
             evidence = f" ({one.evidence})" if one.evidence else ""
-            text = f"  {one.verdict:7s} {one.question}{evidence} {one.change}".rstrip()
-            say(text, STYLES[Outcome.WORSE] if one.verdict == "no" else "")
+            say(f"  {one.verdict:7s} {one.question}{evidence}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
+            if one.change:
+                say(f"          -> {one.change}", "bold")
     say(", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
 
 

@@ -213,7 +213,7 @@ limits reversed
 gain of the wrong sign
   gain=-0.7 -> gain=0.7
   {"pump1": (0.0, 2.0), "pump2": (0.0, 2.0)} -> {"pump1": (-2.0, 2.0), "pump2": (-2.0, 2.0)}
-    no Is the gain admissible? ... Set the gain to -0.7
+    no Is the gain admissible? ... Set the gain to -
 """
 OTHERS = {
     "no input in the response": one(
@@ -242,7 +242,7 @@ OTHERS = {
         PENDULUM,
         "    horizon=fp.Horizon(stages=6, step=2e-2),\n",
         "",
-        "no Does the controller fit the problem? RecedingHorizon needs Problem(horizon=...), which this problem does not have",
+        "no Does the controller fit the problem? -> RecedingHorizon needs Problem(horizon=...), which this problem does not have",
     ),
     "mistakes all over the file": Wrong(
         PENDULUM,
@@ -315,7 +315,7 @@ compare mine.py --controllers RHC,RHC+FPI => controller 'RHC,RHC+FPI' is unknown
 study mine.py --draws 2 --mismatch x => expected percent of at least 0, such as 20%, got 'x'
 study mine.py --mismatch 20 => --mismatch is of drawn plants: give --draws N too
 study mine.py --limits noise --mismatch 20 => --mismatch is of drawn plants: give --draws N too
-review mine.py --mismatch 120% => mismatch 120: expected percent of at least 0 and below 100, where a parameter keeps its sign
+review mine.py --mismatch 120% => mismatch 120 %: use at least 0 % and less than 100 %, where no parameter changes its sign
 run mine.py fpi => controller 'fpi' is unknown. Did you mean 'RHC+FPI'?
 run mine.py RHC+FPI --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.gain'?
 run mine.py RHC --set mass=2 => write exact.mass for the plant, approximate.mass for the model

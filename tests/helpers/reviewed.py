@@ -86,19 +86,6 @@ def three_lags() -> fp.Problem:
     )
 
 
-def untouched_limit() -> fp.Problem:
-    """A speed limit that nothing comes near; the slowest mode of an own Riccati solution is .973 per cycle of the model."""
-    return cart(
-        fp.Limits(inputs={"F": (-2.0, 2.0)}, states={"x'": (-100.0, 100.0)}),
-        lambda t: {"x": 5.0 + 0 * t},
-        1.2,
-        start={"x": 4.9, "x'": 0.0},
-        duration=3.0,
-        horizon=fp.Horizon(stages=30, step=0.1),
-        cost=fp.Quadratic(states={"x": 10.0, "x'": 1.0}, effort={"F": 1e-1}),
-    )
-
-
 def limited_rate() -> fp.Problem:
     """A force that may change by 20 N/s: an own loop with such an actuator has .637 m without adaptation, and metres with it."""
     return cart(
@@ -196,47 +183,6 @@ def biased(size: float) -> fp.Problem:
         sensing=sensing,
         horizon=fp.Horizon(stages=20, step=0.05),
         cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, deviation={"F": 1e-3}),
-    )
-
-
-def balanced() -> fp.Problem:
-    """Two pendulums on top of each other on a cart (those of do-mpc's example), held upright by a force that has limits."""
-    rod, pole = 0.2, 0.5  # kg, m
-    first, second = 0.5 * rod * pole + rod * pole, 0.5 * rod * pole
-
-    def response(q: Any, v: Any, u: Any, p: Any) -> dict[str, Any]:
-        cos, sin = ca.cos(q.low - q.high), ca.sin(q.low - q.high)
-        inertia = ca.vertcat(
-            ca.horzcat(p.cart + 2 * rod, first * ca.cos(q.low), second * ca.cos(q.high)),
-            ca.horzcat(first * ca.cos(q.low), 4 / 3 * rod * pole**2, second * pole * cos),
-            ca.horzcat(second * ca.cos(q.high), second * pole * cos, rod * pole**2 / 3),
-        )
-        forces = ca.vertcat(
-            first * v.low**2 * ca.sin(q.low) + second * v.high**2 * ca.sin(q.high) + u.F,
-            9.81 * first * ca.sin(q.low) - second * pole * v.high**2 * sin,
-            9.81 * second * ca.sin(q.high) + second * pole * v.low**2 * sin,
-        )
-        moved = ca.solve(inertia, forces)
-        return {"x": moved[0], "low": moved[1], "high": moved[2]}
-
-    plant = fp.Plant(
-        coordinates={"x": "m", "low": "rad", "high": "rad"},
-        inputs={"F": "N"},
-        response=response,
-        controlled=("x",),
-        parameters={"cart": fp.Parameter(0.6, 0.7, "kg")},
-    )
-    weights = {"x": 100.0, "low": 100.0, "high": 100.0, "x'": 1.0, "low'": 1.0, "high'": 1.0}
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"x": 0 * t, "low": 0 * t, "high": 0 * t}),
-        start={"x": 0.0, "low": 0.01, "high": -0.01},
-        period=1e-2,
-        duration=6.0,
-        measure_from=3.0,
-        limits=fp.Limits(inputs={"F": (-4.0, 4.0)}),
-        horizon=fp.Horizon(stages=25, step=4e-2),
-        cost=fp.Quadratic(states=weights, effort={"F": 1e-2}),
     )
 
 

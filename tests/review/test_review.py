@@ -19,10 +19,11 @@ NAMES = {  # of numbers by key, which scripts read
     "turns": {"jumps"}, "posed": {"share_finite"}, "inverse": {"condition"},
     "ranges": {"without", "measured"}, "plans": {"not_converged", "error", "error_with_more_iterations"},
     "gain": {"error", "error_recommended", "error_at_half", "error_at_twice", "error_at_four_times", "error_turned",
-             "recommended_times", "recommended_gain", "error_without", "movement", "movement_recommended", "movement_without"},
+             "recommended_times", "recommended_gain", "best_gain", "error_at_best", "error_without", "movement",
+             "movement_recommended", "movement_without"},
     "follows": {"rms_error", "error", "size", "mean_error"},
     "input_limits": {"at_a_limit", "largest", "share_of_the_limit", "needed"},
-    "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "doubles_in", "mean_step"},
+    "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "doubles_in", "mean_step", "at_a_limit"},
     "horizon": {"error", "error_with_twice_the_horizon"}, "box": {"share_that_come_back", "plants", "left", "error"},
     "input_gain": {"most", "least"}, "limits": {"excess", "beyond", "time_of_it", "share_of_cycles"},
     "latency": {"cycles_borne", "time_borne", "cycles_tried", "left", "error", "error_without", "mean_step", "mean_step_without"},
@@ -71,13 +72,15 @@ def noisy(size: float, name: str = "q''") -> fp.Problem:
     return mass(limits=LIMITS, sensing=fp.Sensing({name: fp.Sensor(noise=fp.Noise(size))}), measure_from=2.0)
 
 
-@pytest.mark.parametrize(("gain", "remedy"), [(-0.5, "Set the gain to -"), (-0.05, "Filtered(map, pole=")])
-def test_what_is_recommended_under_noise_is_calm_in_a_run(gain, remedy):
+@pytest.mark.parametrize(
+    ("size", "gain", "remedy"), [(0.1, -0.5, "Set the gain to -"), (0.2, -0.05, "Filtered(map, pole=")]
+)
+def test_what_is_recommended_under_noise_is_calm_in_a_run(size, gain, remedy):
     """Own runs with the noise: less than twice the movement without adaptation, where today's has more, and a smaller error."""
-    problem, told = noisy(0.1), answers(noisy(0.1), torque(gain))["gain"]
+    problem, told = noisy(size), answers(noisy(size), torque(gain))["gain"]
     assert remedy in told.change
     poles = [float(one) for one in re.findall(r"pole=(.*)\)", told.change)] or [0.0]
-    best = fp.Filtered(fp.Sigmoid(gain=told.numbers["recommended_gain"], scale=20.0), pole=poles[0])
+    best = fp.Filtered(fp.Sigmoid(gain=told.numbers.get("recommended_gain", gain), scale=20.0), pole=poles[0])
     laws = [replace(torque(gain), deformation=one) for one in (best, fp.Identity(), torque(gain).deformation)]
     made = [fp.measure(problem, fp.simulate(problem, law, seed=0, compiled=False)) for law in laws]
     calm, without, today = ((one["total_variation"]["u"], one.rms_error["q"]) for one in made)
@@ -87,36 +90,20 @@ def test_what_is_recommended_under_noise_is_calm_in_a_run(gain, remedy):
     assert calm[1] < without[1]
 
 
-def test_a_caution_of_the_gain_names_one_that_a_run_shows():
-    """Twice the gain chatters; half of it has the error that is told, and bears a cycle of latency that the gain does not."""
-    problem = mass(limits=LIMITS)
-    own, half = (answers(problem, torque(gain)) for gain in (-2.0, -1.0))
-    assert (own["gain"].verdict, own["gain"].change) == ("caution", "Set the gain to -1.")
-    made = fp.measure(problem, fp.simulate(problem, torque(-1.0), seed=0, compiled=False))
-    assert own["gain"].numbers["error_recommended"] == pytest.approx(made.rms_error["q"])  # of a motion of 1 m
-    assert [one["latency"].verdict for one in (own, half)] == ["caution", half["gain"].verdict] == ["caution", "yes"]
-
-
-def test_no_gain_is_recommended_where_none_is_calm():
-    """The least gain that is tried moves the command by more than twice as much as no adaptation."""
-    told = answers(noisy(1.0), torque())["gain"]
-    assert not [name for name in told.numbers if "recommended" in name]
-    assert re.fullmatch("No gain and no filter.*: measure the response with less noise.", told.change)
-
-
 def test_a_remedy_is_what_the_loop_has():
     """No gain is lowered and no map filtered where there is no map."""
     law = answers(noisy(0.02, "q'"), fp.ComputedTorque(fp.Exponential(rate=60.0)))
     plan = {a.key: a for a in fp.review(biased(1.0), {"it": plans()["RHC"]}, mismatch=0.0, seed=0).answers["it"]}
-    assert law["noise"].change == "Lower the rate of the tracking law, or measure the response with less noise."
+    said = "No run with one of these passes: set the rate of the tracking law to 30/120/15/240."
+    assert law["noise"].change == f"Measure the response with less noise. {said}"
     assert not [one for one in (*law.values(), *plan.values()) if "the gain" in one.change or "Filtered" in one.change]
 
 
 @pytest.mark.parametrize(
-    ("limit", "rate", "verdict"), [(0.3, 1e6, "no"), (20, 1e6, "yes"), (20, 2, "no"), (2e3, 1e6, "caution")]
+    ("limit", "rate", "verdict"), [(0.3, 1e6, "no"), (20, 1e6, "yes"), (20, 2, "no"), (2e3, 1e6, "yes")]
 )
 def test_limits_of_inputs_that_do_not_fit_are_told(limit, rate, verdict):
-    """Ten times too small, right, too slow, and a hundred times too large; shares are those of an own run; 1.5 kg need more."""
+    """Ten times too small, right, too slow, and far away; shares are those of an own run; 1.5 kg need more."""
     limits = fp.Limits(inputs={"u": (-limit, limit)}, rates={"u": (-rate, rate)})
     problem = mass(plant=heavy(1.0, 1.5, (10.0, 6.0)), limits=limits)
     told, run = answers(problem)["input_limits"], fp.simulate(problem, torque(), seed=0, compiled=False)

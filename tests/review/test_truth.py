@@ -19,12 +19,9 @@ from helpers.reviewed import ball, biased, levitation, plans, turntable
 
 import fpirhc as fp
 
-UNWRAP = "The angle jumps by a whole turn: unwrap it (an angle that goes on), or weigh 1 - cos of its error."
+UNWRAP = "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its error."
 Pick = Callable[[], tuple[fp.Problem, dict[str, Any]]]
-SHORTER, LEAVE = "or shorten the window of the estimator, ", "or leave the deformation out."
-LATE = "No gain that was tried helps: predict the dead time: Predicted(controller, inputs=...), "
-BUSY = "Weigh the changes of the inputs more in the cost: with more gain of the inputs it is lost."
-START = "Its map is model-referenced already: the start of the plan or the estimator's window is the cause: RecedingHorizon("
+LEAVE, LOUD = "Leave the deformation out.", " Commands then move more than twice as much as without adaptation."
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
 
 
@@ -68,20 +65,12 @@ CASES: dict[str, Case] = {
             ("RHC", "returns", "left"): (np.exp(-270 / 200), 0.1),
         },
     ),
-    "a limit that nothing comes near": Case(
-        lambda: (reviewed.untouched_limit(), {"RHC": plans()["RHC"]}),
-        {("RHC", "returns"): "yes", ("RHC", "box"): "yes", ("RHC", "limits"): "yes", ("RHC", "plans"): "yes"},
-        {("RHC", "returns", "factor"): (0.98, 0.01)},
-        never=("RHC",),
-    ),
     "a limit of a rate": Case(
         lambda: (reviewed.limited_rate(), plans()),
         {("RHC", "limits"): "yes", ("RHC+FPI", "limits"): "yes", ("RHC+FPI", "pays"): "no"},
         {("RHC", "limits", "share_of_cycles"): (0, 0), ("RHC+FPI", "pays", "error_without"): (0.637, 0.01)},
         never=("problem",),
-        changes={
-            ("RHC+FPI", "follows"): f"Adaptation spoils it: no gain that was tried helps: use another form, {LEAVE}"
-        },
+        changes={("RHC+FPI", "follows"): LEAVE},
     ),
     "an angle that wraps": Case(
         lambda: (turntable(lambda t: ca.atan2(ca.sin(t), ca.cos(t))), plans(iterations=2)),
@@ -104,12 +93,6 @@ CASES: dict[str, Case] = {
         {("RHC", "plans"): "no", ("RHC", "follows"): "no"},
         changes={("RHC", "follows"): MORE},
     ),
-    "two pendulums on a cart, with limits of the force": Case(
-        lambda: (reviewed.balanced(), {"RHC": fp.RecedingHorizon(fp.FixedPoint())}),
-        {("RHC", "returns"): "yes", ("RHC", "follows"): "yes", ("RHC", "box"): "yes", ("RHC", "plans"): "yes"},
-        {("RHC", "returns", "factor"): (0.9876, 1e-3), ("RHC", "returns", "largest_factor"): (0.991, 3e-3)},
-        never=("problem", "RHC"),
-    ),
     "a servo and its recommended gain": Case(
         lambda: (reviewed.servo(), {str(g): plans(iterations=None, tolerance=None, gain=g)["RHC+FPI"] for g in SERVO}),
         {
@@ -127,18 +110,18 @@ CASES: dict[str, Case] = {
     "a map that swings while plans converge": Case(
         lambda: (reviewed.lift(), {"it": sigmoid(-1.0)}),
         {("it", "plans"): "yes", ("it", "gain"): "caution", ("it", "horizon"): "yes"},
-        changes={("it", "gain"): "Set the gain to -2."},
+        changes={("it", "gain"): f"Set the gain to -4.{LOUD}"},
     ),
     "a dead time that no gain makes up for": Case(
         lambda: (reviewed.tank(), {"it": sigmoid(-0.3), "predicted": fp.Predicted(sigmoid(-0.6), inputs=1.5)}),
         {("it", "gain"): "no", ("predicted", "gain"): "yes", ("predicted", "returns"): "caution"},
         {("it", "gain", "error_without"): (0.0865, 1e-3), ("it", "gain", "error"): (0.0956, 1e-3)},
-        changes={("it", "gain"): LATE + SHORTER + LEAVE, ("predicted", "input_gain"): BUSY},
+        changes={("it", "gain"): LEAVE, ("it", "pays"): LEAVE},
     ),
     "a map of a right model behind a window that is too long": Case(
         lambda: (replace(reviewed.lift(), sensing=fp.Sensing({}, fp.SavitzkyGolay(41, 3))), {"it": sigmoid(-2.0)}),
         {("it", "model"): "no"},
-        changes={("it", "model"): f"{START}consistent=False), a shorter window, {LEAVE}"},
+        changes={("it", "model"): f"Set the gain to -0.125.{LOUD}"},
     ),
     "an inverse with two branches": Case(
         foreign("cstr", "RHC", "RHC+FPI"),
@@ -154,7 +137,7 @@ CASES: dict[str, Case] = {
     "a gain that is too small for its pairing": Case(
         shipped("delayed_mass", PAIRED),
         {(PAIRED, "gain"): "no", (PAIRED, "pays"): "no"},
-        changes={(PAIRED, "follows"): "Set the gain to -1."},
+        changes={(PAIRED, "follows"): "Set the gain to -2."},
     ),
     "a biased sensor": Case(lambda: (biased(1.0), plans()), {("RHC+FPI", "bias"): "no", ("RHC+FPI", "pays"): "no"}),
     "the right sensor": Case(lambda: (biased(0.0), plans()), {("RHC+FPI", "pays"): "yes"}, never=("RHC+FPI",)),
@@ -196,9 +179,6 @@ CASES: dict[str, Case] = {
         },
         {("RHC+FPI, increment", "latency", "cycles_borne"): (0, 0)},
     ),
-    "a person who eats within the model's step": Case(
-        shipped("problems/gallery/diabetes.py", "RHC+FPI on the target"), {("RHC+FPI on the target", "follows"): "yes"}
-    ),
     "slots": Case(
         shipped("crane_slots", "slots+FPI"),
         {("slots+FPI", "follows"): "yes", ("slots+FPI", "pays"): "yes"},
@@ -221,7 +201,7 @@ def said(name: str) -> dict[tuple[str, str], Any]:
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
-LONG = "two pend", "a map", "a servo", "an own", "an inv", "a limit of", "an unst", "a dead", "a person"  # 4 s and more
+LONG = "a map", "a servo", "an own", "an inv", "a limit of", "an unst", "a dead"  # 4 s and more
 
 
 @pytest.mark.parametrize("name", slow_but(CASES, *(n for n in CASES if not n.startswith(LONG))))
@@ -254,42 +234,12 @@ def rms(problem: fp.Problem, controller: Any) -> float:
     return np.inf if run.stop else next(iter(fp.measure(problem, run).rms_error.values()))
 
 
-def test_the_recommended_gain_is_better_in_a_run():
-    """A pairing with seventeen cycles of dead time is too slow with its gain, and converges with the recommended one."""
-    problem, controllers = CASES["a gain that is too small for its pairing"].task()
-    own = controllers[PAIRED]
-    times = said("a gain that is too small for its pairing")[PAIRED, "gain"].numbers["recommended_times"]
-    more = own.with_deformation(own.deformation.with_effective_gain(times * own.deformation.effective_gain()))
-    assert rms(problem, more) < 0.1 * rms(problem, own)
-
-
-def test_more_iterations_hold_the_ball():
-    """The cure that is named, in a run from the same start."""
-    one, many = (plans(iterations=k, tolerance=t)["RHC"] for k, t in ((1, 1e-2), (8, 1e-3)))
-    assert rms(ball(0.011), many) < 1e-3 < rms(ball(0.011), one)
-
-
 def test_the_harm_of_a_bias_is_that_of_runs():
     found = said("a biased sensor")["RHC+FPI", "pays"]
     pair = [rms(biased(1.0), one) for one in plans().values()]
     assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=0.02)
     assert pair[1] > 1.2 * pair[0]
     assert f"{pair[1] / pair[0]:.2g}" in found.evidence.split(", ")[-1].removesuffix(" times larger")
-
-
-@pytest.mark.slow
-def test_the_factor_is_the_decay_of_two_runs():
-    """Unstable plants that are balanced: the deviation of a run from another start decays as it is said to."""
-    cases = {"an unstable plant of order three with limits of its input": ("gap", 1e-5, 0.1),
-             "two pendulums on a cart, with limits of the force": ("low", 1e-4, 6e-3)}  # fmt: skip
-    for name, (state, size, tolerance) in cases.items():
-        problem, controllers = CASES[name].task()
-        starts = (replace(problem, start={**problem.start, state: problem.start[state] + d}) for d in (size, -size))
-        runs = [fp.simulate(one, controllers["RHC"], seed=0)[f"plant_state.{state}"] for one in starts]
-        tops = [part.max() for part in np.array_split(np.abs(runs[0] - runs[1]), 6)]
-        own = (tops[-1] / tops[0]) ** (6 / 5 / len(runs[0]))
-        assert tops[-1] < 1e-2 * tops[0]
-        assert own == pytest.approx(said(name)["RHC", "returns"].numbers["factor"], abs=tolerance)
 
 
 def test_neither_of_two_lost_balls_is_better():
@@ -299,14 +249,6 @@ def test_neither_of_two_lost_balls_is_better():
     assert min(one.errors["gap"] for one in found.entries) > 0.1
     assert str(found.outcome) == "not comparable"
     assert "neither follows the reference" in found.verdict[0].lower()
-
-
-def test_a_command_that_is_later_by_more_than_is_borne_is_lost_in_a_run():
-    """The increment behind a dead time that is longer by a cycle than what is stated."""
-    problem, controllers = CASES["an own map behind a dead time"].task()
-    later = fp.DeadTime(inputs={"F": problem.dead_time.inputs["F"] + problem.period})
-    run = fp.simulate(replace(problem, dead_time=later), controllers["RHC+FPI, increment"], seed=0, compiled=False)
-    assert np.abs(run["realised"] - run["desired"])[-400:].max() > 20  # m/s^2; .53 with the dead time as it is
 
 
 def test_a_plant_outside_is_asked_by_its_model():

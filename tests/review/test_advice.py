@@ -1,0 +1,115 @@
+"""Every change that a review names was run: a review of the loop with it passes, and asks for no other."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from helpers import tasks
+from helpers.line import line_text
+from helpers.reviewed import answers, mass, torque
+
+import fpirhc as fp
+from fpirhc.__main__ import main
+
+
+def motor(stronger: float = 2.86, **settings: Any) -> fp.Problem:
+    """A motor whose plant answers so many times as strongly as its model."""
+    gain = fp.Parameter(3.5, 3.5 * stronger, "rad/s^2/V")
+    plant = fp.Plant({"q": "rad"}, {"V": "V"}, {"gain": gain}, lambda q, v, u, p: {"q": p.gain * u.V - 2 * v.q})
+    usual: dict[str, Any] = {"period": 2e-3, "duration": 4.0, "measure_from": 1.0}
+    usual |= {"limits": fp.Limits(inputs={"V": (-12.0, 12.0)}), "start": {"q": 0.0, "q'": 2.0}}
+    return fp.Problem(plant, fp.Trajectory(lambda t: {"q": ca.sin(2 * t)}), **(usual | settings))
+
+
+def law(gain: float, rate: float = 8.0) -> fp.ComputedTorque:
+    return fp.ComputedTorque(fp.Exponential(rate), fp.ModelReferenced(fp.Sigmoid(gain)))
+
+
+NOISY = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(3e-5))}, fp.SavitzkyGolay(window=21, degree=2))
+
+
+@pytest.mark.parametrize(
+    ("problem", "gain"), [(motor(), -9.0), (motor(), -0.02), (motor(0.7, sensing=NOISY), 2.0), (motor(0.7), 1.0)]
+)
+def test_a_recommended_gain_is_admitted_helps_and_asks_for_no_other(problem, gain):
+    """One that is refused, one that is too small, and two of the wrong sign, of which one has a noisy encoder."""
+    told = answers(problem, law(gain))["gain"]
+    new = told.numbers["recommended_gain"]
+    assert told.verdict == "yes" or told.change.startswith(f"Set the gain to {new:.4g}.")
+    run = fp.simulate(problem, law(new), seed=0, compiled=False)  # no gain is refused that is recommended
+    alone = fp.simulate(problem, fp.ComputedTorque(fp.Exponential(8.0)), seed=0, compiled=False)
+    assert fp.measure(problem, run).rms_error["q"] < fp.measure(problem, alone).rms_error["q"]
+    assert answers(problem, law(new))["gain"].numbers["recommended_times"] == 1
+
+
+def test_a_refusal_names_another_gain_than_the_one_that_is_refused():
+    with pytest.raises(fp.FpirhcError) as refused:
+        fp.compare(tasks.made(motor(), {"it": law(-9.0)}), seed=0, compiled=False)
+    _, _, written = str(refused.value).partition("write ")
+    assert written.startswith("ModelReferenced(Sigmoid(gain=-")
+    assert "-9" not in written
+
+
+def lift() -> fp.Problem:
+    """It is pushed away from where it should be, and its mass is half as much again as in the model."""
+    known = {"m": fp.Parameter(400.0, 650.0, "kg"), "k": fp.Parameter(0.0, 9000.0, "N/m")}
+    plant = fp.Plant(
+        {"h": "m"}, {"F": "N"}, known, lambda q, v, u, p: {"h": (u.F + p.k * q.h - 1500 * v.h) / p.m - 9.81}
+    )
+    wave = fp.Trajectory(lambda t: {"h": 0.5 - 0.4 * ca.cos(0.8 * t)})
+    return fp.Problem(plant, wave, {"h": 0.1}, period=5e-3, duration=8.0, measure_from=2.0,
+                      limits=fp.Limits(inputs={"F": (-2e4, 3e4)}))  # fmt: skip
+
+
+def test_the_rate_that_is_named_is_the_one_that_passes():
+    """Half and twice the rate are lost in own runs, four times is not; where every rate is, that is what is said."""
+    errors = {}
+    for rate in (1.0, 4.0, 8.0):
+        run = fp.simulate(lift(), fp.ComputedTorque(fp.Exponential(rate, integral=False)), seed=0, compiled=False)
+        errors[rate] = np.inf if run.stop else fp.measure(lift(), run).rms_error["h"]
+    assert errors[8.0] < min(0.4, errors[1.0] / 2, errors[4.0] / 2)
+    two, one = (fp.ComputedTorque(fp.Exponential(rate, integral=False)) for rate in (2.0, 0.5))
+    assert answers(lift(), two)["follows"].change == "Set the rate of the tracking law to 8."
+    vain = "No run with one of these passes: set the rate of the tracking law to 0.25/1/0.125/2;"
+    assert answers(lift(), one)["follows"].change.startswith(vain)
+
+
+def test_limits_are_named_where_a_push_is_lost_at_them():
+    """A mass that a spring pushes away comes back from a tenth of its range alone with a larger force."""
+    plant = fp.Plant(
+        {"q": "m"}, {"u": "N"}, {"k": fp.Parameter(4.0, 4.0, "N/m")}, lambda q, v, u, p: {"q": p.k * q.q + u.u}
+    )
+    wave = fp.Trajectory(lambda t: {"q": 0.05 * ca.sin(t)})
+    usual: dict[str, Any] = {"start": {"q": 0.0, "q'": 0.05}, "period": 1e-2, "duration": 10.0}
+    far = fp.Problem(plant, wave, limits=fp.Limits(inputs={"u": (-0.2505, 0.2505)}), **usual)
+    found = answers(far, fp.ComputedTorque(fp.Exponential(rate=3.0)))
+    assert found["returns"].numbers["at_a_limit"] > 0.2 > found["input_limits"].numbers["at_a_limit"]
+    assert found["returns"].change.startswith("Widen the limits of the inputs: they are the cause")
+    wide = replace(far, limits=fp.Limits(inputs={"u": (-0.501, 0.501)}))
+    assert answers(wide, fp.ComputedTorque(fp.Exponential(rate=3.0)))["returns"].verdict == "yes"
+
+
+@pytest.mark.parametrize("gain", [-0.5, -1.4, -2.0])
+def test_latency_that_is_borne_leaves_little_of_a_push(gain):
+    found = answers(mass(), torque(gain))
+    left = found["latency"].numbers.get("left", 1.0)
+    assert (found["latency"].verdict == "yes") == (left <= max(0.1, 2 * found["returns"].numbers["left"]))
+
+
+def test_the_terminal_has_one_line_of_advice_below_each_row_that_is_not_yes(tmp_path: Path, capsys):
+    """From no to yes: what is advised is set, and nothing is left to do; --verbose has the rows that are yes."""
+    file, told, gain = tmp_path / "mine.py", [], "0.5"
+    for code, options in ((1, []), (0, []), (0, ["--verbose"])):
+        file.write_text(line_text("period=1e-3, duration=2.0", f"fp.ModelReferenced(fp.Affine(gain={gain}))"))
+        assert main(["review", str(file), *options]) == code
+        told.append(capsys.readouterr().out)
+        [gain] = {*re.findall(r"^ {10}-> Set the gain to (-\S+)\.$", told[0], re.MULTILINE)}
+    rows = re.findall(r"^  (yes|no|caution|unknown) ", told[0], re.MULTILINE)
+    assert len(re.findall(r"^ {10}-> ", told[0], re.MULTILINE)) == len(rows) > 0
+    assert "yes" not in rows
+    assert "->" not in told[1] + told[2]
+    assert len(re.findall(r"^  yes ", told[2], re.MULTILINE)) > len(re.findall(r"^  yes ", told[1], re.MULTILINE)) == 0
