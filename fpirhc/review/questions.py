@@ -22,8 +22,8 @@ from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
 
-MINOR, ROUNDING, BAD = 1e-3, 1e-6, 1.0  # added error as a share of the largest; errors as shares of the task
-MOSTLY, LEFT = 0.5, 0.1  # share of the cycles at a limit that shows no loop; of a push that latency may leave
+MINOR, ROUNDING, NEAR, BAD = 1e-3, 1e-6, 0.2, 1.0  # added error as a share of the largest; errors as shares of the task
+MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loop; push that latency leaves; of a limit
 CALM, CHATTER = 0.1, 0.01  # step of a command a cycle, as a share of what it covers: mean, and rms from noise
 SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
 SAID = {1.0: "error", -1.0: "error_turned", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
@@ -94,7 +94,7 @@ def _ranges(case: Case) -> Fact | None:
 
 def _follows(case: Case) -> Fact:
     bench, (name, share) = case.bench, case.bench.worst(case.bench.nominal)
-    rms, errors, verdict = bench.errors(bench.nominal)[name], bench.nominal["true_error"], graded(share, GOOD, BAD)
+    rms, errors, verdict = bench.errors(bench.nominal)[name], bench.nominal["true_error"], graded(share, NEAR, BAD)
     numbers = {"rms_error": rms, "error": share, "size": bench.sizes[name]}
     column, by = errors[bench.first(len(errors)) :, case.problem.judged_names.index(name)], predictor(bench.controller)
     offset = by is not None and not by.residual_time and abs(column.mean()) > OFFSET * rms and 0.01 < share < math.inf
@@ -117,13 +117,20 @@ def _saturates(case: Case) -> Fact | None:
     largest, held = of_limit(sent), bench.held(stuck)
     stands = bench.at_limits(stuck)[bench.first(stuck.cycles) :].mean(axis=0)
     at = int((stands if held > SATURATED else largest).argmax())
-    exact = (False,) if case.outside or case.problem.reality is not None else (False, True)
-    needed = max(of_limit(needed_commands(case.problem, states, exact=one))[at] for one in exact)
+    wanted = [needed_commands(case.problem, states, exact=one) for one in (False, case.problem.reality is None)]
+    needed, plain = max(of_limit(one)[at] for one in wanted), case.plain
     sizes = {"largest": np.abs(sent[:, at]).max(), "share_of_the_limit": largest[at]}
     numbers = {"at_a_limit": held} | (sizes if largest[at] > ROUNDING else {})  # it may stand at a limit of zero
     numbers |= {"needed": needed} if np.isfinite(needed) and not plant.equations.hidden else {}
+    once = max(np.abs(np.diff(one[:, at])).mean() for one in wanted) / case.problem.period
+    moves, room = plain.moves(plain.nominal)[at], numbers.get("needed", math.inf) <= ROOM
+    swings = plain.controller.planner is not None and room and moves > 4 * once
+    swings = swings and min(held, plain.held(plain.nominal)) > SATURATED  # by itself
+    numbers |= {"period": 2 * plain.span[at] / moves} if swings else {}  # of a square wave
+    slow = "Slow the reference, or take a larger actuator." if not room and "needed" in numbers else ""
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
-    return Fact(Verdict.NO if lost else graded(held, SATURATED, math.inf), numbers, names[at])
+    verdict = Verdict.NO if lost or swings else graded(held, SATURATED, math.inf)
+    return Fact(verdict, numbers, names[at], slow, ways="dead weights" if swings else "")
 
 
 def _returns(case: Case) -> Fact:
@@ -142,9 +149,8 @@ def _returns(case: Case) -> Fact:
 
 def _times(rate: float) -> dict[str, float]:
     """The time constant of what shrinks, or the time in which what grows is twice as large."""
-    return (
-        {"time_constant": -1 / rate} if rate < 0 else {"doubles_in": math.log(2) / rate} if 0 < rate < math.inf else {}
-    )
+    found = {"time_constant": -1 / rate} if rate < 0 else {"doubles_in": math.log(2) / rate} if rate else {}
+    return found if math.isfinite(rate) else {}
 
 
 def _plans(case: Case) -> Fact | None:
@@ -230,12 +236,11 @@ def _left(case: Case) -> Fact | None:
     if not followed:
         return None
     worst = max(followed, key=lambda one: float(one.beyond.max()))
-    share, most = float((worst.beyond > TOLERANCE).mean()), float(worst.beyond.max())
-    verdict, at = Verdict.YES if most <= TOLERANCE else Verdict.NO, int(worst.beyond.argmax())
+    most, at = float(worst.beyond.max()), int(worst.beyond.argmax())
     excess = max(worst.values[at] - worst.upper, worst.lower - worst.values[at], 0.0)
-    numbers = {"share_of_cycles": share}
+    numbers = {"share_of_cycles": float((worst.beyond > TOLERANCE).mean())}
     numbers |= {"excess": excess, "beyond": most, "time_of_it": at * case.problem.period} if most > 0 else {}
-    return Fact(verdict, numbers, worst.name, unit=worst.unit)
+    return Fact(Verdict.YES if most <= TOLERANCE else Verdict.NO, numbers, worst.name, unit=worst.unit)
 
 
 def _inner(case: Case) -> Fact | None:
@@ -245,7 +250,7 @@ def _inner(case: Case) -> Fact | None:
     rate, left = max(map(zero_dynamics, case.slopes(9))), bench.back.left
     rate = 0.0 if abs(rate) * problem.duration < ROUNDING else rate
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
-    numbers = {"rate_with_outputs_held": rate, **(_times(rate) if rate else {})}
+    numbers = {"rate_with_outputs_held": rate, **_times(rate)}
     still = rate * problem.duration <= math.log(2)
     return Fact(Verdict.YES, numbers) if still else Fact(held, {**numbers, "left": left})
 
@@ -325,8 +330,7 @@ def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) 
     """The quantity that is made worse with most added, its errors, and how many times; `slight` is a share of the task."""
     sizes = {n: s for n, s in case.plain.sizes.items() if s and n in adapted}
     added = {n: math.inf if adapted[n] == math.inf else (adapted[n] - without[n]) / s for n, s in sizes.items()}
-    most = (max((e[n] / s for n, s in sizes.items()), default=0.0) for e in (without, adapted))
-    slight = slight or MINOR * min(most)
+    slight = slight or MINOR * min(max((e[n] / s for n, s in sizes.items()), default=0.0) for e in (without, adapted))
     counted = [n for n, share in added.items() if share > slight and adapted[n] > ROUNDING * sizes[n]]
     times = {n: adapted[n] / max(without[n], 1e-300) for n in counted}
     name = max(added, key=lambda n: (times.get(n, 0.0) > WORSE, added[n]), default=next(iter(adapted)))
@@ -350,9 +354,7 @@ def _model(case: Case) -> Fact:
 
 def _pays(case: Case) -> Fact:
     plain, own = case.plain.share(case.plain.nominal), case.bench.share(case.bench.nominal)
-    if min(plain, own) > BAD:
-        shares = {"share_without": plain, "share_with": own}
-        return Fact(Verdict.UNKNOWN, shares, change="Neither follows: mend that first.")
+    require(min(plain, own) <= BAD, "Neither follows: mend that first.")
     name, numbers, harms = _added(case, case.plain.errors(case.plain.nominal), case.bench.errors(case.bench.nominal))
     numbers["divided_by"] = plain / max(own, 1e-300)
     verdict = Verdict.YES if own < max(plain, SLIGHT) else Verdict.CAUTION  # a small one is nothing to mend
@@ -372,6 +374,10 @@ QUESTIONS = (
     Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of the plans of {whole} did not converge| relative "
              "rms error {error:%} ({start})| {error_with_more_iterations:%} with 8 times the iterations", "Give the optimiser more "
              "iterations, or a smaller tolerance, before anything else."),
+    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change at a limit in "
+             "{at_a_limit:%} of the cycles ({counted})| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the "
+             "model or the plant the reference needs {needed:%}| without adaptation it swings with a period of {period} {time}",
+             "", "gain rate weights window dead limits"),
     Question("gain", "Is the gain admissible?", gain_by_run, "relative rms error {error:%} ({tried})| {error_without:%} without "
              "adaptation| {error_recommended:%} as recommended| {error_at_half:%} at half of the gain| {error_at_twice:%} at "
              "twice| {error_turned:%} with the other sign| recommended gain "
@@ -381,9 +387,6 @@ QUESTIONS = (
     Question("follows", "Does it follow the reference?", _follows, "rms error of {of} {rms_error:u} ({counted}), {error:%} of its "
              "motion of {size:u}| mean {mean_error:u}", "",
              "residual gain out rate weights window dead limits"),
-    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change at a limit in "
-             "{at_a_limit:%} of the cycles ({counted})| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the "
-             "model or the plant the reference needs {needed:%}", "", "gain rate weights window dead limits"),
     Question("returns", "Does it come back from a push?", _returns, "{pushed} after a push by 1 % of the states' ranges {left:%} "
              "is left| {halfway} after one by 10 % {left_of_ten_times:%}| a command at a limit in {at_a_limit:%} of the way back"
              "| a cycle leaves {factor:5} of it| time constant {time_constant} {time}| doubles in {doubles_in} {time}| at worst "
@@ -399,7 +402,7 @@ QUESTIONS = (
     Question("latency", "Does it bear half a cycle of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})| with "
              "{cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation| commands "
              "change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency| {left:%} of a push left "
-             "after {pushed}", "Measure the latency, and state it: Problem(dead_time=...).", "gain form rate weights window"),
+             "after {pushed}", "Run it where no command is late.", "gain form rate weights window"),
     Question("limits", "Do states, rates and paths keep their limits?", _left, "beyond a limit in {share_of_cycles:%} of the "
              "cycles of {whole}| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}", "Commands keep "
              "intervals of inputs and rates: slow the reference, or leave room.", "gain rate weights"),
@@ -417,8 +420,7 @@ QUESTIONS = (
              "disturbances: rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
              "", "form window gain out", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "rms error of {of} {error_without:u} without "
-             "adaptation| {error_with:u} with it ({counted})| relative rms error {share_without:%} without| {share_with:%} with it "
-             "({counted})| {ratio}", "", "gain form window dead out", "adaptive"),
+             "adaptation| {error_with:u} with it ({counted})| {ratio}", "", "gain form window dead out", "adaptive"),
 )  # fmt: skip
 OF_MODEL = "turns", "posed", "ranges", "model"  # which ask the file or the model, and no plant outside
 ROOTS = ("turns", "posed", "plans", "gain")  # whose no is the cause of the others: their sentence stands there too

@@ -73,9 +73,9 @@ def test_the_rate_that_is_named_is_the_one_that_passes():
         errors[rate] = np.inf if run.stop else fp.measure(lift(), run).rms_error["h"]
     assert errors[8.0] < min(0.4, errors[1.0] / 2, errors[4.0] / 2)
     two, one = (fp.ComputedTorque(fp.Exponential(rate, integral=False)) for rate in (2.0, 0.5))
-    assert answers(lift(), two)["follows"].change == "Set the rate of the tracking law to 8."
-    vain = "No run with one of these passes: set the rate of the tracking law to 0.25/1/0.125/2;"
-    assert answers(lift(), one)["follows"].change.startswith(vain)
+    told, vain = (answers(lift(), rate)["follows"].change for rate in (two, one))
+    assert told == "Set the rate of the tracking law to 8. It is better then, and no yes."
+    assert vain.startswith("No run with one of these passes: set the rate of the tracking law to 0.25/1/0.125/2;")
 
 
 def test_limits_are_named_where_a_push_is_lost_at_them():
