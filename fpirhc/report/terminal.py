@@ -292,10 +292,10 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
     for name, answers in found.answers.items():
         shown = [one for one in answers if verbose or one.verdict != "yes"]
         say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
-        for one in shown:
+        for one, after in zip(shown, [*(later.change for later in shown[1:]), ""], strict=False):
             evidence = f" ({one.evidence})" if one.evidence else ""
             say(f"  {one.verdict:7s} {one.question}{evidence}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
-            if one.change:
+            if one.change and one.change != after:  # the same advice stands once, below its last row
                 say(f"          -> {one.change}", "bold")
     say(", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
 
