@@ -152,8 +152,12 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
             largest = largest_gain(deformation.with_effective_gain(-gain), jacobian, seen)
             remedy = f"use a {'negative' if value > 0 else 'positive'} {name}, 0 < |{name}| < {abs(largest / gain * value):.3g}"
         turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
-        why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
-        raise NotContractive(f"{report.fault}{why}", remedy or report.remedy)
+        if turned:
+            why = f"{report.fault}: {' and '.join(turned)} of the plant and of the model differ in sign"
+            raise NotContractive(
+                why, "give the model the plant's sign, because a plan with the other one goes the wrong way"
+            )
+        raise NotContractive(report.fault, remedy or report.remedy)
     if not deformation.form.steady or (seen is None and abs(gain) < abs(limit)):
         return
     weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)

@@ -243,7 +243,7 @@ class Estimates:
         if self.least_at_most <= 0:
             return "an eigenvalue of the gains has the wrong sign: an input of the model has, or is paired with the wrong output"
         if self.uncertain or np.linalg.eigvals(self.gains).real.min() <= 0:
-            return "the sign of a gain is not certain: excite more or longer (amplitude=, cycles=)"
+            return "the sign of a gain is not certain: excite more or longer (amplitude, cycles)"
         return ""
 
     @property

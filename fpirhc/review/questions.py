@@ -343,7 +343,7 @@ def _model(case: Case) -> Fact:
     benches = [case.other(one.controller, model=task) for one in (case.plain, case.bench)]
     runs = [one.run(cycles=one.whole, disturbed=False, quiet=True) for one in benches]
     stuck = min(one.held(run) for one, run in zip(benches, runs, strict=True))
-    require(stuck <= MOSTLY, "The command stands at a limit: run it where commands are free.")
+    require(stuck <= MOSTLY, "With the model as plant the command stands at a limit: run it where commands are free.")
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
     name, numbers, harms = _added(case, without, adapted, SLIGHT)
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
@@ -399,8 +399,8 @@ QUESTIONS = (
              "Narrow the range of the parameters.", "gain rate limits out"),
     Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it comes back at {least} to {most} "
              "times their gain", "", "gain form rate weights window"),
-    Question("latency", "Does it bear half a cycle of latency?", _latency, "{cycles_borne} of 3 cycles ({time_borne} {time})| with "
-             "{cycles_tried} of them: relative rms error {error:%} ({start})| {error_without:%} without adaptation| commands "
+    Question("latency", "Does it bear half a cycle of latency?", _latency, "it bears {cycles_borne} of 3 ({time_borne} {time})| "
+             "with {cycles_tried} late: relative rms error {error:%} ({start})| {error_without:%} without adaptation| commands "
              "change by {mean_step:%} of what they cover a cycle| {mean_step_without:%} without latency| {left:%} of a push left "
              "after {pushed}", "Run it where no command is late.", "gain form rate weights window"),
     Question("limits", "Do states, rates and paths keep their limits?", _left, "beyond a limit in {share_of_cycles:%} of the "

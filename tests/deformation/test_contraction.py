@@ -64,7 +64,9 @@ def test_a_gain_is_refused_exactly_beyond_its_limit(map):
     with pytest.raises(NotContractive, match=rf"wrong sign.*use a {sign} {name}, 0 < "):
         run(PAIR, map.with_effective_gain(-0.2), duration=0.6)
     with pytest.raises(NotContractive, match=r"wrong sign.*, without the response's delay of 2 cycles$"):
-        run((-np.array(PAIR)).tolist(), map, duration=0.6, dead_time=fp.DeadTime(measurement=4e-3))
+        run(PAIR, map.with_effective_gain(-0.2), duration=0.6, dead_time=fp.DeadTime(measurement=4e-3))
+    with pytest.raises(NotContractive, match=r"differ in sign; give the model the plant's sign"):
+        run((-np.array(PAIR)).tolist(), map, duration=0.6)
 
 
 @pytest.mark.parametrize("jacobian", [[[1.0, 0.0], [0.0, -0.5]], [[0.0, 0.3], [-0.3, 0.0]]])

@@ -91,7 +91,7 @@ def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
         (lambda: plant(z=parameter(0.0, fp.LogNormal(factor=2.0))), "use Uniform or Normal with absolute"),
         (lambda: plant(z=fp.Parameter(1.0, 1.0, "1", spread=0.3)), "expected a Spread or None, got 0.3"),  # type: ignore[arg-type]
         # 100 % has no meaning for a parameter that could change its sign; with spreads everywhere it has.
-        (lambda: drawn(plant(a=parameter(2.0, fp.Uniform(absolute=0.1))), 100.0), "below 100"),
+        (lambda: drawn(plant(a=parameter(2.0, fp.Uniform(absolute=0.1))), 100.0), "less than 100"),
         (lambda: drawn(plant(), -1.0), "at least 0"),
         # 0.5 -+ 0.3 leaves (0.35, 1): half of the spread stays inside.
         (
@@ -114,7 +114,7 @@ def test_a_review_refuses_what_scenarios_refuse():
     assert fp.review(problem, law, mismatch=39.0, seed=0).mismatch == 39.0
     for wrong, words in (
         (41.0, r"parameter 'c'.*at most 40 % stay inside"),
-        (100.0, "below 100"),
+        (100.0, "less than 100"),
         (math.nan, "a number, got nan"),
     ):
         with pytest.raises(fp.FpirhcError, match=words):
