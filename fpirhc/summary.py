@@ -124,11 +124,6 @@ def number(value: float) -> str:
     return written_out(value, 4)
 
 
-def behind_equals(value: float, digits: int = 4) -> str:
-    """Return a number as it stands behind '=', where thousands stay together."""
-    return written_out(value, digits).replace(" ", "")
-
-
 def in_percent(share: float) -> str:
     """Return a share in percent, in three digits; what is below a thousandth of a percent is said to be so."""
     return "less than 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{written_out(100 * share)} %"

@@ -30,14 +30,6 @@ def switches(run_: fp.Run) -> np.ndarray:
     return np.flatnonzero(np.diff(run_["slot"][:, 0])) + 1
 
 
-def angle_gain(angle: np.ndarray) -> np.ndarray:
-    """Size of d angle'' / dF of the crane."""
-    p = dict(
-        zip(SHIPPED.crane_slots.problem.plant.parameter.elements, SHIPPED.crane_slots.problem.plant.exact, strict=True)
-    )
-    return np.cos(angle) / p["l"] / (p["M"] + p["m"] * np.sin(angle) ** 2)
-
-
 def pendulum_problem() -> fp.Problem:
     """A pendulum that follows a ramp with hardly enough torque."""
     return fp.Problem(

@@ -1,4 +1,4 @@
-"""Whole reports as they are read: six texts are kept in tests/data/reports, and a changed one is renewed by
+"""Whole reports as they are read: eight texts are kept in tests/data/reports, and a changed one is renewed by
 
     FPIRHC_RENEW=1 python -m pytest tests/report/test_texts.py
 
