@@ -163,11 +163,11 @@ def test_compare_runs_members_from_abroad(abroad: Path) -> None:
 
 @pytest.mark.slow
 def test_check_measures_members_from_abroad(abroad: Path) -> None:
-    """A baseline is written and checked, with the plan metrics of the wrapped controller."""
+    """A baseline is written and checked, with all of them."""
     written = run(
         abroad, "-m", "fpirhc", "accept", "masses.py", "--reason", "first numbers", "--no-compile", "--seeds", "2"
     )
     assert written.returncode == 0, written.stderr
     [baseline] = (abroad / "baselines").glob("*.json")
-    assert "plans" in baseline.read_text()
+    assert set(json.loads(baseline.read_text())["controllers"]) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
     assert run(abroad, "-m", "fpirhc", "check", "masses.py", "--no-compile").returncode == 0

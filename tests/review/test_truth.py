@@ -117,7 +117,7 @@ CASES: dict[str, Case] = {
         lambda: (reviewed.tank(), {"it": sigmoid(-0.3), "predicted": fp.Predicted(sigmoid(-0.6), inputs=1.5)}),
         {("it", "gain"): "no", ("predicted", "gain"): "yes", ("predicted", "returns"): "caution"},
         {("it", "gain", "error_without"): (0.0865, 1e-3), ("it", "gain", "error"): (0.0956, 1e-3)},
-        changes={("it", "gain"): LEAVE, ("it", "pays"): LEAVE},
+        changes=dict.fromkeys([("it", "gain"), ("it", "pays")], WRAP.replace("0.06", "1.5")),
     ),
     "a dead time that is stated and not predicted": Case(
         shipped("delayed_mass", "RHC not predicting"), changes={("RHC not predicting", "follows"): WRAP}
