@@ -169,5 +169,6 @@ def test_check_measures_members_from_abroad(abroad: Path) -> None:
     )
     assert written.returncode == 0, written.stderr
     [baseline] = (abroad / "baselines").glob("*.json")
-    assert set(json.loads(baseline.read_text())["controllers"]) == {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
+    members = {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
+    assert set(json.loads(baseline.read_text())["controllers"]) == members
     assert run(abroad, "-m", "fpirhc", "check", "masses.py", "--no-compile").returncode == 0
