@@ -146,18 +146,18 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     spectrum, delay = Spectrum(np.linalg.eigvals(weighted)), problem.response_delay
     limit, seen = sum(linear_limit(spectrum.eigenvalues)), _weights_of_estimators(problem)
     if limit * gain <= 0:
-        report, remedy = assess_gain(deformation, spectrum, delay), ""
-        if seen is not None and deformation.form.steady:
-            name, value = own_gain(deformation)
-            largest = largest_gain(deformation.with_effective_gain(-gain), jacobian, seen)
-            remedy = f"use a {'negative' if value > 0 else 'positive'} {name}, 0 < |{name}| < {abs(largest / gain * value):.3g}"
+        report = assess_gain(deformation, spectrum, delay)
         turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
         if turned:
             why = f"{report.fault}: {' and '.join(turned)} of the plant and of the model differ in sign"
             raise NotContractive(
                 why, "give the model the plant's sign, because a plan with the other one goes the wrong way"
             )
-        raise NotContractive(report.fault, remedy or report.remedy)
+        remedy, behind = report.remedy, seen is not None and deformation.form.steady
+        if behind and (largest := largest_gain(deformation.with_effective_gain(-gain), jacobian, seen or [])):
+            name, value = own_gain(deformation)
+            remedy = f"use a {'negative' if value > 0 else 'positive'} {name}, 0 < |{name}| < {abs(largest / gain * value):.3g}"
+        raise NotContractive(report.fault, remedy)
     if not deformation.form.steady or (seen is None and abs(gain) < abs(limit)):
         return
     weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)
