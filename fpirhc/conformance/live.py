@@ -47,6 +47,8 @@ def check_live(
         except FpirhcError as error:
             named = [path for path in opened if f"'{path}'" in str(error)]
             _hold(bool(named), f"one of the settings {opened} is refused without its name: {error}")
+            if len(named) > 1:  # together: those that open alone are not the ones
+                named = [path for path in named if not _opens(short, controller, path)] or named
             became |= dict.fromkeys(named, str(error))
             opened = [path for path in opened if path not in named]
     if ready is not None:
@@ -56,6 +58,13 @@ def check_live(
         for path in opened:
             became[path] = next((factor for factor in _FACTORS if _runs_as_rebuilt(ready, path, factor)), None)
     return became
+
+
+def _opens(problem: Problem, controller: Controller, path: str) -> bool:
+    try:
+        return bool(simulator(problem, controller, compiled=False, live=[path]).live.paths)
+    except FpirhcError:
+        return False
 
 
 def _own_paths(problem: Problem, controller: Controller) -> Iterator[str]:
