@@ -31,11 +31,11 @@ from .horizon.cost import LQRTerminal as LQRTerminal
 from .horizon.cost import Quadratic as Quadratic
 from .horizon.hessian_models import ExactHessian as ExactHessian
 from .horizon.horizon import Horizon as Horizon
-from .learning.estimators.base import Uncertain as Uncertain
-from .learning.estimators.disturbance_kalman import DisturbanceKalman as DisturbanceKalman
-from .learning.estimators.recursive_least_squares import RecursiveLeastSquares as RecursiveLeastSquares
-from .learning.rules.lyapunov_rule import LyapunovRule as LyapunovRule
-from .learning.rules.projection import Projection as Projection
+from .learning.disturbance_kalman import DisturbanceKalman as DisturbanceKalman
+from .learning.estimators import RecursiveLeastSquares as RecursiveLeastSquares
+from .learning.estimators import Uncertain as Uncertain
+from .learning.rules import LyapunovRule as LyapunovRule
+from .learning.rules import Projection as Projection
 from .optimisers.fixed_point import FixedPoint as FixedPoint
 from .optimisers.nlp import Fatrop as Fatrop
 from .optimisers.nlp import Ipopt as Ipopt
@@ -89,7 +89,7 @@ from .simulation.simulate import simulate as simulate
 from .simulation.simulate import simulator as simulator
 from .simulation.stepper import Stepper as Stepper
 from .status import Status as Status
-from .studies.comparison.compare import compare as compare
+from .studies.compare import compare as compare
 from .studies.limits import limits as limits
 from .studies.open_loop import certify as certify
 from .studies.study import study as study

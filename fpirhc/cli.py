@@ -170,8 +170,8 @@ def compare(
 ) -> None:  # fmt: skip
     """Run controllers side by side and write a report. It names the winner, by how much, and at what price."""
     task = _task(problem, set_, controllers)
-    from fpirhc.studies.comparison.compare import compare as run
-    from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.compare import compare as run
+    from fpirhc.studies.compare import select
     from fpirhc.studies.open_loop import first_plans, with_optimisers
 
     named = list(select(task, controllers)) if controllers else None
@@ -216,7 +216,7 @@ def review(
 
     from fpirhc.report.terminal import show_review
     from fpirhc.review.review import review as ask
-    from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.compare import select
     from fpirhc.studies.view import to_json
 
     found = ask(task.problem, select(task, controllers), mismatch=mismatch, seed=seed)
@@ -245,7 +245,7 @@ def run(
     from dataclasses import replace
 
     from fpirhc.problem_files.problem_file import in_case
-    from fpirhc.studies.comparison.compare import harm_of_adaptation, select
+    from fpirhc.studies.compare import harm_of_adaptation, select
 
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], _folder(out, task.name)
@@ -305,7 +305,7 @@ def study(
             "--limits searches by the error, run after run: leave out --headline, --processes, --cluster"
         )
     task = _task(problem)
-    from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.compare import select
     from fpirhc.studies.limits import limits as find_limits
     from fpirhc.studies.study import figure_of
     from fpirhc.studies.study import study as run_study
@@ -359,7 +359,7 @@ def probe(
     from fpirhc.errors import NotSupported, require
     from fpirhc.probing.probe import probe as ask
     from fpirhc.report.terminal import show_probe
-    from fpirhc.studies.comparison.compare import select
+    from fpirhc.studies.compare import select
     from fpirhc.studies.view import to_json
 
     able = list[str]()
@@ -518,12 +518,12 @@ def export(
     """Write a controller for use without Python. C99 for a device, a unit of FMI 2, WebAssembly, or a page with sliders."""
     task = _task(problem)
     from fpirhc.errors import InvalidName, nearest
-    from fpirhc.export.target import device_of, targets, write
-    from fpirhc.studies.comparison.compare import select
+    from fpirhc.export.device import device_of, targets, write
+    from fpirhc.studies.compare import select
 
     chosen, folder = select(task, [controller])[controller], out or Path("results", task.name, to)
     if to == "lab":
-        from fpirhc.export.lab.lab import write_lab
+        from fpirhc.export.lab import write_lab
 
         if live:
             raise typer.BadParameter(

@@ -14,7 +14,7 @@ from fpirhc.deformation.base import Deformation as Deformation
 from fpirhc.deformation.base import Form as Form
 from fpirhc.deformation.base import Wrapper as Wrapper
 from fpirhc.horizon.problem import reduced_gradient as reduced_gradient
-from fpirhc.learning.estimators.base import ParameterEstimator as ParameterEstimator
+from fpirhc.learning.estimators import ParameterEstimator as ParameterEstimator
 from fpirhc.optimisers.base import Optimiser as Optimiser
 from fpirhc.optimisers.base import clip as clip
 from fpirhc.optimisers.base import judge as judge

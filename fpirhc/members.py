@@ -42,8 +42,8 @@ FAMILIES: Mapping[str, Family] = {
     "observers": Family("fpirhc.sensing.base:StateObserver", ("fpirhc.sensing.observers",)),
     "optimisers": Family("fpirhc.optimisers.base:Optimiser", ("fpirhc.optimisers",)),
     "controllers": Family("fpirhc.controllers.base:Controller", ("fpirhc.controllers",)),
-    "estimators": Family("fpirhc.learning.estimators.base:ParameterEstimator", ("fpirhc.learning.estimators",)),
-    "adaptation rules": Family("fpirhc.learning.rules.base:Rule", ("fpirhc.learning.rules",)),
+    "estimators": Family("fpirhc.learning.estimators:ParameterEstimator", ("fpirhc.learning",)),
+    "adaptation rules": Family("fpirhc.learning.rules:Rule", ("fpirhc.learning",)),
 }
 
 

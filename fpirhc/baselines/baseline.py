@@ -22,7 +22,7 @@ from fpirhc.errors import BaselineError, not_writable
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.shipped import missing
-from fpirhc.studies.comparison.compare import select
+from fpirhc.studies.compare import select
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.view import Progress, versions

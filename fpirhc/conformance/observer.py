@@ -9,8 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
-from fpirhc.conformance.loops import two_masses
+from fpirhc.conformance.laws import Array, Broken, Draw, keep, two_masses, within
 from fpirhc.controllers.path import observed_model
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, unobservable, values_of

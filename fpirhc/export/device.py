@@ -1,21 +1,26 @@
-"""What every target knows of a controller that leaves Python: its C, the C names of its numbers, and how large all of it is.
+"""A controller that leaves Python: its C, the C names of its numbers, the samples that it is replayed with, and its targets.
 
-The C is that of `Stepper.function`; no target computes anything of the controller anew.
+The C is that of `Stepper.function`; no target computes anything of the controller anew. A target is a module of
+`fpirhc.export.targets` with a value `TARGET`, which turns a `Device` into files; an addition is one file.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import InvalidName
+from fpirhc.errors import InvalidName, NotSupported, OutputError, not_writable
+from fpirhc.members import within
 from fpirhc.problem_files.settings import unit_of_setting
+from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.open import SETTINGS
@@ -165,3 +170,140 @@ def portable(text: str) -> str:
     text = _FUNCTION.sub(lambda m: m[1] if visible.fullmatch(m[2]) else f"static {m[1]}", text)
     lines = (line if "OF_TYPE" in line else _NUMBER.sub(r"(casadi_real)\1", line) for line in text.splitlines(True))
     return _HEAD + "".join(lines)
+
+
+_OFFSET, _PRIME, _MASK = 0xCBF29CE484222325, 0x100000001B3, (1 << 64) - 1
+_NAN = 0x7FF8000000000000
+_CYCLES = 2000  # of a record
+
+
+def recorded(device: Device) -> bytes:
+    """Return the file: a head of four 32-bit numbers (cycles, numbers given, commands, whether bits count), and the cycles.
+
+    Bits do not count where there is no compiler and a plan was solved by the virtual machine, which rounds in another order.
+
+    Samples are those of a run, again from its beginning where it is too short; a plant outside is not run, but its model is.
+    """
+    stepper = device.stepper
+    rows = with_faults(_samples(device), device.problem)[:_CYCLES]
+    exact = stepper.compiled or stepper.function.is_a("SXFunction")
+    head = struct.pack("<4i", len(rows), rows.shape[1], device.problem.plant.input.size, exact)
+    memory, parts = stepper.start(), [head]
+    for k, row in enumerate(rows):
+        damaged = memory.size - 3 if k == _DAMAGED else -1
+        if damaged >= 0:
+            memory = memory.copy()
+            memory[damaged] = np.nan
+        command, memory = stepper.step_measured(row[0], row[1:], memory)
+        trace = np.concatenate([value.ravel() for value in stepper.trace().values()])
+        parts += [
+            row.tobytes(),
+            struct.pack("<d", damaged),
+            command.tobytes(),
+            struct.pack("<2Q", digest(memory), digest(trace)),
+        ]
+    return b"".join(parts)
+
+
+_GAPS = ((150, 3), (220, 30), (300, 700))  # first cycle behind a gap, and the number of missing ones
+_DAMAGED = 95  # cycle before which an entry of the memory becomes NaN
+
+
+def with_faults(rows: np.ndarray, problem: Problem) -> np.ndarray:
+    """Return samples with what a device meets: no numbers, outliers, a plant that jumped, and cycles that are missing.
+
+    Behind a gap the samples are those of its end, as the reference is: others would keep the commands at their limits.
+    """
+    place = np.arange(len(rows))
+    for first, missing in _GAPS:
+        place[first:] += missing
+    rows = rows[place % len(rows)]
+    rows[:, 0] = problem.period * place
+    # main.c knows the first outlier, that of cycle 40.
+    faults: dict[int, tuple[int, float]] = {
+        20: (1, np.nan), 25: (-1, np.inf), 30: (-1, -np.inf), 35: (0, np.nan), 40: (1, 1e9), 41: (1, 1e9), 42: (1, 1e9),
+        50: (-1, 1e200), 52: (0, 1e18), 53: (1, -np.inf),
+    }  # fmt: skip
+    for k, (entry, value) in faults.items():
+        rows[k : k + 1, entry] = value
+    rows[60:85, 1] += 1e4
+    rows[350:351, 0] = rows[349:350, 0]  # a cycle twice
+    return rows
+
+
+def digest(values: np.ndarray) -> int:
+    """Return FNV-1a of the bits of the numbers, eight bytes at a time."""
+    bits = np.where(np.isnan(values), np.uint64(_NAN), values.view(np.uint64))
+    total = _OFFSET
+    for one in bits.tolist():
+        total = ((total ^ one) * _PRIME) & _MASK
+    return total
+
+
+def _samples(device: Device) -> np.ndarray:
+    """What the step is given in a run, with times that go on where it is repeated, and as many cycles more as gaps are long."""
+    problem = device.problem
+    run = simulate(problem.of_equations, device.controller, seed=0)
+    parts = (run.time if name == "time" else run[name] for name in device.inputs.names)
+    rows = np.hstack([np.asarray(part, dtype=float).reshape(len(run.time), -1) for part in parts])
+    wanted = _CYCLES + sum(missing for _, missing in _GAPS)
+    rows = np.vstack([rows] * -(-wanted // len(rows)))[:wanted]
+    rows[:, 0] = device.problem.period * np.arange(len(rows))
+    return rows
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of place where a controller runs."""
+
+    name: str  # word after --to
+    files: Callable[[Device], Mapping[str, str | bytes]]  # contents of all files by name
+
+
+@cache
+def targets() -> dict[str, Target]:
+    """Return all targets by name."""
+    members = [module.TARGET for module in within("fpirhc.export.targets")]
+    return {target.name: target for target in sorted(members, key=lambda one: one.name)}
+
+
+def device_of(
+    problem: Problem, controller: Controller, title: str, *, name: str | None = None, live: Sequence[str] = ()
+) -> Device:
+    """Return a controller for a device; `name` is the prefix of everything in C, None: made of the title."""
+    whole = f"{problem.name} {title}"
+    chosen = default_name(whole) if name is None else name
+    check_name(chosen)
+    try:
+        # A solver without a bound of its time is refused below, for what it is.
+        stepper = Stepper(problem, controller, live=live, bounded=False)
+        device = Device(chosen, in_comment(whole), problem, controller, stepper)
+        _ = device.sources, device.bounds
+    except NotSupported as error:
+        raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None
+    return device
+
+
+def write(device: Device, target: Target, folder: Path) -> list[Path]:
+    """Write the files of a target into a new or empty folder, and return their paths."""
+    try:
+        taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        contents = {} if taken else target.files(device)
+        for name, content in contents.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    except OSError as error:
+        raise not_writable(folder, error, "--out") from None
+    if taken:
+        raise OutputError(
+            f"'{folder}' is not an empty folder, and nothing in it is replaced; choose another one with --out"
+        )
+    return [folder / name for name in contents]
+
+
+def _instead(controller: Controller) -> str:
+    """What to use in place of an optimiser that needs a library; empty for a controller without one."""
+    optimiser = None if controller.planner is None else type(controller.planner.optimiser).__name__
+    if optimiser in (None, "FixedPoint"):
+        return ""
+    return f". In place of {optimiser} use FixedPoint(iterations=1, tolerance=...), which is C of its own"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from fpirhc.contraction.spectrum import ContractionReport
     from fpirhc.simulation.picture import Drawing
-    from fpirhc.studies.comparison.compare import Comparison, Contraction
+    from fpirhc.studies.compare import Comparison, Contraction
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
 

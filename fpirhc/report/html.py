@@ -25,7 +25,7 @@ from fpirhc.report.figures import colours_of, contraction_figures
 from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import planar
-from fpirhc.studies.comparison.verdict import IN_FULL, Outcome
+from fpirhc.studies.verdict import IN_FULL, Outcome
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
     from fpirhc.simulation.picture import Drawing
-    from fpirhc.studies.comparison.compare import Comparison
+    from fpirhc.studies.compare import Comparison
     from fpirhc.studies.view import View
 
 

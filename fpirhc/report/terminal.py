@@ -27,7 +27,7 @@ from rich.text import Text
 from fpirhc.simulation.metrics.base import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
-from fpirhc.studies.comparison.verdict import IN_FULL, Outcome
+from fpirhc.studies.verdict import IN_FULL, Outcome
 from fpirhc.summary import Column, Table, number, printable, written_out
 
 if TYPE_CHECKING:

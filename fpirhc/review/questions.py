@@ -17,8 +17,8 @@ from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
 from fpirhc.plant.chain import zero_dynamics
 from fpirhc.review.experiments import BUSY, GOOD, LITTLE, PROBE, SLIGHT, WORSE, Case, ladder, predictor, set_gain
-from fpirhc.simulation.hard_limits import TOLERANCE, hard_limits
 from fpirhc.simulation.model_as_plant import ModelAsPlant
+from fpirhc.simulation.ranges import TOLERANCE, hard_limits
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import compiled_plans
 

@@ -28,9 +28,9 @@ from fpirhc.simulation.judging import with_judgements
 from fpirhc.simulation.metrics.base import Metric, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator
-from fpirhc.studies.comparison.compare import select
-from fpirhc.studies.comparison.verdict import left_alone, ranges
+from fpirhc.studies.compare import select
 from fpirhc.studies.variants import Variant, Variants
+from fpirhc.studies.verdict import left_alone, ranges
 from fpirhc.studies.view import Progress, versions
 from fpirhc.summary import in_units
 from fpirhc.task.cases import as_declared

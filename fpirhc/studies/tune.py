@@ -18,7 +18,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting, with_settings
-from fpirhc.studies.comparison.compare import check_gains, harm_of_adaptation, select
+from fpirhc.studies.compare import check_gains, harm_of_adaptation, select
 from fpirhc.studies.objective import Objective, objective
 from fpirhc.studies.runs import Runner
 from fpirhc.studies.variants import Draws, Variant, Variants

@@ -12,7 +12,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from fpirhc.describe import describe
-from fpirhc.studies.comparison.verdict import Outcome
+from fpirhc.studies.verdict import Outcome
 from fpirhc.summary import Table, in_percent
 
 if TYPE_CHECKING:

@@ -288,7 +288,7 @@ HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", 
         ("import fpirhc as fp; fp.load_problem('two_mass')", ("matplotlib", "rich", "jinja2", "pandas", "joblib")),
         ("from fpirhc.__main__ import main; main(['compare', 'wrong.py'])", HEAVY[3:]),
         ("import fpirhc.report.html", ("matplotlib",)),
-        ("import fpirhc.studies.comparison.compare", ("scipy",)),
+        ("import fpirhc.studies.compare", ("scipy",)),
     ],
 )
 def test_what_comes_first_is_light(first, absent, tmp_path):

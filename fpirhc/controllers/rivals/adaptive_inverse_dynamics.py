@@ -15,7 +15,7 @@ from fpirhc.controllers.path import measured
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
-from fpirhc.learning.rules.base import Pair, Rule
+from fpirhc.learning.rules import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block, Delay, fed

@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.controllers.base import clip
 from fpirhc.controllers.built import Built
 from fpirhc.errors import InvalidValue, refuse
-from fpirhc.learning.rules.base import Bounds, Evidence, Pair, Rule
+from fpirhc.learning.rules import Bounds, Evidence, Pair, Rule
 from fpirhc.plant.plant import Plant
 from fpirhc.plant.regressor import Regressor
 from fpirhc.symbolic.block import Block, Delay

@@ -13,7 +13,7 @@ from fpirhc.controllers.rivals.learned_parameters import Learning, learning_dela
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Positive
-from fpirhc.learning.rules.base import Pair, Rule
+from fpirhc.learning.rules import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.plant.motion import derivative_unit, places
 from fpirhc.plant.regressor import Regressor

@@ -17,8 +17,8 @@ from fpirhc.controllers.built import Built, compose_controller, dependencies_of_
 from fpirhc.controllers.contract import ControllerWrapper, Planner, innermost, with_field
 from fpirhc.controllers.path import Pairs
 from fpirhc.errors import require
-from fpirhc.learning.estimators.base import ParameterEstimator, Seen
-from fpirhc.learning.estimators.disturbance_kalman import DisturbanceKalman
+from fpirhc.learning.disturbance_kalman import DisturbanceKalman
+from fpirhc.learning.estimators import ParameterEstimator, Seen
 from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay

@@ -1,1 +1,1 @@
-"""The targets, one file each: a value `TARGET` of the class `fpirhc.export.target.Target`."""
+"""The targets, one file each: a value `TARGET` of the class `fpirhc.export.device.Target`."""

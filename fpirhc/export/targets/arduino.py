@@ -7,8 +7,7 @@ import re
 from collections.abc import Mapping
 
 from fpirhc.errors import InvalidValue
-from fpirhc.export.device import Device
-from fpirhc.export.target import Target
+from fpirhc.export.device import Device, Target
 from fpirhc.export.targets.c import filled, layout_of, sources
 from fpirhc.plant.motion import SECONDS
 

@@ -13,9 +13,7 @@ from importlib import resources
 import numpy as np
 
 from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
-from fpirhc.export.device import Device, identifiers, in_comment, literal
-from fpirhc.export.samples import recorded
-from fpirhc.export.target import Target
+from fpirhc.export.device import Device, Target, identifiers, in_comment, literal, recorded
 from fpirhc.simulation.clock import LONGEST, MEMORY
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.status import Status

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 
 from fpirhc.errors import NotInstalled
 from fpirhc.export.binaries import shared_library
-from fpirhc.export.device import Device
-from fpirhc.export.target import Target
+from fpirhc.export.device import Device, Target
 from fpirhc.export.targets.c import filled, layout_of, sources
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import why_no_compiler

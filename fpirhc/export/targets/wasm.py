@@ -6,9 +6,7 @@ import json
 from collections.abc import Mapping
 
 from fpirhc.export.binaries import web_module
-from fpirhc.export.device import Device
-from fpirhc.export.samples import recorded
-from fpirhc.export.target import Target
+from fpirhc.export.device import Device, Target, recorded
 from fpirhc.export.targets.c import data_of, filled, layout_of, sources
 
 

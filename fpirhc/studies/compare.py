@@ -22,19 +22,19 @@ from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
 from fpirhc.sensing.base import response_names
-from fpirhc.simulation.hard_limits import Followed, limits_left
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.pictures.base import Picture
+from fpirhc.simulation.ranges import Followed, limits_left
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.tables import Changes
 from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
-from fpirhc.studies.comparison.verdict import NULL, Finding, Outcome, Yardstick, findings
 from fpirhc.studies.objective import objective
+from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings
 from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
 from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.symbolic.evaluate import attempted

@@ -25,7 +25,7 @@ from fpirhc.summary import in_percent, in_words
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
-    from fpirhc.studies.comparison.compare import Entry
+    from fpirhc.studies.compare import Entry
 
 
 class Outcome(StrEnum):

@@ -13,7 +13,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
 from fpirhc.fields.kinds import Deviation, Positive
-from fpirhc.learning.estimators.base import Correct, ParameterEstimator, Seen
+from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
 from fpirhc.plant.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import one_step
 from fpirhc.plant.maps import response_age

@@ -1,1 +1,0 @@
-"""Rules by which an adaptive controller changes its parameters."""

@@ -1,1 +1,0 @@
-"""Several controllers on one problem."""
