@@ -25,7 +25,7 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.open import ANEW, Opened, not_live
-from fpirhc.symbolic.paths import Copy, changed_at, content_at, copied, entry, mapped, names_in, paths_to, validated
+from fpirhc.symbolic.paths import changed_at, content_at, entry, levels, mapped, meant, names_in, paths_to
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -61,7 +61,7 @@ class LiveSettings:
         checked(self.problem, self.controller)
         opened = Opened(self.start)
         try:
-            composite = compose(build(*self._with(opened.symbols, copied), opened=True))
+            composite = compose(build(*self._with(opened.symbols, checked=False), opened=True))
         except _OF_BUILD as error:
             interruption = unwrapped(error)
             if not isinstance(interruption, Exception):
@@ -102,7 +102,7 @@ class LiveSettings:
                 raise InvalidValue(
                     f"setting '{path}' cannot become {value}: the compiled loop has this number in its code; use a large one"
                 )
-        problem, controller = self._with({p: v for p, v in values.items() if v != self.start[p]}, validated)
+        problem, controller = self._with({p: v for p, v in values.items() if v != self.start[p]})
         return problem, checked(problem, controller, numbers_only=True), values
 
     def bounds(self, path: str, reach: float = math.inf) -> Interval:
@@ -165,14 +165,14 @@ class LiveSettings:
                     raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
         return values
 
-    def _with(self, contents: Mapping[str, object], copy: Copy) -> tuple[Problem, Controller]:
+    def _with(self, contents: Mapping[str, object], *, checked: bool = True) -> tuple[Problem, Controller]:
         """Problem and controller with other contents, by path."""
         problem, controller = self.problem, self.controller
         for path, content in contents.items():
             if _owner(self.problem, self.controller, path) is self.problem:
-                problem = changed_at(problem, path, content, copy)
+                problem = changed_at(problem, path, content, checked=checked)
             else:
-                controller = changed_at(controller, path, content, copy)
+                controller = changed_at(controller, path, content, checked=checked)
         return problem, controller
 
     def _content(self, path: str) -> float:
@@ -218,13 +218,12 @@ def _is_structure(owner: object, path: str) -> bool:
 
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:
     """The controller, or the problem for a cost, limits or a reference that the controller does not have."""
-    first = path.partition(".")[0]
-    own = [n for n in names_in(controller) if getattr(controller, n) is not None]
+    first, dot, rest = path.partition(".")
+    own = [*dict.fromkeys(n for one in levels(controller) for n in names_in(one) if entry(one, n) is not None)]
     shared = [n for n in OF_PROBLEM if getattr(problem, n) is not None]
     if first in (*own, *shared):
         return controller if first in own else problem
-    below = " or ".join(f"'{one}'" for one in paths_to(first, controller))
-    hint = f" Did you mean {below}?" if below else nearest(first, [*own, *shared])
+    hint = meant(f"{one}{dot}{rest}" for one in paths_to(first, controller)) or nearest(first, [*own, *shared])
     if first in ("start", "plant", "parameters", *problem.plant.parameters):
         hint = (
             " Parameters (exact and approximate) and the start are data of every loop; they need no live setting: --set takes "

@@ -11,7 +11,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
-from fpirhc.symbolic.paths import changed_at, content_at, names_in
+from fpirhc.symbolic.paths import changed_at, content_at, mapped, names_in
 from fpirhc.task.cases import PARAMETERS, START, Cases, check_change
 from fpirhc.task.problem import Problem
 
@@ -62,7 +62,7 @@ def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
 
 def is_own(controller: Controller, path: str) -> bool:
     """Whether a path begins with a field of the controller that it has: a number that problem and controller have is its own."""
-    return getattr(controller, path.partition(".")[0], None) is not None
+    return getattr(mapped(controller, first := path.partition(".")[0]), first, None) is not None
 
 
 def unit_of_setting(path: str, problem: Problem) -> str:

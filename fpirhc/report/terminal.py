@@ -89,8 +89,6 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
         say(heading, "bold")
         for text in texts:
             say(f"- {text}")
-    for name, why in view.skipped.items():
-        say(f"skipped {name}: {why}")
     notes = sum(map(len, view.lists.values()))
     more = "" if verbose else f" ({notes} notes there, or by --verbose)" if notes else " (more by --verbose)"
     say(f"report: {report}", more=more, wrap=False)

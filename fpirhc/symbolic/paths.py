@@ -5,14 +5,13 @@ A path leads through fields of dataclasses, keys of mappings and places of tuple
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import TypeVar, cast
 
 from fpirhc.errors import InvalidName, nearest
 
 T = TypeVar("T")
-Copy = Callable[[object, Mapping[str, object]], object]  # (dataclass, changes by field) -> the changed copy
 
 
 def names_in(value: object) -> list[str]:
@@ -21,16 +20,24 @@ def names_in(value: object) -> list[str]:
         return [f.name for f in fields(value) if f.init]
     if isinstance(value, Mapping):
         return [str(key) for key in value]
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [str(k) for k in range(len(value))]
-    return []
+    return [str(k) for k in range(len(value))] if isinstance(value, Sequence) and not isinstance(value, str) else []
+
+
+def levels(value: object) -> Iterator[object]:
+    """Yield a value and all that it wraps, the outermost first."""
+    yield value
+    if (field := _wraps(value)) is not None:
+        yield from levels(entry(value, field))
 
 
 def mapped(value: object, name: str) -> object:
-    """The map inside a wrapper that has no field of this name: 'deformation.gain' is that of the map."""
-    while is_dataclass(value) and name not in names_in(value) and "map" in names_in(value):
-        value = getattr(value, "map")  # noqa: B009
-    return value
+    """The outermost level that has a field of this name: 'deformation.gain' is that of the map in all wrappers."""
+    found = [*levels(value)]
+    return next((one for one in found if name in names_in(one)), found[-1])
+
+
+def _wraps(value: object) -> str | None:
+    return next((one for one in ("map", "controller") if is_dataclass(value) and one in names_in(value)), None)
 
 
 def entry(value: object, name: str) -> object:
@@ -42,27 +49,28 @@ def entry(value: object, name: str) -> object:
 
 def content_at(owner: object, path: str, what: str = "the controller") -> object:
     """Return what stands at a path."""
-    value = owner
-    done: list[str] = []
-    for name in path.split("."):
+    value, names = owner, path.split(".")
+    for k, name in enumerate(names):
+        every = [*levels(value)]
         value = mapped(value, name)
-        valid = names_in(value)
-        if name not in valid:
-            where = f"'{'.'.join(done)}' of {what}" if done else what
-            kind = "" if isinstance(value, Mapping | Sequence) else f" ({type(value).__name__})"
-            below = [".".join((*done, one)) for one in paths_to(name, value)]
-            hint = f" Did you mean '{below[0]}'?" if below else nearest(name, valid)
+        if name not in names_in(value):
+            where = f"'{'.'.join(names[:k])}' of {what}" if k else what
+            kinds = " around ".join(type(one).__name__ for one in every)
+            kind = "" if isinstance(value, Mapping | Sequence) else f" ({kinds})"
+            valid = [*dict.fromkeys(own for level in every for own in names_in(level))]
+            hint = meant(".".join((*names[:k], one, *names[k + 1 :])) for one in paths_to(name, value))
             if not valid:
-                others = [one for one in names_in(owner) if names_in(entry(owner, one))]
-                hint = (
-                    f" It has no settings; {what} has settings in: {', '.join(others)}."
-                    if others
-                    else " It has no settings."
-                )
-            raise InvalidName(f"setting '{path}': {where}{kind} has no '{name}'.{hint}")
+                others = ", ".join(one for one in names_in(owner) if names_in(entry(owner, one)))
+                hint = f" It has no settings{f'; {what} has settings in: {others}' if others else ''}."
+            raise InvalidName(f"setting '{path}': {where}{kind} has no '{name}'.{hint or nearest(name, valid)}")
         value = entry(value, name)
-        done.append(name)
     return value
+
+
+def meant(paths: Iterable[str]) -> str:
+    """Return ' Did you mean 'a' or 'b'?' of paths; empty where there are none."""
+    quoted = " or ".join(f"'{one}'" for one in paths)
+    return f" Did you mean {quoted}?" if quoted else ""
 
 
 def paths_to(name: str, value: object, depth: int = 4) -> Iterator[str]:
@@ -74,11 +82,6 @@ def paths_to(name: str, value: object, depth: int = 4) -> Iterator[str]:
             yield from (f"{one}.{rest}" for rest in paths_to(name, entry(value, one), depth - 1))
 
 
-def validated(value: object, changes: Mapping[str, object]) -> object:
-    """Return a dataclass with other contents of some fields, checked as a new one is."""
-    return replace(value, **changes)  # type: ignore[type-var]  # only dataclasses have fields
-
-
 def copied(value: T, changes: Mapping[str, object]) -> T:
     """Return a frozen dataclass with other contents of some fields, without validation and without cached facts."""
     copy = object.__new__(type(value))
@@ -87,19 +90,18 @@ def copied(value: T, changes: Mapping[str, object]) -> T:
     return copy
 
 
-def changed_at(value: T, path: str, content: object, copy: Copy = validated) -> T:
-    """Return the value with another content at a path.
+def changed_at(value: T, path: str, content: object, *, checked: bool = True) -> T:
+    """Return the value with another content at a path; where it is not `checked` it may be a symbol."""
 
-    Args:
-        value: the value; it stays as it is.
-        copy: function (dataclass, changes by field) -> the changed copy; the default one validates.
-    """
+    def with_(name: str, new: object) -> T:
+        return replace(value, **{name: new}) if checked else copied(value, {name: new})  # type: ignore[type-var]
+
     name, _, rest = path.partition(".")
-    if mapped(value, name) is not value:
-        return cast(T, copy(value, {"map": changed_at(entry(value, "map"), path, content, copy)}))
-    inner = changed_at(entry(value, name), rest, content, copy) if rest else content
+    if name not in names_in(value) and (field := _wraps(value)) is not None:
+        return with_(field, changed_at(entry(value, field), path, content, checked=checked))
+    inner = changed_at(entry(value, name), rest, content, checked=checked) if rest else content
     if isinstance(value, Mapping):
         return cast(T, {**value, name: inner})
     if isinstance(value, Sequence):
         return cast(T, (*value[: int(name)], inner, *value[int(name) + 1 :]))
-    return cast(T, copy(value, {name: inner}))
+    return with_(name, inner)

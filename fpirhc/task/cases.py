@@ -17,7 +17,7 @@ from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
 from fpirhc.fields.kinds import described, finite_number
 from fpirhc.summary import line
-from fpirhc.symbolic.paths import changed_at, content_at
+from fpirhc.symbolic.paths import changed_at, content_at, mapped
 from fpirhc.task.problem import Problem
 
 EVERY = "all"  # names every case
@@ -162,7 +162,7 @@ def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
 def is_whole(owner: object, path: str) -> bool:
     """Whether the number at a path of a problem or a controller is declared as a whole one."""
     parent, _, name = path.rpartition(".")
-    part = content_at(owner, parent) if parent else owner
+    part = mapped(content_at(owner, parent) if parent else owner, name)
     return is_dataclass(part) and expects_whole_number(type(part), name)
 
 

@@ -317,7 +317,7 @@ study mine.py --mismatch 20 => --mismatch is of drawn plants: give --draws N too
 study mine.py --limits noise --mismatch 20 => --mismatch is of drawn plants: give --draws N too
 review mine.py --mismatch 120% => mismatch 120 %: use at least 0 % and less than 100 %, where no parameter changes its sign
 run mine.py fpi => controller 'fpi' is unknown. Did you mean 'RHC+FPI'?
-run mine.py RHC+FPI --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.gain'?
+run mine.py RHC+FPI --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?
 run mine.py RHC --set mass=2 => write exact.mass for the plant, approximate.mass for the model
 new ../my-arm => '../my-arm' is no name for a problem ... Try 'my_arm'; a folder is given by --dir
 new two_mass => 'two_mass' cannot be the name of a problem: a shipped problem has it ... Try 'my_two_mass'

@@ -99,7 +99,7 @@ def test_what_python_computes_from_a_number_is_refused_by_path_and_place():
     with pytest.raises(
         NotSupported, match=r"'estimator\.drift\.a' cannot be live here: .* needs its number while the loop"
     ):
-        fp.simulator(two_masses(), KALMAN, live=["controller.deformation.gain", "estimator.drift.a"], compiled=False)
+        fp.simulator(two_masses(), KALMAN, live=["deformation.gain", "estimator.drift.a"], compiled=False)
 
     class Branching(fp.Affine):
         """Affine whose gain counts only where it is large."""
