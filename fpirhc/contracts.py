@@ -30,7 +30,6 @@ from fpirhc.symbolic.block import Delay as Delay
 from fpirhc.symbolic.expression import is_finite as is_finite
 from fpirhc.symbolic.layout import Layout as Layout
 from fpirhc.symbolic.layout import Signal as Signal
-from fpirhc.symbolic.layout import discrete as discrete
 from fpirhc.symbolic.layout import like as like
 from fpirhc.symbolic.layout import scalar as scalar
 from fpirhc.symbolic.layout import vector as vector

@@ -21,7 +21,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, rename
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.tracking.base import Tracking
 
 _REQUEST = Form().request
@@ -64,7 +64,7 @@ def commanding_blocks(built: Built, judged: Sequence[Signal] = ()) -> tuple[list
     The controller also writes 'desired', and '_deformed_unclipped': the response that its model expects of this command.
     `judged` are solver statuses.
     """
-    delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(built.before, "command")]
+    delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(built.before, "command")]
     return [_limit_block(built), judge_block(judged), warm_up_block(built.warm_up)], delays
 
 

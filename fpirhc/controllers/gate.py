@@ -154,7 +154,7 @@ class Gate:
         memory = self.inner.memory
         if not self.inner.opaque:
             return memory
-        return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start())), memory.kinds),))
+        return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start()))),))
 
     def named(self, memory: Layout) -> Layout:
         """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""

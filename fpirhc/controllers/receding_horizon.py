@@ -36,7 +36,7 @@ from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, discrete, like, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
 from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.exogenous import model_values
@@ -150,7 +150,7 @@ def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
 
 def _due_block(cycles: int) -> Block:
     """Block -> whether a new plan is due in this cycle."""
-    count = discrete("plan_count")
+    count = scalar("plan_count")
 
     def step(s: Signals) -> dict[str, Expression]:
         count_next = s.plan_count + 1
@@ -191,7 +191,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))
     solve = built(optimiser, ocp, optimiser.step)
     low, high = problem.limits.input_ends(plant)
-    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE, kinds=(Kind.DISCRETE,)), discrete("_solve_status"))
+    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
 
     def step(s: Signals) -> dict[str, Value]:
         own = [getattr(s, one.name) for one in problem.own_signals]
@@ -225,7 +225,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
             **remembered_next,
         }
 
-    own = memory + Layout((discrete("plan_begun"),))
+    own = memory + Layout((scalar("plan_begun"),))
     return Block("plan", _plan_reads(problem, room), Layout(writes), step, own, opaque=True)
 
 

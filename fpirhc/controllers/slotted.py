@@ -29,7 +29,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite, left_after
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 
 
@@ -121,7 +121,7 @@ class Slotted(Controller):
         turns = [self._turn(built, k, name) for k, name in enumerate(self.slots)]
         blocks = [reference_block(built), *_seeing_blocks(built, turns)]
         blocks += [self._schedule_block(built), _switch_block(turns)]
-        delays = [Delay(discrete("warm_up"), "_warm_up_now"), Delay(discrete("_slot_before"), "slot")]
+        delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(scalar("_slot_before"), "slot")]
         for one in turns:
             own, remembered = _own_cycle(one, left_after(built.period, self.blend))
             blocks, delays = [*blocks, *own], [*delays, *remembered]

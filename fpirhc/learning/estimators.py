@@ -20,7 +20,7 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Deviation, Range
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.task.problem import Problem
 
 
@@ -158,7 +158,7 @@ class RecursiveLeastSquares(ParameterEstimator):
         size = len(self.parameters)
         entries = tuple(f"{i},{j}" for j in range(size) for i in range(size))
         first = tuple(np.eye(size).ravel())
-        covariance = Signal("least_squares_covariance", entries, start=first, kinds=(Kind.ADAPTED,))
+        covariance = Signal("least_squares_covariance", entries, start=first)
         return Layout((Signal("least_squares_estimate", self.learned()), covariance))
 
     def step(self, problem: Problem) -> Correct:

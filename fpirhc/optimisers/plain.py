@@ -30,7 +30,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE, is_finite
-from fpirhc.symbolic.layout import Layout, Signal, discrete
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 MOST = 100  # iterations of one converging call
 CAP = 50  # the same of one in a loop
@@ -74,8 +74,8 @@ def plain_memory(ocp: OptimalControl) -> Layout:
             Signal("plan_inputs", tuple(f"{i}@{k}" for k in range(n) for i in inputs)),
             Signal("plan_states", tuple(f"{s}@{k}" for k in range(n) for s in state)),
             Signal("plan_gains", tuple(f"{i}/{s}@{k}" for k in range(n) for s in state for i in inputs)),
-            discrete("plan_gamma"),
-            discrete("plan_step"),
+            scalar("plan_gamma"),
+            scalar("plan_step"),
         )
     )
 

@@ -23,7 +23,7 @@ from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout, steepest_curvature
 from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, refuse_limits, remembered_plan, shift
 from fpirhc.symbolic.expression import TINY, expression, graph, is_finite
-from fpirhc.symbolic.layout import Layout, Signal, discrete
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 _SAFE = 0.95  # share of the largest gain, for the map that is chosen automatically
 _BALANCING = 20  # passes of Ruiz's equilibration
@@ -261,7 +261,7 @@ class ReducedGradient(Optimiser):
         refuse_limits(self, ocp, "states")
 
     def memory(self, ocp: OptimalControl) -> Layout:
-        return Layout((_plan(ocp), discrete("plan_step_length")))
+        return Layout((_plan(ocp), scalar("plan_step_length")))
 
     def shifted(self, ocp: OptimalControl, memory: ca.MX) -> ca.MX:
         plan = ca.reshape(memory[:-1], ocp.input.size, ocp.stages)

@@ -29,7 +29,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.layout import Layout, Signal, discrete
+from fpirhc.symbolic.layout import Layout, Signal, scalar
 
 MU_WARM = 1e-4  # barrier parameter of a remembered plan, in units of the cost
 _TEXTS = ("kernels", "state_limits_sweep", "state_limits")
@@ -131,8 +131,8 @@ def limited_memory(ocp: OptimalControl) -> Layout:
             Signal("plan_costates", later),
             Signal("plan_gains", tuple(f"{e}/{x}@{k}" for k in n for x in states for e in inputs)),
             Signal("plan_multipliers", multipliers),
-            discrete("plan_barrier"),
-            discrete("plan_damping"),
+            scalar("plan_barrier"),
+            scalar("plan_damping"),
         )
     )
 

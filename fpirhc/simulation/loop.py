@@ -25,7 +25,7 @@ from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
 from fpirhc.simulation.tables import disturbance_signals
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
 
@@ -102,7 +102,7 @@ def _clock_block(time: Signal, period: float) -> Block:
     def step(s: Signals) -> dict[str, Expression]:
         return {"time": s.cycle * period, "cycle_next": s.cycle + 1}
 
-    return Block("clock", Layout(), Layout((time,)), step, Layout((discrete("cycle"),)))
+    return Block("clock", Layout(), Layout((time,)), step, Layout((scalar("cycle"),)))
 
 
 @dataclass(frozen=True)

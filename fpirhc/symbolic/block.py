@@ -16,7 +16,7 @@ import casadi as ca
 
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, kind
-from fpirhc.symbolic.layout import Kind, Layout, Signal
+from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.symbolic.open import SETTINGS, with_settings
 
 Step = Callable[[Signals], Mapping[str, Value]]
@@ -261,7 +261,7 @@ def every(block: Block, cycles: int) -> Block:
         raise InvalidValue(f"block '{block.name}' is to run every {cycles} cycles; expected 1 or more")
     if cycles == 1:
         return block
-    phase = Signal(f"{block.name}_phase", kinds=(Kind.PHASE,))
+    phase = Signal(f"{block.name}_phase")
     held = Layout(tuple(replace(s, name=f"{block.name}_held_{s.name}") for s in block.writes.signals))
     own = Layout((phase, *held.signals)) + block.memory
     run, hold = _branches(block, held)

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from functools import cached_property
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 from unicodedata import normalize
 
 import casadi as ca
@@ -21,19 +20,7 @@ import numpy.typing as npt
 from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, derivative_of, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, column
 
-__all__ = ["Expression", "Kind", "Layout", "Named", "Signal", "discrete", "like", "scalar", "vector"]
-
-
-T = TypeVar("T")
-
-
-class Kind(Enum):
-    """What an entry of a memory is, for whoever linearises a step: a state deviates, all others stay what they are at the point."""
-
-    STATE = "deviates"
-    DISCRETE = "jumps, or is only recorded: a count, a status, what a line search remembers"
-    PHASE = "discrete, and back at its value when the step repeats itself"
-    ADAPTED = "part of a model or a gain that changes on line"
+__all__ = ["Expression", "Layout", "Named", "Signal", "like", "scalar", "vector"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +32,12 @@ class Signal:
         elements: names of its entries; empty: a scalar.
         units: one per entry, or one for all; empty: '1'.
         start: first value; empty: zeros.
-        kinds: of a memory: one per entry, or one for all; empty: `Kind.STATE`.
     """
 
     name: str
     elements: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     start: tuple[float, ...] = ()
-    kinds: tuple[Kind, ...] = ()
 
     @cached_property
     def size(self) -> int:
@@ -67,21 +52,12 @@ class Signal:
     @property
     def entry_units(self) -> tuple[str, ...]:
         """One unit per entry; '1' where the signal has none."""
-        return _each(self.units or ("1",), self.size)
-
-    @property
-    def entry_kinds(self) -> tuple[Kind, ...]:
-        """One kind per entry."""
-        return _each(self.kinds or (Kind.STATE,), self.size)
+        units = self.units or ("1",)
+        return units if len(units) == self.size else units * self.size
 
     def start_vector(self) -> np.ndarray:
         """Start value, shape (size,); zeros where the signal has none."""
         return np.array(self.start if self.start else (0.0,) * self.size, dtype=float)
-
-
-def _each(values: tuple[T, ...], size: int) -> tuple[T, ...]:
-    """One value per entry, of one per entry or one for all."""
-    return values if len(values) == size else values * size
 
 
 def like(signal: Signal, name: str) -> Signal:
@@ -92,11 +68,6 @@ def like(signal: Signal, name: str) -> Signal:
 def scalar(name: str, unit: str = "1", start: float = 0.0) -> Signal:
     """Return a scalar signal."""
     return Signal(name, (), (unit,), (start,))
-
-
-def discrete(name: str, start: float = 0.0) -> Signal:
-    """Return a scalar of a memory that jumps, or is only recorded: a count, a status, what a line search remembers."""
-    return Signal(name, start=(start,), kinds=(Kind.DISCRETE,))
 
 
 def vector(name: str, elements: Sequence[str], units: Sequence[str] | str = "1", start: Sequence[float] = ()) -> Signal:
@@ -141,7 +112,7 @@ class Named:
 class Layout:
     """An ordered set of named signals in one flat vector, such as what a `Stepper` reads, remembers and writes.
 
-    `names` are those of the signals, `columns`, `units` and `kinds` those of the entries, `slice(name)` is a signal's place, `size`
+    `names` are those of the signals, `columns` and `units` those of the entries, `slice(name)` is a signal's place, `size`
     the length of the vector, and `start()` its first value. `pack` makes a vector of numbers by name, and `unpack` undoes it.
 
         Stepper(problem, controller).reads.columns        ('time', 'state.q1', ...)
@@ -181,15 +152,6 @@ class Layout:
     def units(self) -> tuple[str, ...]:
         """Units of all entries of the flat vector."""
         return tuple([u for s in self.signals for u in s.entry_units])
-
-    @cached_property
-    def kinds(self) -> tuple[Kind, ...]:
-        """Kinds of all entries of the flat vector."""
-        return tuple([k for s in self.signals for k in s.entry_kinds])
-
-    def adapted(self) -> Layout:
-        """The same signals as part of a model or a gain that changes on line."""
-        return Layout(tuple(replace(s, kinds=(Kind.ADAPTED,)) for s in self.signals))
 
     def __getitem__(self, name: str) -> Signal:
         self.slice(name)

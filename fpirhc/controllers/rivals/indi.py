@@ -16,7 +16,7 @@ from fpirhc.fields.kinds import Accuracy, Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, discrete, like, scalar
+from fpirhc.symbolic.layout import Expression, Layout, like, scalar
 from fpirhc.tracking.base import Tracking
 
 
@@ -54,7 +54,7 @@ class INDI(PairedAtOnce):
         )
         both = (("filtered_command", plant.input), ("filtered_response", plant.response_signal("_")))
         pairs = [like(signal, name + late) for name, signal in both for late in ("", "_before")]
-        memory = Layout((*pairs, discrete("filter_begun"))) if self.frequency is not None else Layout()
+        memory = Layout((*pairs, scalar("filter_begun"))) if self.frequency is not None else Layout()
 
         def filtered(s: Signals) -> tuple[dict[str, Expression], dict[str, Expression]]:
             """Command and response behind the filter, which begins settled, and what it remembers."""

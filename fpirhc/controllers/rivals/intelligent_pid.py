@@ -24,7 +24,7 @@ from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete, like
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, own_errors
 
@@ -73,7 +73,7 @@ class IntelligentPID(Undeformed):
         alpha, response = ca.vertcat(*(self.alpha[n] for n in names)), plant.equations.controlled_response
         places = tuple(f"{name}@{k}" for k in range(length) for name in names)
         memory = Layout((Signal("window_outputs", places), Signal("window_commands", places)))
-        memory = memory + Layout((plant.response_signal("ultra_local_before"), discrete("window_filled")))
+        memory = memory + Layout((plant.response_signal("ultra_local_before"), scalar("window_filled")))
 
         def step(s: Signals) -> dict[str, Expression]:
             output = ca.vertcat(*own_errors(plant, getattr(s, plant.output.name)))

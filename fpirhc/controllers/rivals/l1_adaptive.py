@@ -18,7 +18,7 @@ from fpirhc.plant.chain import require_chains
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_in_mean
-from fpirhc.symbolic.layout import Expression, Layout, discrete
+from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, error_chains
 
@@ -58,7 +58,7 @@ class L1Adaptive(Undeformed):
         moves = period * left_in_mean(period, 1 / self.predictor)  # (1 - left) / a_s
         gain = left / moves
         names = ("predictor_error", "predictor_input", "measured_before", "disturbance_before")
-        memory = Layout((*map(plant.response_signal, names), discrete("predictor_begun")))
+        memory = Layout((*map(plant.response_signal, names), scalar("predictor_begun")))
 
         def step(s: Signals) -> dict[str, Expression]:
             chains = error_chains(plant, getattr(s, plant.output.name))

@@ -23,7 +23,7 @@ from fpirhc.plant.regressor import Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, is_finite, pair
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, like, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 
 Gradient = Callable[[Signals, Expression, Expression], Pair]  # (signals, state of the response, estimate) -> (G, w)
@@ -85,7 +85,7 @@ class Learning:
         believed = like(plant.parameter, "_believed")
         lower, upper = ([b[k] for b in self.bounds.values()] for k in (0, 1))
         equation = equation_function(regressor)
-        learned = replace(regressor.signal, name="learned", start=(), kinds=(Kind.ADAPTED,))
+        learned = replace(regressor.signal, name="learned", start=())
         pairs = built.pairs
         begins = built.warm_up if self.rule.reads_response else 1
         reads = (

@@ -22,7 +22,7 @@ from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
-from fpirhc.symbolic.layout import Expression, Kind, Layout, Signal, like, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 
@@ -148,9 +148,7 @@ def _regressed(plant: Plant) -> tuple[str, ...]:
 
 def _gains(plant: Plant, name: str) -> Signal:
     """Theta column by column: torque_angle is the gain of the angle in the torque."""
-    return Signal(
-        name, tuple(f"{u}_{x}" for x in _regressed(plant) for u in plant.input.elements), kinds=(Kind.ADAPTED,)
-    )
+    return Signal(name, tuple(f"{u}_{x}" for x in _regressed(plant) for u in plant.input.elements))
 
 
 def _adapted(plant: Plant) -> tuple[Signal, ...]:

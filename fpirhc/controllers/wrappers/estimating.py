@@ -24,7 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
-from fpirhc.symbolic.layout import Layout, Signal, discrete, like
+from fpirhc.symbolic.layout import Layout, Signal, like, scalar
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.problem import Problem
 
@@ -133,7 +133,7 @@ def _estimate_block(
     places = [model.parameter.elements.index(n) for n in names]
     estimate = Signal("estimate", names, tuple(model.parameters[n].unit for n in names))
     memory, correct = estimator.memory(modelled), estimator.step(modelled)
-    own = memory + Layout((like(estimate, "estimate_change"), discrete("estimate_begun"), *pairs.memory))
+    own = memory + Layout((like(estimate, "estimate_change"), scalar("estimate_begun"), *pairs.memory))
 
     def step(s: Signals) -> dict[str, Value]:
         parameters = ca.vertcat(s.parameters[:count], ca.DM(model.approximate[count:]))

@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.deformation.leaky import check_cycles, check_uncertainty, chosen_pole, leaked
 from fpirhc.fields.kinds import BelowOne
-from fpirhc.symbolic.layout import Expression, Layout, Signal, discrete
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import MOST, Cycles, Queue
 
 __all__ = ["MOST", "Increment", "Paired"]
@@ -54,7 +54,7 @@ class _Queued(Wrapper):
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
         queues = Signal("queue_requests", past), Signal("queue_desired", past), Signal("queue_now", elements)
-        return Layout((*queues, discrete("queue_filled"))) + self.map.memory(elements)
+        return Layout((*queues, scalar("queue_filled"))) + self.map.memory(elements)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]

@@ -62,7 +62,7 @@ class Tuned(Wrapper):
         counts = scalar("tuner_growing"), scalar("tuner_returning")
         errors = Signal("tuner_error", elements), Signal("tuner_earlier", elements)
         own = (scalar("tuner_factor", start=1.0), *counts, *errors)
-        return Layout(own).adapted() + self.map.memory(elements)
+        return Layout(own) + self.map.memory(elements)
 
     def step(
         self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
