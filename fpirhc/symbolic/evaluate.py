@@ -12,21 +12,13 @@ from collections import deque
 from collections.abc import Callable
 from functools import partial
 from operator import is_
-from typing import Generic, NoReturn, Protocol, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidShape, InvalidValue
-
-
-class _Buffer(Protocol):
-    """CasADi's FunctionBuffer as Python calls it; its stub has the arguments of C++."""
-
-    def set_arg(self, k: int, memory: memoryview) -> None: ...
-    def set_res(self, k: int, memory: memoryview) -> None: ...
-    def ret(self) -> int: ...
+from fpirhc.errors import InvalidValue
 
 
 class Evaluator:
@@ -35,7 +27,7 @@ class Evaluator:
     def __init__(self, function: ca.Function) -> None:
         """Allocate the arrays and bind them; sparse arguments and results become dense."""
         self.function = _dense(function)
-        self._buffer, handle = cast(tuple[_Buffer, Callable[[], object]], self.function.buffer())
+        self._buffer, handle = cast(tuple[Any, Callable[[], object]], self.function.buffer())  # its stub is that of C++
         self.arguments = tuple(_array(self.function.size_in(k)) for k in range(self.function.n_in()))
         self.results = tuple(_array(self.function.size_out(k)) for k in range(self.function.n_out()))
         for k, array in enumerate(self.arguments):
@@ -50,9 +42,7 @@ class Evaluator:
 
     def redirect(self, k: int, array: np.ndarray) -> None:
         """Write result `k` into `array` from now on, such as a slice of a log, and no longer into `results[k]`."""
-        if array.size != self.results[k].size or array.dtype != np.float64 or not array.flags.c_contiguous:
-            name, size = self.function.name_out(k), self.results[k].size
-            raise InvalidShape(f"result '{name}' needs a contiguous float64 array of {size} entries")
+        assert (array.size, array.dtype, array.flags.c_contiguous) == (self.results[k].size, np.float64, True)
         self._redirected[k] = array
         self._buffer.set_res(k, array.data)
 
@@ -77,13 +67,8 @@ class Evaluator:
 
     def __call__(self, *values: npt.ArrayLike) -> tuple[np.ndarray, ...]:
         """Evaluate with these arguments and return copies of the results."""
-        if len(values) != len(self.arguments):
-            names = ", ".join(self.function.name_in())
-            raise InvalidShape(f"expected {len(self.arguments)} arguments ({names}), got {len(values)}")
-        # All values are checked before one is written, so a refused call leaves the arguments unchanged.
-        checked = [self._checked(k, value) for k, value in enumerate(values)]
-        for array, value in zip(self.arguments, checked, strict=True):
-            array[...] = value
+        for array, value in zip(self.arguments, values, strict=True):
+            array[...] = np.reshape(value, array.shape)
         try:
             self.evaluate()
         except (RuntimeError, SystemError) as error:
@@ -91,29 +76,6 @@ class Evaluator:
         if self.failed:
             raise InvalidValue(f"'{self.function.name()}' fails for these arguments: {values}")
         return tuple(result.copy() for result in self.results)
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be copied or pickled: the buffers belong to this process."""
-        raise TypeError("an Evaluator cannot be copied or pickled; build one from its Function in each process")
-
-    def _checked(self, k: int, value: npt.ArrayLike) -> np.ndarray:
-        array, name = self.arguments[k], self.function.name_in(k)
-        try:
-            entries = np.asarray(value, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InvalidValue(f"argument '{name}' is not made of numbers: {error}") from None
-        # A vector's entries have the same order as a row and as a column; a matrix must be transposed.
-        is_vector = array.ndim == 1 or 1 in array.shape
-        fits = (
-            sum(n != 1 for n in entries.shape) <= 1 if is_vector else entries.ndim == 1 or entries.shape == array.shape
-        )
-        if entries.size != array.size or not fits:
-            rows, columns = self.function.size_in(k)
-            hint = "" if is_vector else f"; a ({rows}, {columns}) matrix is given transposed"
-            raise InvalidShape(
-                f"argument '{name}' has {array.size} entries (shape {array.shape}{hint}), got shape {entries.shape}"
-            )
-        return entries.reshape(array.shape)
 
 
 def unwrapped(error: Exception) -> BaseException:
