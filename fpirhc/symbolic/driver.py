@@ -2,7 +2,7 @@
 
 A driver is a hand-written loop around generated leaf functions. The virtual machine runs a composed Function in its place, which
 has the same results, or calls its compiled library. When C is generated for a Function that calls it, its body is replaced by a
-call of the driver. The first one finds out whether a column is finite.
+call of the driver. The first one keeps a column where it is finite.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from functools import cache
 import casadi as ca
 
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.expression import FINITE, TINY, Expression, graph, kind
+from fpirhc.symbolic.expression import FINITE, TINY, Expression, expression, graph, kind
 
 SIGNATURE = "(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem)"
 # Large leaves are compiled without much optimising; the loops around them never are. The loops use wider registers than the
@@ -185,21 +185,6 @@ def renamed(function: ca.Function, name: str) -> ca.Function:
     return ca.Function(name, inputs, function.call(inputs))
 
 
-_TEXT = f"""
-int ENTRY{SIGNATURE} {{
-  casadi_real sums[8], total = 0;
-  const casadi_real large = 134217728, *x = arg[0];
-  int k = 0, j;
-  for (j = 0; j < 8; ++j) sums[j] = 0;
-  for (; k + 8 <= SIZE; k += 8)
-    for (j = 0; j < 8; ++j) sums[j] += x[k + j] * large - x[k + j] * large;
-  for (; k < SIZE; ++k) total += x[k] * large - x[k] * large;
-  for (j = 0; j < 8; ++j) total += sums[j];
-  if (res[0]) res[0][0] = total == 0;
-  return 0;
-}}
-"""
-
 _KEPT = f"""
 int ENTRY{SIGNATURE} {{
   casadi_real sums[8], total = 0, *kept = res[0];
@@ -207,12 +192,11 @@ int ENTRY{SIGNATURE} {{
   int k = 0, j;
   for (j = 0; j < 8; ++j) sums[j] = 0;
   for (; k + 8 <= SIZE; k += 8)
-    for (j = 0; j < 8; ++j) {{ kept[k + j] = x[k + j]; sums[j] += x[k + j] * large - x[k + j] * large; }}
-  for (; k < SIZE; ++k) {{ kept[k] = x[k]; total += x[k] * large - x[k] * large; }}
+    for (j = 0; j < 8; ++j) sums[j] += x[k + j] * large - x[k + j] * large;
+  for (; k < SIZE; ++k) total += x[k] * large - x[k] * large;
   for (j = 0; j < 8; ++j) total += sums[j];
   if (res[1]) res[1][0] = total == 0;
-  if (total != 0 || arg[2][0] == 0)
-    for (k = 0; k < SIZE; ++k) kept[k] = old[k];
+  if (kept) memcpy(kept, total != 0 || arg[2][0] == 0 ? old : x, sizeof(casadi_real) * SIZE);
   return 0;
 }}
 """
@@ -220,7 +204,7 @@ int ENTRY{SIGNATURE} {{
 
 def finite(column: Expression, *, opaque: bool) -> Expression:
     """Return 1 where every entry of the column is finite, else 0; `opaque` is that of the block."""
-    return _function(graph(column).numel())(column) if opaque else every_finite(column)
+    return kept_if_finite(column, column, expression(1.0))[1] if opaque else every_finite(column)
 
 
 def every_finite(column: Expression) -> Expression:
@@ -242,19 +226,7 @@ def kept_if_finite(new: Expression, old: Expression, good: Expression) -> tuple[
 def _kept(size: int) -> ca.Function:
     new, old, good = ca.MX.sym("new", size), ca.MX.sym("old", size), ca.MX.sym("good")
     driver = Driver(_KEPT, {}, {"SIZE": size})
-    fine = _none_large(new)
+    fine = ca.norm_1(new) <= FINITE  # a sum of sizes, because the virtual machine then passes over the column once
     # A short circuit copies; else every entry is selected by itself.
     kept = ca.if_else(ca.logic_and(good, fine), new, old, True)
     return with_driver("fpirhc_kept", driver, lambda name: ca.Function(name, [new, old, good], [kept, fine]))
-
-
-@cache
-def _function(size: int) -> ca.Function:
-    column = ca.MX.sym("column", size)
-    driver = Driver(_TEXT, {}, {"SIZE": size})
-    return with_driver("fpirhc_finite", driver, lambda name: ca.Function(name, [column], [_none_large(column)]))
-
-
-def _none_large(column: ca.MX) -> ca.MX:
-    """Whether every entry is finite: a sum of sizes, because the virtual machine then passes over the column once."""
-    return ca.norm_1(column) <= FINITE
