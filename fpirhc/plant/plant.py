@@ -11,21 +11,14 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import Mistakes, NotInvertible
+from fpirhc.errors import NotInvertible
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.plant.equations import Equations
 from fpirhc.plant.motion import derivative_unit, derivatives_signal, followed_units
-from fpirhc.plant.parameter import Parameter, check_parameters
-from fpirhc.plant.plant_check import (
-    check_expressions,
-    check_map,
-    check_names,
-    check_outputs,
-    check_ranges,
-    check_response,
-)
-from fpirhc.summary import line, number, table
+from fpirhc.plant.parameter import Parameter
+from fpirhc.plant.plant_check import check_plant
+from fpirhc.summary import line
 from fpirhc.symbolic.expression import Expression
 from fpirhc.symbolic.layout import Signal, vector
 
@@ -95,18 +88,7 @@ class Plant(Checked):
     believed: Mapping[str, str] = field(default_factory=dict, kw_only=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
-        mistakes = Mistakes("plant")
-        check_names(self, mistakes)
-        check_map(self, mistakes)
-        check_parameters(self.parameters, mistakes)
-        mistakes.raise_if_any()
-        check_ranges(self, mistakes)
-        check_expressions(self, mistakes)
-        mistakes.raise_if_any()
-        check_response(self, mistakes)
-        mistakes.raise_if_any()
-        check_outputs(self, mistakes)
-        mistakes.raise_if_any()
+        check_plant(self)
 
     @classmethod
     def of_states(
@@ -188,21 +170,6 @@ class Plant(Checked):
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))
-
-    def _repr_html_(self) -> str:
-        """Coordinates, inputs and parameters as a table, for notebooks."""
-        orders = dict(zip(self.names, self.orders, strict=True))
-        rows = [(n, f"coordinate, order {orders[n]}", unit, "", "") for n, unit in self.coordinates.items()]
-        orders = self.equations.output_orders
-        rows += [(n, f"output, relative order {orders[n]}", one.unit, "", "") for n, one in self.outputs.items()]
-        rows += [(name, "input", unit, "", "") for name, unit in self.inputs.items()]
-        for name, one in self.parameters.items():
-            what = "signal from outside" if one.outside else "parameter"
-            rows.append((name, what, one.unit, number(one.approximate), number(one.exact)))
-        notes = [f"Unit of time: {self.time_unit}."]
-        if self.controlled is not None:
-            notes.append(f"Controlled: {', '.join(self.controlled)}.")
-        return table("Plant", ("name", "is", "unit", "model", "plant"), rows, notes)
 
     @cached_property
     def equations(self) -> Equations:

@@ -14,6 +14,7 @@ from fpirhc.fields.user_code import called, named_results, place_of, scalar_expr
 from fpirhc.plant.chain import output_order, stated_expression
 from fpirhc.plant.equations import inverse_by_user
 from fpirhc.plant.motion import arguments_of, followed, followed_units, words
+from fpirhc.plant.parameter import check_parameters
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -22,8 +23,30 @@ HIGHEST_ORDER = 20  # every derivative is a state with a name of its own: a mist
 _LOWER = ["q", "v", "a", *(f"d{k}" for k in range(3, 12))]
 
 
-def check_names(plant: Plant, mistakes: Mistakes) -> None:
-    """Add every mistake in names, units, orders and the choice of controlled coordinates to `mistakes`."""
+def check_plant(plant: Plant) -> None:
+    """Raise with all mistakes of a plant; what needs other parts to be right is checked after them."""
+    mistakes = Mistakes("plant")
+    _check_names(plant, mistakes)
+    if plant.step is not None and not (finite_number(plant.step) and plant.step > 0):
+        mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {plant.step!r}")
+    check_parameters(plant.parameters, mistakes)
+    mistakes.raise_if_any()
+    mistakes.unknown("ranges: state", plant.ranges, plant.state.elements)
+    for name, (low, high) in plant.ranges.items():
+        if not low < high:
+            mistakes.add(f"ranges: '{name}' must be (lowest, highest), got {(low, high)!r}")
+    _check_expressions(plant, mistakes)
+    mistakes.raise_if_any()
+    _check_response(plant, mistakes)
+    mistakes.raise_if_any()
+    for name in plant.outputs:
+        with mistakes.caught():
+            _check_output(plant, name, mistakes)
+    mistakes.raise_if_any()
+
+
+def _check_names(plant: Plant, mistakes: Mistakes) -> None:
+    """What is wrong in names, units, orders and the choice of controlled coordinates."""
     outputs = {name: one.unit for name, one in plant.outputs.items()}
     quantities = "states" if plant.step is not None or (plant.outputs and plant.order == 1) else "coordinates"
     for what, group in ((quantities, plant.coordinates), ("inputs", plant.inputs), ("outputs", outputs)):
@@ -53,22 +76,8 @@ def check_names(plant: Plant, mistakes: Mistakes) -> None:
             )
 
 
-def check_map(plant: Plant, mistakes: Mistakes) -> None:
-    """Add every mistake of the steps to `mistakes`."""
-    if plant.step is not None and not (finite_number(plant.step) and plant.step > 0):
-        mistakes.add(f"step must be a positive number, in {plant.time_unit}, got {plant.step!r}")
-
-
-def check_ranges(plant: Plant, mistakes: Mistakes) -> None:
-    """Add every mistake of the physical ranges to `mistakes`."""
-    mistakes.unknown("ranges: state", plant.ranges, plant.state.elements)
-    for name, (low, high) in plant.ranges.items():
-        if not low < high:
-            mistakes.add(f"ranges: '{name}' must be (lowest, highest), got {(low, high)!r}")
-
-
-def check_response(plant: Plant, mistakes: Mistakes) -> None:
-    """Add every mistake of the response, of the orders, and of the user's inverse to `mistakes`."""
+def _check_response(plant: Plant, mistakes: Mistakes) -> None:
+    """What is wrong with the response, the orders, and the user's inverse."""
     x, u, p = plant.symbols()
     arguments, (quantity, function) = arguments_of(plant, x, u, p), words(plant)
     if not takes(plant.response, len(arguments)):
@@ -156,8 +165,8 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
             )
 
 
-def check_expressions(plant: Plant, mistakes: Mistakes) -> None:
-    """Add every output whose function takes other arguments to `mistakes`."""
+def _check_expressions(plant: Plant, mistakes: Mistakes) -> None:
+    """Which outputs have a function of other arguments."""
     lower = max(plant.orders, default=0)
     names = ", ".join((["x"] if words(plant)[0] == "state" else _LOWER)[:lower])
     for name, one in plant.outputs.items():
@@ -166,13 +175,6 @@ def check_expressions(plant: Plant, mistakes: Mistakes) -> None:
                 f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
                 f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
             )
-
-
-def check_outputs(plant: Plant, mistakes: Mistakes) -> None:
-    """Add every mistake of the outputs to `mistakes`."""
-    for name in plant.outputs:
-        with mistakes.caught():
-            _check_output(plant, name, mistakes)
 
 
 def _check_output(plant: Plant, name: str, mistakes: Mistakes) -> None:

@@ -21,7 +21,7 @@ from fpirhc.symbolic.expression import Expression
 from fpirhc.symbolic.layout import Signal, vector
 
 _TRIES = 12  # random points
-_TOLERANCE = 1e-7  # relative error at which an identity holds
+_TOLERANCE = 1e-7  # share of a force that counts as nothing
 _SPREAD = 0.3  # relative range of random parameters
 
 
@@ -142,55 +142,42 @@ def _check_plant(plant: Plant) -> None:
 
 
 def _check_linear(regressor: Regressor) -> None:
-    """Compare Y theta + Q0 with the inverse dynamics at random points with other values of the covered parameters."""
-    plant, random = regressor.plant, np.random.default_rng(1)
-    worst, entering, tried = 0.0, np.zeros(len(regressor.names), dtype=bool), 0
+    """Look at random points for terms of the second order in the covered parameters, and for those that do not enter."""
+    plant, (x, r, p), places = regressor.plant, regressor.symbols(), regressor.places
+    force = plant.equations.inverse(x, r, p)
+    slope = ca.jacobian(force, p)[:, places]
+    function = ca.Function(
+        "fpirhc_bend", [x, r, p], [force, slope, ca.jacobian(ca.vec(slope), p)[:, places]], {"cse": True}
+    )
+    random, count, tried = np.random.default_rng(1), len(places), 0
+    bent, entering = np.zeros((count, count)), np.zeros(count, dtype=bool)
     for _ in range(_TRIES):
-        x, r, p = _point(plant, random)
-        wanted = plant.equations.inverse(x, r, p).full()
-        y, rest = (m.full() for m in regressor.function(x, r, p))
-        terms = y * p[regressor.places]
-        error = terms.sum(axis=1, keepdims=True) + rest - wanted
-        if np.isfinite(error).all():
+        point = _point(plant, random)
+        theta = point[2][places]
+        wanted, terms, second = (m.full() for m in function(*point))
+        terms, second = terms * theta, second.reshape(count, -1, count) * theta[:, None, None] * theta
+        if np.isfinite(terms).all() and np.isfinite(second).all():
             tried += 1
             # Each force by the size of its own terms: forces have units of their own.
-            sizes = np.maximum(np.abs(terms).sum(axis=1, keepdims=True) + np.abs(rest) + np.abs(wanted), 1e-300)
-            worst = max(worst, float((np.abs(error) / sizes).max()))
+            sizes = np.maximum(np.abs(terms).sum(axis=1, keepdims=True) + np.abs(wanted), 1e-300)
+            bent = np.maximum(bent, np.abs(second / sizes).max(axis=1))
             entering |= (np.abs(terms) > _TOLERANCE * sizes).any(axis=0)
     if not tried:
         raise InvalidValue("Regressor: the inverse dynamics is not finite at any random state; give Plant(inverse=...)")
-    if worst > _TOLERANCE:
-        raise InvalidValue(_not_linear(regressor, worst))
-    if not entering.all():
-        absent = [n for n, e in zip(regressor.names, entering, strict=True) if not e]
-        raise InvalidValue(
-            f"Regressor: '{absent[0]}' does not enter the inverse dynamics, so nothing can be learned about it"
+    if bent.max() > _TOLERANCE:
+        alone = ", ".join(
+            f"'{name}'" for name, own in zip(regressor.names, np.diag(bent), strict=True) if own > _TOLERANCE
         )
-
-
-def _not_linear(regressor: Regressor, worst: float) -> str:
-    every = list(regressor.plant.parameters)
-    alone = ", ".join(f"'{every[k]}'" for k in regressor.places if _bends(regressor.plant, k))
-    reason = (
-        f"{alone} enter(s) nonlinearly" if alone else "they enter in products, or the combinations leave something out"
-    )
-    return (
-        f"the inverse dynamics is not linear in {', '.join(regressor.names)} (relative error {worst:.1e}): {reason}. Learn others, "
-        "which leaves these at the model's values, or write the plant with what enters as a whole as one parameter, such as the "
-        "inertia m l^2"
-    )
-
-
-def _bends(plant: Plant, k: int) -> bool:
-    """Whether the inverse dynamics has a second difference by a parameter, at random points."""
-    random = np.random.default_rng(2)
-    for _ in range(_TRIES):
-        x, r, p = _point(plant, random)
-        change = _SPREAD * p[k] * np.eye(p.size)[k]
-        low, middle, high = (plant.equations.inverse(x, r, q).full() for q in (p - change, p, p + change))
-        if (np.abs(high - 2 * middle + low) > _TOLERANCE * (np.abs(high) + np.abs(middle) + np.abs(low))).any():
-            return True
-    return False
+        reason = f"{alone} enter(s) nonlinearly" if alone else "they enter in products"
+        raise InvalidValue(
+            f"the inverse dynamics is not linear in {', '.join(regressor.names)}: {reason}. Learn others, which leaves these at "
+            "the model's values, or write the plant with what enters as a whole as one parameter, such as the inertia m l^2"
+        )
+    if not entering.all():
+        absent = regressor.names[int(np.argmin(entering))]
+        raise InvalidValue(
+            f"Regressor: '{absent}' does not enter the inverse dynamics, so nothing can be learned about it"
+        )
 
 
 def _point(plant: Plant, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

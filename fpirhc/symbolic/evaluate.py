@@ -42,7 +42,7 @@ class Evaluator:
 
     def redirect(self, k: int, array: np.ndarray) -> None:
         """Write result `k` into `array` from now on, such as a slice of a log, and no longer into `results[k]`."""
-        assert (array.size, array.dtype, array.flags.c_contiguous) == (self.results[k].size, np.float64, True)
+        assert (array.size, array.dtype.char, array.flags.c_contiguous) == (self.results[k].size, "d", True)
         self._redirected[k] = array
         self._buffer.set_res(k, array.data)
 
