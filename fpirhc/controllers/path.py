@@ -25,7 +25,6 @@ import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.integrators import Integrator, RungeKutta4
-from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Evidence, Model, values_of
@@ -177,24 +176,23 @@ def answer_block(path: Path) -> Block:
     model's waits as long: modelled_k = y^_r(x_{k-r}, u_{k-r}), u the input that acted then.
     """
     plant, modelled = path.problem.plant, path.problem.plant.response_signal("_modelled")
-    age, start = response_age(plant), tuple(map(float, path.problem.start_state))
-    before, seen = replace(plant.state, name=f"{path.name}_state_before", start=start), measured(plant.state)
-    waits = [Queue(age * (plant.chains[name] - 1)) for name in plant.controlled_names]
+    states, before, seen = Queue(plant.response_age), f"{path.name}_state", measured(plant.state)
+    waits = [Queue(max(count - 1, 0)) for count in plant.differences.values()]
     names = [f"{path.name}_{name}" for name in plant.controlled_names]
     queues = [w.memory(queue, (e,), (0.0,)) for queue, w, e in zip(names, waits, modelled.elements, strict=True)]
 
     def step(s: Signals) -> dict[str, Expression]:
         acted = path.acted(s)
-        at = getattr(s, before.name if age else seen.name)
+        at, later = states.arrived(s, before, getattr(s, seen.name))
         shown: list[Expression] = []
-        later = {f"{before.name}_next": getattr(s, seen.name)} if age else {}
         values = ca.vertsplit(plant.equations.controlled_response(at, acted.end, acted.parameters))
         for name, wait, value in zip(names, waits, values, strict=True):
             arrived, queue = wait.arrived(s, name, value)
             shown, later = [*shown, arrived], later | queue
         return {modelled.name: ca.vertcat(*shown), **acted.later, **later}
 
-    memory = (*path.memory, *((before,) * age), *(signal for queue in queues for signal in queue))
+    past = states.memory(before, seen.elements, path.problem.start_state.tolist())
+    memory = (*path.memory, *past, *(signal for queue in queues for signal in queue))
     return Block(path.name, Layout((seen, *path.reads)), Layout((modelled,)), step, Layout(memory))
 
 

@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.path import believe_block, stated_path
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
 from fpirhc.errors import NoAnswer
-from fpirhc.plant.maps import growth_of, response_age
+from fpirhc.plant.maps import growth_of
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import members, slowest, unobservable, values_of
 from fpirhc.symbolic.block import Block, Delay
@@ -64,13 +64,13 @@ def with_steps_ahead(plant: Plant, estimate: Block) -> list[Block]:
 
     With an exact model it is exact. A prediction without the last measured difference would keep the model's error for ever.
     """
-    if not response_age(plant) * (max(plant.chains.values()) - 1):
+    powers = [plant.response_age * e.count("'") for e in plant.output.elements]
+    if not any(powers):
         return [estimate]
     measured, (x, u, p) = replace(plant.output, name="_differences"), plant.symbols()
     expected = ca.Function(
         "fpirhc_expected", [x, p], [plant.equations.output(x, 0 * u, p, ca.SX.zeros(len(plant.names)))]
     )
-    powers = [e.count("'") for e in plant.output.elements]
     waits = [(f"ahead_{k}", Queue(power)) for k, power in enumerate(powers)]
     pasts = zip(waits, plant.output.elements, strict=True)
     memory = [m for (name, wait), e in pasts for m in wait.memory(name, (e,), (0.0,))]

@@ -16,7 +16,6 @@ from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
 from fpirhc.plant.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import one_step
-from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import quantities, require_named, response_names, values_of
@@ -216,7 +215,7 @@ class DisturbanceKalman(ParameterEstimator):
 
     def _foresees(self, plant: Plant) -> bool:
         """Whether it remembers the next state: a map's response is to the command that acts after the state, and not before."""
-        return bool(self._responses(plant)) and response_age(plant) > 0
+        return bool(self._responses(plant)) and plant.response_age > 0
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
         return tuple(n for n in self.measured if n in response_names(plant))

@@ -77,11 +77,6 @@ def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
         )
 
 
-def response_age(plant: Plant) -> int:
-    """Return how many cycles before a measured response its state was: at one instant, or one step earlier on a map."""
-    return 0 if plant.step is None else 1
-
-
 def step_of(plant: Plant, matrix: np.ndarray, time: float) -> np.ndarray:
     """Return the matrix by which x' = A x moves in that time, or delta x = A x in the whole cycles of a map."""
     from scipy.linalg import expm  # only here: the import takes longer than that of the whole package

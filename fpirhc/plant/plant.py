@@ -240,6 +240,16 @@ class Plant(Checked):
         """Names of the controlled quantities of order 0, which the command moves at once: each is its own response."""
         return tuple(n for n in self.controlled or self.chains if not self.equations.output_orders[n])
 
+    @property
+    def response_age(self) -> int:
+        """How many cycles before a measured response its state was: at one instant, or one step earlier on a map."""
+        return 0 if self.step is None else 1
+
+    @cached_property
+    def differences(self) -> dict[str, int]:
+        """Of every controlled quantity over how many cycles its response is a difference: its order on a map, else none."""
+        return {name: self.response_age * order for name, order in self.response_orders.items()}
+
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
         return Signal(name, self.controlled_names, self._controlled_units)

@@ -18,7 +18,6 @@ from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
 from fpirhc.plant.chain import response_units
-from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
 from fpirhc.symbolic.block import Block
@@ -96,7 +95,7 @@ class Sensing(Checked):
 
     def spreads(self, plant: Plant) -> bool:
         """Whether a response is a mean over time, and not that of one state and one command."""
-        return not (self.estimator.measures_all or response_age(plant))
+        return not (self.estimator.measures_all or plant.response_age)
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         """Names of the measured quantities: states, outputs, and highest derivatives of controlled ones."""
@@ -154,7 +153,7 @@ class Sensing(Checked):
         states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
         if self.measured is not None and not measured:
             yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-        elif believes and self.measured is None and not (response_age(plant) or plant.outputs):
+        elif believes and self.measured is None and not (plant.response_age or plant.outputs):
             yield (
                 f"observer: everything that {own} needs is measured; name what sensors show: "
                 f"Sensing(measured={list(measured)!r}, ...)"

@@ -11,7 +11,6 @@ import numpy as np
 
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.seeing import sensor_ranges
-from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import followed_units, time_signal
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.path import HELD, Mover, moving, real_signals
@@ -167,8 +166,8 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
     """
     period = problem.period
     orders = problem.plant.response_orders
-    if not (response_age(problem.plant) and any(orders.values())):
-        return sense  # a response of order 0 is the output, and no difference
+    if not any(problem.plant.differences.values()):
+        return sense
     places = {c: problem.plant.output.elements.index(c) for c in orders}
     entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]
     past = Signal(_PAST, tuple(f"{c}@{j}" for c, j in entries))

@@ -22,7 +22,7 @@ from fpirhc.horizon.cost import Cost, view_of_symbols
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
-from fpirhc.plant.maps import check_maps, over, response_age
+from fpirhc.plant.maps import check_maps, over
 from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
@@ -238,7 +238,7 @@ def _check_disturbances(problem: Problem) -> None:
         with mistakes.caught(f"'{name}': "):
             one.values(instants, np.random.default_rng(0))
     for name, order in problem.disturbed_outputs.items():
-        if response_age(problem.plant) * order > 1:
+        if problem.plant.response_age * order > 1:
             mistakes.add(
                 f"the output '{name}' of a map has relative order {order}, and its differences look ahead to unknown "
                 "disturbances; disturb a state or an input, or an output of order 1"

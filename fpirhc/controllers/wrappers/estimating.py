@@ -19,7 +19,6 @@ from fpirhc.controllers.path import Pairs
 from fpirhc.errors import require
 from fpirhc.learning.disturbance_kalman import DisturbanceKalman
 from fpirhc.learning.estimators import ParameterEstimator, Seen
-from fpirhc.plant.maps import response_age
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
@@ -114,7 +113,7 @@ class Estimating(ControllerWrapper):
             "stays as it is; wrap a controller that uses its model, such as ComputedTorque or RecedingHorizon",
         )
         outputs = self.estimator.reads_outputs(modelled.plant)
-        age = response_age(built.plant) if self.estimator.reads_response(modelled.plant) else 0
+        age = built.plant.response_age * self.estimator.reads_response(modelled.plant)
         pairs = replace(built.pairs, dead_time=self.dead_time or built.pairs.dead_time, with_outputs=outputs, age=age)
         believed = Signal(_BELIEVED, modelled.plant.parameter.elements, modelled.plant.parameter.units)
         acted = replace(built.before, name="_acted")

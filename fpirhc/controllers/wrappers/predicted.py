@@ -18,7 +18,6 @@ from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.integrators import one_step
-from fpirhc.plant.maps import response_age
 from fpirhc.plant.motion import forcing_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -132,9 +131,9 @@ class Predicted(ControllerWrapper):
         advance = one_step(plant, period) if self.by == "model" else _along_desired(plant, period)
         corrected = _residual(plant, self.residual_time, period) if self.residual_time else None
         residual = Signal("residual", plant.names, forcing_units(plant))
-        # The state to which a map answered with the response that is measured now is that of the cycle before.
-        last = (replace(built.state, name="state_answered"),) * response_age(plant)
-        own = (residual, *last) if corrected else ()
+        answered = Queue(plant.response_age)  # cycles since the state to which the plant answered with the measured response
+        past = answered.memory("state_answered", plant.state.elements, built.state.start)
+        own = (residual, *past) if corrected else ()
         responses = (plant.response_signal("realised"),) if corrected else ()
         reads = (time_signal(plant), *plant.motion, *responses, plant.parameter, before)
         # An output that is the state is where the state is.
@@ -144,9 +143,9 @@ class Predicted(ControllerWrapper):
             queued, values = queue.column(s, "sent", getattr(s, before.name))
             error = expression(calm)
             if corrected:
-                at = s.state_answered if last else s.state
+                at, later = answered.arrived(s, "state_answered", s.state)
                 error = corrected(s.residual, at, queue.delayed(queued, before.size), s.realised, s.parameters)
-                values |= {"residual_next": error, **{f"{signal.name}_next": s.state for signal in last}}
+                values |= {"residual_next": error, **later}
             state = queue.driven(advance, s.state, queued, before.size, [s.parameters, error])
             for name, function in outputs_ahead.items():
                 values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, cycles * period)
