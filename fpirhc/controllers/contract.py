@@ -20,7 +20,7 @@ from fpirhc.errors import require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
-from fpirhc.plant.chain import without_disturbances
+from fpirhc.plant.chain import require_derivatives, without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
@@ -206,6 +206,16 @@ class Undeformed(Controller, ABC):
     def deformation(self) -> Deformation:
         """Identity(): no request is iterated."""
         return Identity()
+
+
+class OfDerivatives(Undeformed, ABC):
+    """Contract: a law on derivatives of the controlled quantities below their response."""
+
+    of_time: ClassVar[bool] = False  # whether differences of a map's steps do not serve
+
+    def check(self, problem: Problem) -> None:
+        instead = "use ComputedTorque, with a deformation where the model is wrong"
+        require_derivatives(problem.plant, type(self).__name__, of_time=self.of_time, instead=instead)
 
 
 class PairedAtOnce(Undeformed, ABC):

@@ -240,8 +240,8 @@ class Quadratic(Cost):
     ) -> Expression:
         """Return the terminal cost (x - x^N)' P (x - x^N); without outputs of order 0, for which the end has no command."""
         if self.terminal is None:
-            at_once = [name for name, order in plant.equations.output_orders.items() if not order]
-            weights = {n: w for n, w in self._errors.items() if n not in at_once}
+            orders = plant.equations.output_orders
+            weights = {n: w for n, w in self._errors.items() if orders.get(n, 1)}
             return step * _squares(weights, view.output, view.reference)
         if isinstance(self.terminal, Mapping):
             return _squares(self.terminal, view.output, view.reference)

@@ -163,26 +163,17 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))
 
 
-def require_chains(plant: Plant, law: str) -> None:
-    """Raise for an output of order 0, which has no derivative below its response.
+def require_derivatives(plant: Plant, who: str, *, of_time: bool, instead: str) -> None:
+    """Raise for an output of order 0, and where derivatives are `of_time` for a map: they have none.
 
-    `law`: what needs such a derivative, as the beginning of a sentence.
+    Args:
+        who: what needs derivatives, as the beginning of a sentence.
+        instead: what to do, as its end.
     """
-    refuse(
-        f"{law}, and the command moves '{name}' at once (order 0); use DisturbanceObserver" for name in plant.at_once
-    )
-
-
-def require_derivatives(plant: Plant, law: str) -> None:
-    """Raise for a map or an output of order 0, where a law has no meaning.
-
-    `law`: what the law does with derivatives, as the beginning of a sentence.
-    """
-    reasons = [*(["a map has differences of its steps"] * (plant.step is not None))]
-    reasons += [f"{name} is of order 0" for name in plant.at_once]
-    refuse(
-        f"{law} a derivative with respect to time, and {why}; use ComputedTorque with a deformation" for why in reasons
-    )
+    reasons = [f"the command moves '{name}' at once (order 0)" for name in plant.at_once]
+    if of_time and plant.step is not None:
+        reasons.append("a map has differences of its steps")
+    refuse(f"{who} needs derivatives below the response, and {why}; {instead}" for why in reasons)
 
 
 def require_rates(plant: Plant, refusal: str) -> None:

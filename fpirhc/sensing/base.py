@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.chain import require_rates
+from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.chain import response_names as response_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
@@ -55,12 +55,8 @@ class DerivativeEstimator(Checked, ABC):
         return 1
 
     def check(self, plant: Plant) -> None:
-        """Raise if the estimator cannot serve the plant; by default it estimates derivatives, which a map does not have."""
-        require_rates(
-            plant,
-            f"{type(self).__name__} estimates derivatives with respect to time, which a map does not have; leave the estimator "
-            "out, and differences of its steps are taken",
-        )
+        """Raise if the estimator cannot serve the plant; by default it estimates derivatives with respect to time."""
+        require_derivatives(plant, type(self).__name__, of_time=True, instead="leave the estimator out")
 
 
 def quantities(plant: Plant) -> tuple[str, ...]:

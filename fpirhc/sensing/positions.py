@@ -17,6 +17,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Count, whole
+from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
@@ -108,7 +109,8 @@ class StepDifference(PositionDifference):
     """
 
     def check(self, plant: Plant) -> None:
-        """Serve every map."""
+        """Raise for an output of order 0, which is no difference."""
+        require_derivatives(plant, "StepDifference", of_time=False, instead="leave the estimator out")
 
     def weights(self, order: int, period: float) -> Array:
         del period

@@ -129,11 +129,6 @@ class Sensing(Checked):
         mistakes.unknown("measured: quantity", self.measured or (), every)
         for mistake in self._uncovered(plant):
             mistakes.add(mistake)
-        if plant.at_once and not self.estimator.measures_all:
-            mistakes.add(
-                f"{type(self.estimator).__name__} estimates derivatives, and outputs of order 0 ({', '.join(plant.at_once)}) need "
-                "none; leave the estimator out: Sensing(sensors=...)"
-            )
         with mistakes.caught():
             self.estimator.check(plant)
         if self.observer is not None:

@@ -64,11 +64,8 @@ def disturbance_values(problem: Problem, times: np.ndarray, seed: int) -> np.nda
         one.values(times, np.random.default_rng(stream))
         for one, stream in zip(problem.disturbances.values(), streams, strict=True)
     ]
-    by_name = dict(zip(problem.disturbances, values, strict=True))
     for name, k in disturbance_columns(problem):
-        if k and problem.integrator.steps_maps:
-            values.append(np.diff(by_name[name], prepend=by_name[name][:1]) / problem.period)
-        elif k:
+        if k:
             values.append(problem.disturbances[name].derivative(times, k))
     return np.column_stack(values) if values else np.zeros((len(times), 0))
 

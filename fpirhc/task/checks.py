@@ -232,8 +232,7 @@ def _gain(plant: Plant) -> ca.Function:
 def _check_disturbances(problem: Problem) -> None:
     """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
     mistakes, instants = Mistakes("disturbances"), np.array([0.0, problem.period])
-    what = "input, coordinate or output" if problem.plant.outputs else "input or coordinate"
-    mistakes.unknown(what, problem.disturbances, problem.disturbable)
+    mistakes.unknown("input, coordinate or output", problem.disturbances, problem.disturbable)
     for name, one in problem.disturbances.items():
         with mistakes.caught(f"'{name}': "):
             one.values(instants, np.random.default_rng(0))
@@ -270,7 +269,8 @@ def needed_names(
     measured = tuple(dict.fromkeys((*states, *sensing.measures(plant))))
     if sensing.observer is None:
         return frozenset((*plant.coordinates, *followed_units(plant))), measured
-    return frozenset((*(name.rstrip("'") for name in measured), *(judged or ()), *plant.controlled_names)), measured
+    shown = (name.rstrip("'") for name in measured)
+    return frozenset((*shown, *(judged or ()), *plant.controlled_names, *plant.outputs)), measured
 
 
 def _check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:

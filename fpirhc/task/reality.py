@@ -78,7 +78,7 @@ class Reality(Checked):
 
         Args:
             model: of the problem.
-            needed: names of the model's coordinates that it must have. What else it has under the same name has the same unit.
+            needed: names of the model that it must have. What else it has under the same name has the same unit.
             measured: names of what the sensing uses, which follows from the coordinates.
 
         Raises:
@@ -97,7 +97,7 @@ class Reality(Checked):
         if plant.time_unit != model.time_unit:
             mistakes.add(f"its time is in {plant.time_unit}, the model's in {model.time_unit}; write both in one unit")
         for name in quantities:
-            self._check_quantity(model, name, mistakes, needed=name in model.outputs or name in needed)
+            self._check_quantity(model, name, mistakes, needed=name in needed)
         mistakes.raise_if_any()
 
     def _check_quantity(self, model: Plant, name: str, mistakes: Mistakes, *, needed: bool) -> None:

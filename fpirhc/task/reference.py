@@ -15,6 +15,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from typing import NoReturn
 
@@ -26,8 +27,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.chain import response_units
-from fpirhc.plant.maps import time_derivatives
-from fpirhc.plant.motion import followed, followed_units, sampling
+from fpirhc.plant.maps import derivative_along, time_derivatives
+from fpirhc.plant.motion import followed, followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
@@ -243,18 +244,13 @@ class Setpoint(Reference):
     def _chain(self, plant: Plant, z: Expression, held: Expression) -> list[Expression]:
         """(y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map y and its divided forward differences.
 
-        With the distance d = z - w b the differences are the first entries of ((Phi(T) - I) / T)^j d.
+        They are the first entries of D^j d for the distance d = z - w b.
         """
-        order = z.numel()
-        if plant.step is None:
-            highest = power(self.rate, order) * (held - z[0])
-            for j in range(1, order):
-                highest = highest - math.comb(order, j) * power(self.rate, order - j) * z[j]
-            return [*ca.vertsplit(z), highest]
-        step, values, apart = sampling(plant), [z[0]], ca.vertcat(z[0] - held, z[1:])
-        phi = _transition(self.rate, step, order)
+        order, values, apart = z.numel(), [z[0]], ca.vertcat(z[0] - held, z[1:])
+        phi = partial(_transition, self.rate, order=order)
+        along = derivative_along(plant, ca.DM(_slopes(self.rate, order)), phi)
         for _ in range(order):
-            apart = (phi @ apart - apart) / step
+            apart = along(apart)
             values.append(apart[0])
         return values
 
@@ -287,11 +283,16 @@ class Setpoint(Reference):
         mistakes.raise_if_any()
 
 
+def _slopes(rate: float, order: int) -> np.ndarray:
+    """A of d' = A d, the distance of a filter from its set-point, shape (order, order)."""
+    companion = [[0.0] * order] * (order - 1) + [[math.comb(order, j) * power(rate, order - j) for j in range(order)]]
+    return np.eye(order, k=1) - companion
+
+
 def _transition(rate: float, time: float | ca.SX, order: int) -> ca.DM | ca.SX:
     """Phi(time), shape (order, order)."""
     matrix = ca.SX if isinstance(time, ca.SX) else ca.DM
-    companion = [[0.0] * order] * (order - 1) + [[math.comb(order, j) * power(rate, order - j) for j in range(order)]]
-    nilpotent = matrix(np.eye(order, k=1) + rate * np.eye(order) - companion)
+    nilpotent = matrix(_slopes(rate, order) + rate * np.eye(order))
     term = terms = matrix.eye(order)
     for k in range(1, order):
         term = term @ nilpotent * time / k

@@ -106,8 +106,11 @@ for family, found in (
 
 WRONG_SIGN = "has the wrong sign, so every cycle enlarges the error"
 WRONG_PAIR = "so the iteration does not converge with this gain"
-BY_TIME = "a derivative with respect to time, and {}; use ComputedTorque with a deformation"
-AT_ONCE_SAID, STEPS_SAID = BY_TIME.format("y is of order 0"), BY_TIME.format("a map has differences of its steps")
+NEEDS = (
+    "{} needs derivatives below the response, and {}; use ComputedTorque, with a deformation where the model is wrong"
+)
+OF_DERIVATIVES = ("ADRC", "L1Adaptive", "LyapunovMRAC", "ResolvedAccelerationRate", "SlidingMode")
+OF_TIME = ("LyapunovMRAC", "ResolvedAccelerationRate")
 NO_FILTER = "no stationary gain makes the filter stable; give noise={'a': ...}, or measure more states"
 IN_STEPS = "map", "believed map"
 REFUSED: dict[tuple[str, str], str] = {
@@ -120,15 +123,10 @@ REFUSED: dict[tuple[str, str], str] = {
     **{("Paired 13", form): WRONG_PAIR for form in ("map", "encoder", "believed", "believed map")},
     ("Estimating", "states"): NO_FILTER,
     ("Estimating", "believed"): NO_FILTER,
-    ("ADRC", "at once"): "ADRC observes a chain of integrators, and the command moves 'y' at once (order 0)",
-    ("IntelligentPID", "at once"): "'y' is moved at once (order 0); it needs an order from 1 to the window",
-    ("L1Adaptive", "at once"): "predicts a derivative below the response, and the command moves 'y' at once (order 0)",
-    ("SlidingMode", "at once"): "the command moves 'y' at once (order 0), so there is no surface to slide on",
+    **{(one, "at once"): NEEDS.format(one, "the command moves 'y' at once (order 0)") for one in OF_DERIVATIVES},
+    **{(one, form): NEEDS.format(one, "a map has differences of its steps") for one in OF_TIME for form in IN_STEPS},
+    ("IntelligentPID", "at once"): "'y' has order 0; it needs an order from 1 to the window",
     ("BacksteppingMRAC", "at once"): "rates=()): expected positive numbers, 1/s",
-    ("LyapunovMRAC", "at once"): f"proves that errors vanish by {AT_ONCE_SAID}",
-    **{("LyapunovMRAC", form): f"proves that errors vanish by {STEPS_SAID}" for form in IN_STEPS},
-    ("ResolvedAccelerationRate", "at once"): f"prescribes {AT_ONCE_SAID}",
-    **{("ResolvedAccelerationRate", form): f"prescribes {STEPS_SAID}" for form in IN_STEPS},
     ("ExactModel", "reality"): "no coordinate y, which the model has: it cannot be the exact model of this controller",
     ("ExactModel", "outside"): "an ExternalPlant has no equations that could be the exact model; leave ExactModel out",
 }

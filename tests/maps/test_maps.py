@@ -137,7 +137,7 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "estimator": (
         lambda: task(sensing=fp.Sensing(estimator=fp.PositionDifference())),
-        r"PositionDifference estimates derivatives with respect to time, which a map does not have",
+        r"PositionDifference needs derivatives below the response, and a map has differences of its steps; leave the estimator out",
     ),
     "state": (
         lambda: fishery(next=lambda x, u, p: {}),

@@ -109,7 +109,7 @@ def test_disturbances_act_where_they_are_said_to():
     [
         (
             {"disturbances": {"elbow": fp.Step(at=0.1, size=1.0)}},
-            "input or coordinate 'elbow' is unknown. Did you mean 'input elbow'",
+            "input, coordinate or output 'elbow' is unknown. Did you mean 'input elbow'",
         ),
         ({"disturbances": {"input elbo": fp.Step(at=0.1, size=1.0)}}, "Did you mean 'input elbow'"),
         (

@@ -136,7 +136,7 @@ BAD: dict[str, dict[str, Any]] = {
     "input 'torqe' is unknown": {"limits": fp.Limits(inputs={"torqe": (0.0, 1.0)})},
     "has no nominal motion": {"reference": fp.Trajectory(lambda t: {})},
     "shorter than one period": {"duration": 1e-4},
-    "disturbances: input or coordinate 'x' is unknown": {"disturbances": {"x": fp.Noise(1.0)}},
+    "disturbances: input, coordinate or output 'x' is unknown": {"disturbances": {"x": fp.Noise(1.0)}},
 }
 
 

@@ -14,11 +14,10 @@ import numpy as np
 
 from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
-from fpirhc.plant.chain import require_chains
 from fpirhc.plant.maps import check_modes, step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, rename
@@ -29,7 +28,7 @@ from fpirhc.tracking.base import error_chains, own_errors
 
 
 @dataclass(frozen=True)
-class ADRC(Undeformed):
+class ADRC(OfDerivatives):
     """Linear active disturbance rejection control of every controlled coordinate.
 
     Args:
@@ -41,13 +40,8 @@ class ADRC(Undeformed):
     observer: Positive
 
     def check(self, problem: Problem) -> None:
-        """Raise for an output of order 0.
-
-        Raises:
-            NotSupported: no chain of integrators.
-            InvalidValue: an error that does not decay in the steps of a map.
-        """
-        require_chains(problem.plant, "ADRC observes a chain of integrators")
+        """Raise for an output of order 0, or an error that does not decay in the steps of a map."""
+        super().check(problem)
         for order in problem.plant.response_orders.values():
             check_modes(self, problem.plant, decay_gains(self.bandwidth, order))
 

@@ -58,8 +58,9 @@ class IntelligentPID(Undeformed):
             elif not finite_number(value) or value == 0:
                 mistakes.add(f"alpha: the gain of '{name}' must be a finite number other than zero, got {value!r}")
             if not 1 <= order <= self.window:
-                words = "is moved at once (order 0)" if not order else f"has relative order {order}"
-                mistakes.add(f"window = {self.window} cycles: '{name}' {words}; it needs an order from 1 to the window")
+                mistakes.add(
+                    f"window = {self.window} cycles: '{name}' has order {order}; it needs an order from 1 to the window"
+                )
         mistakes.raise_if_any()
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:

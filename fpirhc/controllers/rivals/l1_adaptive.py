@@ -11,20 +11,18 @@ import casadi as ca
 
 from fpirhc.controllers.base import invert_block, law_blocks
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
-from fpirhc.plant.chain import require_chains
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_in_mean
 from fpirhc.symbolic.layout import Expression, Layout, scalar
-from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking, error_chains
 
 
 @dataclass(frozen=True)
-class L1Adaptive(Undeformed):
+class L1Adaptive(OfDerivatives):
     """Inverse dynamics less the low-passed estimate of a fast predictor.
 
     Args:
@@ -36,14 +34,6 @@ class L1Adaptive(Undeformed):
     tracking: Tracking
     bandwidth: Positive
     predictor: Positive = 1.0
-
-    def check(self, problem: Problem) -> None:
-        """Raise for an output of order 0.
-
-        Raises:
-            NotSupported: no derivative below the response can be predicted.
-        """
-        require_chains(problem.plant, "L1Adaptive predicts a derivative below the response")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant

@@ -13,12 +13,11 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import commanding_blocks, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
-from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
@@ -28,7 +27,7 @@ from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)
-class LyapunovMRAC(Undeformed):
+class LyapunovMRAC(OfDerivatives):
     """Gains on state, reference and bias, adapted so that the plant becomes the reference model.
 
     Args:
@@ -41,7 +40,7 @@ class LyapunovMRAC(Undeformed):
     adaptation: Positive
     leakage: NotNegative = 0.0
 
-    learns = True
+    learns = of_time = True
 
     def weights(self, order: int) -> np.ndarray:
         """Return P of the scaled error z for one coordinate, shape (order, order)."""
@@ -54,7 +53,7 @@ class LyapunovMRAC(Undeformed):
             NotSupported: a map, or an output of order 0.
             InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
         """
-        require_derivatives(problem.plant, "LyapunovMRAC proves that errors vanish by")
+        super().check(problem)
         plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
         followed = plant.chains
         if len(plant.controlled_names) != len(followed):

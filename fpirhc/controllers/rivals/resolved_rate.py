@@ -11,21 +11,19 @@ import casadi as ca
 
 from fpirhc.controllers.base import commanding_blocks, invert_block, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
-from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.motion import controlled_places, time_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, like, scalar
-from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)
-class ResolvedAccelerationRate(Undeformed):
+class ResolvedAccelerationRate(OfDerivatives):
     """Increments of the command with which all modes of the error and its first n derivatives decay as exp(-rate t).
 
     The first cycle has no measured response yet and prescribes (d/dt + rate)^n e = 0.
@@ -36,17 +34,11 @@ class ResolvedAccelerationRate(Undeformed):
 
     rate: Positive
 
+    of_time = True
+
     def gains(self, degree: int) -> tuple[float, ...]:
         """Return the coefficients of (d/dt + rate)^degree below the highest, lowest derivative first."""
         return decay_gains(self.rate, degree)
-
-    def check(self, problem: Problem) -> None:
-        """Raise for a map, or an output of order 0.
-
-        Raises:
-            NotSupported: the response has no derivative.
-        """
-        require_derivatives(problem.plant, "ResolvedAccelerationRate prescribes")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant

@@ -12,7 +12,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import closing_blocks, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import Positive
@@ -27,7 +27,7 @@ from fpirhc.tracking.base import error_chains
 
 
 @dataclass(frozen=True)
-class SlidingMode(Undeformed):
+class SlidingMode(OfDerivatives):
     """Inverse dynamics with the switching term K tanh(S / w).
 
     Args:
@@ -44,19 +44,17 @@ class SlidingMode(Undeformed):
         """Raise if the loop chatters even with an exact model.
 
         Raises:
-            InvalidProblem: K period / w is 2 or more; an output of order 0, which has no surface.
+            InvalidProblem: K period / w is 2 or more.
+            NotSupported: an output of order 0.
             InvalidValue: an error on the surface that does not decay in the steps of a map.
         """
+        super().check(problem)
         mistakes, product = Mistakes("SlidingMode"), self.gain * problem.period / self.width
         if product >= 2:
             mistakes.add(
                 f"gain x period / width = {product:.3g} chatters with any model; "
                 f"take a width above {0.5 * self.gain * problem.period:.3g} "
                 f"or a gain below {2 * self.width / problem.period:.3g}"
-            )
-        for name in problem.plant.at_once:
-            mistakes.add(
-                f"the command moves '{name}' at once (order 0), so there is no surface to slide on; use ComputedTorque"
             )
         mistakes.raise_if_any()
         for order in problem.plant.response_orders.values():

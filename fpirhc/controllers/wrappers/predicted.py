@@ -131,7 +131,7 @@ class Predicted(ControllerWrapper):
         advance = one_step(plant, period) if self.by == "model" else _along_desired(plant, period)
         corrected = _residual(plant, self.residual_time, period) if self.residual_time else None
         residual = Signal("residual", plant.names, forcing_units(plant))
-        answered = Queue(plant.response_age)  # cycles since the state to which the plant answered with the measured response
+        answered = Queue(plant.response_age)  # of the state to which the measured response belongs
         past = answered.memory("state_answered", plant.state.elements, built.state.start)
         own = (residual, *past) if corrected else ()
         responses = (plant.response_signal("realised"),) if corrected else ()
