@@ -16,9 +16,7 @@ import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
 from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
-from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import response_names
 from fpirhc.symbolic.evaluate import Evaluator, require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
@@ -146,10 +144,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     advance = problem.real_integrator.step(plant, problem.period)
     after = advance(x, u, exact, calm)
     later = matrix.sym("later", model.input.size)
-    if problem.integrator.steps_maps:
-        response = _differences(problem, advance, after, (later, exact, calm))
-    else:
-        response = problem.truth.function(response_names(model), seen=True)(after, u, exact, calm)
+    response = _response(problem, advance, after, u, (later, exact, calm))
     gain = ca.Function("fpirhc_sampled_gain", [x, u, later, exact], [ca.densify(ca.jacobian(response, u))])
     command = model.equations.inverse(state, r, assumed)
     jacobian = gain(x, command, command, exact) @ ca.jacobian(command, r)
@@ -158,21 +153,23 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
     return ca.Function("fpirhc_sampled_jacobian", arguments, [ca.densify(jacobian)], names, ["jacobian"])
 
 
-def _differences(problem: Problem, advance: ca.Function, after: Matrix, held: tuple[Matrix, Matrix, ca.DM]) -> Matrix:
-    """The divided differences y_{k+r} / T^r of a map's controlled quantities, as far as the command of cycle k changes them.
+def _response(
+    problem: Problem, advance: ca.Function, after: Matrix, command: Matrix, held: tuple[Matrix, Matrix, ca.DM]
+) -> Matrix:
+    """The response to the command of a cycle; of a map the divided differences y_{k+r} / T^r, as far as that command changes them.
 
-    `held`: commands of the cycles after it, parameters, no forcing.
+    Args:
+        after: state at the end of the cycle, whose command is `command`.
+        held: command of the cycles after it, parameters, no forcing.
     """
-    model = problem.plant
-    outputs_of = problem.truth.function(model.output.elements, seen=True)
-    states, entries = [after], []
-    for _ in range(1, max(model.chains.values())):
-        states.append(advance(states[-1], *held))
-    for name in model.controlled_names:
-        order = model.chains[name]
-        outputs = outputs_of(states[order - 1], *held)
-        entries.append(outputs[model.output.elements.index(name)] / sampling(model) ** order)
-    return ca.vertcat(*entries)
+    counts, orders = problem.plant.differences, problem.plant.response_orders
+    names = [name + "'" * (order - counts[name]) for name, order in orders.items()]
+    shown, state = problem.truth.function(names, seen=True), after
+    values = {0: shown(after, command, *held[1:])}
+    for count in range(1, max(counts.values()) + 1):
+        values[count] = shown(state, *held) / problem.period**count
+        state = advance(state, *held)
+    return ca.vertcat(*(values[count][k] for k, count in enumerate(counts.values())))
 
 
 def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:

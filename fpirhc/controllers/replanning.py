@@ -12,7 +12,7 @@ from fpirhc.horizon.nominal import consistent_state
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.optimisers.base import Optimiser, first_memory
 from fpirhc.plant.chain import without_disturbances
-from fpirhc.plant.integrators import one_step
+from fpirhc.plant.integrators import USUAL
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.driver import plans_are_compiled
@@ -70,7 +70,7 @@ def _propagate(plant: Plant, period: float) -> Block:
     reads = Layout((like(plant.state, _FOLLOWED), like(plant.input, "planned"), plant.parameter))
     writes = Layout((like(plant.output, "_target"), plant.response_signal("nominal"), like(plant.state, "target")))
     model, calm = plant.equations, ca.DM.zeros(len(plant.names))
-    after = one_step(plant, period)
+    after = USUAL.step(plant, period)
 
     def step(s: Signals) -> dict[str, Expression]:
         state = getattr(s, _FOLLOWED)

@@ -15,7 +15,7 @@ from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
 from fpirhc.plant.disturbed import disturbance_name, disturbed
-from fpirhc.plant.integrators import one_step
+from fpirhc.plant.integrators import USUAL
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import quantities, require_named, response_names, values_of
@@ -180,7 +180,7 @@ class DisturbanceKalman(ParameterEstimator):
 
     def step(self, problem: Problem) -> Correct:
         model = problem.plant
-        advance, no_forcing = one_step(model, problem.period), ca.DM.zeros(len(model.names))
+        advance, no_forcing = USUAL.step(model, problem.period), ca.DM.zeros(len(model.names))
         gain = expression(ca.DM(self.gain(problem)))
         shown, follows = self._shown_function(model), self._has_state(model)
         foresees = self._foresees(model)
@@ -238,7 +238,7 @@ class DisturbanceKalman(ParameterEstimator):
         model = problem.plant
         x, u, p = model.symbols()
         w = ca.SX.sym("w", len(model.names))
-        x_next = one_step(model, problem.period)(x, u, p, w)
+        x_next = USUAL.step(model, problem.period)(x, u, p, w)
         function = ca.Function("fpirhc_linear", [x, u, p, w], [ca.jacobian(x_next, x), ca.jacobian(x_next, w)])
         a, b = (np.asarray(m.full()) for m in function(*_operating_point(problem), np.zeros(len(model.names))))
         effects = dict(zip(model.names, b.T, strict=True))  # that of an output is on what is measured alone

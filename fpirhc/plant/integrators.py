@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar, cast, final
 
 import casadi as ca
 import numpy as np
@@ -27,10 +27,9 @@ _NAMES = ["x", "u", "p", "w"], ["x_next"]
 
 
 class Integrator(Checked, ABC):
-    """Contract: one cycle of the plant as a Function (state, input, parameters, forcing) -> state after `period`."""
+    """Contract: how x' = f(x, u, p, w) moves in a time. A map has steps of its own, and no use for it."""
 
     opaque: ClassVar[bool] = False  # whether the step holds operations that scalar expressions cannot
-    steps_maps: ClassVar[bool] = False  # whether it moves maps; False for what integrates differential equations
 
     def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
         """The same method with about `times` times the work; None where it has no such setting."""
@@ -44,36 +43,40 @@ class Integrator(Checked, ABC):
         return None
 
     @abstractmethod
+    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
+        """Function (state, input, parameters, forcing) -> state after `period`, of one with the same arguments -> dx/dt."""
+
+    @final
     def step(self, plant: Plant, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period`, in the plant's unit of time."""
+        if plant.step is None:
+            return self.integrate(plant.equations.forced_rate, period)
+        x, u, p, w = _symbols(plant.equations.next)
+        after = x
+        for _ in range(max(1, round(period / sampling(plant)))):
+            after = plant.equations.next(after, u, p, w)
+        return ca.Function("fpirhc_map", [x, u, p, w], [after], *_NAMES)
 
-    @abstractmethod
+    @final
     def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:
         """Function (state, input, parameters, length) -> state after so many steps at once, up to the longest."""
-
-
-class _OfRates(Integrator):
-    """What integrates x' = f(x, u, p, w)."""
-
-    @abstractmethod
-    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
-        """`step`, of a Function (state, input, parameters, forcing) -> dx/dt."""
-
-    def step(self, plant: Plant, period: float) -> ca.Function:
-        return self.integrate(plant.equations.forced_rate, period)
-
-    def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:  # noqa: ARG002
-        """One step of f times the length."""
-        rate, length = plant.equations.forced_rate, ca.SX.sym("length")
-        x, u, p, w = _symbols(rate)
-        given = [x, u, ca.vertcat(p, length), w]
-        one = self.integrate(ca.Function("fpirhc_slow", given, [length * rate(x, u, p, w)], _NAMES[0], ["dx"]), step)
-        still = one(*given[:3], ca.SX.zeros(w.numel()))
-        return ca.Function("fpirhc_stretched", [x, u, p, length], [still])
+        (x, u, p), length, still = plant.symbols(), ca.SX.sym("length"), ca.SX.zeros(len(plant.names))
+        if plant.step is None:  # one step of f times the length
+            rate = plant.equations.forced_rate
+            *_, w = _symbols(rate)
+            given = [x, u, ca.vertcat(p, length), w]
+            slow = ca.Function("fpirhc_slow", given, [length * rate(x, u, p, w)], _NAMES[0], ["dx"])
+            after = self.integrate(slow, step)(*given[:3], still)
+        else:
+            one, after = self.step(plant, step), x
+            for k in range(round(longest)):
+                later = one(after, u, p, still)
+                after = ca.if_else(length > k, later, after) if k else later
+        return ca.Function("fpirhc_stretched", [x, u, p, length], [after])
 
 
 @dataclass(frozen=True)
-class _Substepped(_OfRates):
+class _Substepped(Integrator):
     """Equal sub-steps of one method; `finer` has more of them, as many as there may be."""
 
     substeps: Few = 1
@@ -182,7 +185,7 @@ class Collocation(_Substepped):
 
 
 @dataclass(frozen=True)
-class Cvodes(_OfRates):
+class Cvodes(Integrator):
     """SUNDIALS CVODES.
 
     Args:
@@ -213,43 +216,6 @@ class Cvodes(_OfRates):
         return ca.Function("fpirhc_cvodes_step", [xm, *given], [x_next], *_NAMES)
 
 
-@dataclass(frozen=True)
-class MapSteps(Integrator):
-    """What stands in the place of an integrator where the plant is a map: x+ = f(x, u, p), as often as the time has steps.
-
-    `Problem` and `Horizon` have it for a map by themselves.
-    """
-
-    steps_maps = True
-
-    def stretched(self, plant: Plant, step: float, longest: float) -> ca.Function:
-        (x, u, p), length = plant.symbols(), ca.SX.sym("length")
-        one, after = self.step(plant, step), x
-        for k in range(round(longest)):
-            later = one(after, u, p, ca.SX.zeros(len(plant.names)))
-            after = ca.if_else(length > k, later, after) if k else later
-        return ca.Function("fpirhc_stretched", [x, u, p, length], [after])
-
-    def step(self, plant: Plant, period: float) -> ca.Function:
-        x, u, p, w = _symbols(plant.equations.next)
-        after = x
-        for _ in range(max(1, round(period / sampling(plant)))):
-            after = plant.equations.next(after, u, p, w)
-        return ca.Function("fpirhc_map", [x, u, p, w], [after], *_NAMES)
-
-
-def one_step(plant: Plant, period: float) -> ca.Function:
-    """Function (state, input, parameters, forcing) -> state one cycle later: one Runge-Kutta step, or the cycle of a map."""
-    return motion_of(plant, USUAL).step(plant, period)
-
-
-def motion_of(plant: Plant, integrator: Integrator) -> Integrator:
-    """Return what moves a plant: the integrator where it fits the plant, else the steps of a map, or the usual integrator."""
-    if integrator.steps_maps == (plant.step is not None):
-        return integrator
-    return USUAL if integrator.steps_maps else MapSteps()
-
-
 def own_steps(plant: Plant, integrator: Integrator, period: float) -> int:
     """Return how many steps of its own a plant makes in a cycle: those of a map, sub-steps, and else one."""
     return round(period / plant.step) if plant.step is not None else getattr(integrator, "substeps", 1)
@@ -264,7 +230,7 @@ def own_step(plant: Plant, integrator: Integrator, period: float) -> ca.Function
 
 
 USUAL = RungeKutta4()
-"""The integrator of a problem, or of a horizon, that names none: this very object. A map has its own steps in its place."""
+"""The integrator of a problem, or of a horizon, that names none."""
 
 
 def _symbols(rate: ca.Function) -> tuple[ca.SX, ...]:
@@ -289,7 +255,7 @@ def stiffness(
     modes = poles(plant, state, command, parameters)
     if not np.isfinite(modes).all():
         return ""
-    growth = _spurious(integrator, period, modes)
+    growth = _spurious(plant, integrator, period, modes)
     wrong = growth > 1 + 1e-9
     if not wrong.any():
         return ""
@@ -319,13 +285,15 @@ def spurious_growth(
     """
     points = zip(states.T, commands.T, strict=True)
     modes = [poles(plant, state, command, plant.approximate) for state, command in points]
-    return np.array([_spurious(integrator, period, m).max(initial=1.0) if np.isfinite(m).all() else 1.0 for m in modes])
+    return np.array(
+        [_spurious(plant, integrator, period, m).max(initial=1.0) if np.isfinite(m).all() else 1.0 for m in modes]
+    )
 
 
-def _spurious(integrator: Integrator, period: float, modes: np.ndarray) -> np.ndarray:
+def _spurious(plant: Plant, integrator: Integrator, period: float, modes: np.ndarray) -> np.ndarray:
     """Factor by which a step makes each decaying mode grow; 1 for the others."""
     growth = integrator.growth(modes * period)
-    if growth is None:
+    if growth is None or plant.step is not None:
         return np.ones(len(modes))
     return np.where(modes.real <= 1e-9 * np.abs(modes), np.maximum(growth, 1.0), 1.0)
 

@@ -143,7 +143,7 @@ class Plant(Checked):
             plant = Plant.discrete(states={"stock": "t"}, inputs={"catch": "t/year"}, parameters={...}, next=grown, step=1.0, ...)
 
         A response is a divided difference, (y_{k+1} - y_k) / T for an output that an input reaches in one control cycle of T; see
-        `fpirhc.plant.maps`. `Problem` takes no integrator for a map, and its period is a whole number of steps.
+        `fpirhc.plant.maps`. A map has no use for an integrator, and the period of its `Problem` is a whole number of steps.
 
         Args:
             states: name -> unit of every state.

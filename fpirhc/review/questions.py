@@ -245,7 +245,7 @@ def _left(case: Case) -> Fact | None:
 
 def _inner(case: Case) -> Fact | None:
     problem, bench = case.problem, case.bench
-    if sum(problem.plant.response_orders.values()) >= problem.plant.state.size or problem.integrator.steps_maps:
+    if sum(problem.plant.response_orders.values()) >= problem.plant.state.size or problem.plant.step is not None:
         return None
     rate, left = max(map(zero_dynamics, case.slopes(9))), bench.back.left
     rate = 0.0 if abs(rate) * problem.duration < ROUNDING else rate

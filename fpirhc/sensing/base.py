@@ -30,6 +30,7 @@ class DerivativeEstimator(Checked, ABC):
     """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
 
     measures_all: ClassVar[bool] = False  # whether state and response are both measured, so that nothing is estimated
+    of_time: ClassVar[bool] = True  # whether a map has not what it estimates
 
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -55,8 +56,8 @@ class DerivativeEstimator(Checked, ABC):
         return 1
 
     def check(self, plant: Plant) -> None:
-        """Raise if the estimator cannot serve the plant; by default it estimates derivatives with respect to time."""
-        require_derivatives(plant, type(self).__name__, of_time=True, instead="leave the estimator out")
+        """Raise if the estimator cannot serve the plant; by default it estimates derivatives."""
+        require_derivatives(plant, type(self).__name__, of_time=self.of_time, instead="leave the estimator out")
 
 
 def quantities(plant: Plant) -> tuple[str, ...]:

@@ -17,7 +17,6 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Count, whole
-from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
@@ -108,9 +107,7 @@ class StepDifference(PositionDifference):
     those of s cycles ago; `fpirhc.controllers.seeing` brings them to this cycle by the model.
     """
 
-    def check(self, plant: Plant) -> None:
-        """Raise for an output of order 0, which is no difference."""
-        require_derivatives(plant, "StepDifference", of_time=False, instead="leave the estimator out")
+    of_time = False
 
     def weights(self, order: int, period: float) -> Array:
         del period

@@ -60,7 +60,7 @@ def _with_lag(problem: Problem, form: Form) -> Problem:
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
     plant = problem.plant
-    if not any(lags) or problem.integrator.steps_maps:
+    if not any(lags) or plant.step is not None:
         return problem
     finer = problem.integrator.finer(math.ceil(problem.period / min(t for t in lags if t)))
     before = zip(plant.inputs, lags, map(float, problem.inputs_before), strict=True)

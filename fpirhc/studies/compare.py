@@ -225,7 +225,7 @@ def compare(
         findings=findings(entries, task.headline, Yardstick.of(problem, seed), skipped, aim),
         pictures=task.pictures,
         time_unit=problem.time_unit,
-        steps=problem.real_integrator.steps_maps,
+        steps=problem.real_plant.step is not None,
     )
 
 

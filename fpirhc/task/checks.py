@@ -1,8 +1,8 @@
 """Whether the parts of a problem fit together, and what follows from maps among them.
 
-A map has its own steps in place of an integrator, in the run and along a horizon. A response of a map is a difference of outputs,
-which no sensor shows, so it is taken from the outputs of the last cycles (`StepDifference`); that of an output of order 0 is the
-output itself, and measured. What is believed, nobody measures; a reality need not have it.
+A response of a map is a difference of outputs, which no sensor shows, so it is taken from the outputs of the last cycles
+(`StepDifference`); that of an output of order 0 is the output itself, and measured. What is believed, nobody measures; a reality
+need not have it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from fpirhc.horizon.constraint_states import check_names
 from fpirhc.horizon.cost import Cost, view_of_symbols
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.plant.chain import differentiated_signals
-from fpirhc.plant.integrators import USUAL, Integrator, MapSteps
 from fpirhc.plant.maps import check_maps, over
 from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
@@ -50,20 +49,12 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
     if not mistakes.none:
         return {}
     if plant.step is not None:
-        settled["integrator"] = _steps("integrator", problem.integrator, mistakes)
-        if problem.horizon is not None:
-            discretisation = _steps("horizon: discretisation", problem.horizon.discretisation, mistakes)
-            settled["horizon"] = replace(problem.horizon, discretisation=discretisation)
-            if any(length % 1 for length in problem.horizon.lengths):
-                mistakes.add(
-                    f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}"
-                )
+        if problem.horizon is not None and any(length % 1 for length in problem.horizon.lengths):
+            mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}")
         if problem.sensing.estimator.measures_all and not plant.at_once:
             from fpirhc.sensing.positions import StepDifference  # of maps alone
 
             settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
-    elif problem.integrator.steps_maps:
-        settled["integrator"] = USUAL
     return settled
 
 
@@ -245,15 +236,6 @@ def _check_disturbances(problem: Problem) -> None:
         with mistakes.caught():
             problem.disturbances[name].derivative(instants, 1)
     mistakes.raise_if_any()
-
-
-def _steps(what: str, integrator: Integrator, mistakes: Mistakes) -> Integrator:
-    """The steps of a map in place of an integrator that nobody named."""
-    if integrator.steps_maps:
-        return integrator
-    if integrator is not USUAL:
-        mistakes.add(f"{what}: {integrator!r} integrates differential equations; the plant is a map, leave it out")
-    return MapSteps()
 
 
 def needed_names(

@@ -16,7 +16,7 @@ from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import nominal_run
-from fpirhc.plant.integrators import USUAL, Integrator, motion_of, own_steps
+from fpirhc.plant.integrators import USUAL, Integrator, own_steps
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.base import response_names
@@ -187,7 +187,7 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return motion_of(self.real_plant, self.truth.integrator or self.integrator)
+        return self.truth.integrator or self.integrator
 
     @cached_property
     def real_start(self) -> np.ndarray:

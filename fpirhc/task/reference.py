@@ -15,7 +15,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
 from typing import NoReturn
 
@@ -247,8 +246,8 @@ class Setpoint(Reference):
         They are the first entries of D^j d for the distance d = z - w b.
         """
         order, values, apart = z.numel(), [z[0]], ca.vertcat(z[0] - held, z[1:])
-        phi = partial(_transition, self.rate, order=order)
-        along = derivative_along(plant, ca.DM(_slopes(self.rate, order)), phi)
+        slopes = ca.DM(_slopes(self.rate, order))
+        along = derivative_along(plant, slopes, lambda cycle: ca.DM(_transition(self.rate, cycle, order)))
         for _ in range(order):
             apart = along(apart)
             values.append(apart[0])

@@ -131,10 +131,6 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
         lambda: task(period=15.0),
         r"period 15 s is no whole number of the map's steps of 10 s; use 10 s or 20 s",
     ),
-    "discretisation": (
-        lambda: task(horizon=fp.Horizon(stages=3, step=T, discretisation=fp.Euler())),
-        r"horizon: discretisation: Euler\(substeps=1\) integrates differential equations",
-    ),
     "estimator": (
         lambda: task(sensing=fp.Sensing(estimator=fp.PositionDifference())),
         r"PositionDifference needs derivatives below the response, and a map has differences of its steps; leave the estimator out",

@@ -17,7 +17,7 @@ from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function
-from fpirhc.plant.integrators import one_step
+from fpirhc.plant.integrators import USUAL
 from fpirhc.plant.motion import forcing_units, time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -128,7 +128,7 @@ class Predicted(ControllerWrapper):
         plant, period, cycles = built.plant, built.period, self._cycles(built.period)
         # One value more than is on its way: the oldest acted while the response was realised.
         queue, calm = Queue(cycles), ca.MX.zeros(len(plant.names))
-        advance = one_step(plant, period) if self.by == "model" else _along_desired(plant, period)
+        advance = USUAL.step(plant, period) if self.by == "model" else _along_desired(plant, period)
         corrected = _residual(plant, self.residual_time, period) if self.residual_time else None
         residual = Signal("residual", plant.names, forcing_units(plant))
         answered = Queue(plant.response_age)  # of the state to which the measured response belongs
