@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.first_files import PENDULUM
 from helpers.hand_made_runs import CYCLES, SOLVE, problem, run, step
 from helpers.plants import linear
 
 import fpirhc as fp
 from fpirhc.contracts import Layout, Signal
-from fpirhc.errors import InvalidName, InvalidValue
+from fpirhc.errors import FpirhcError, InvalidName, InvalidValue
 
 
 def test_errors_are_those_of_the_measured_part():
@@ -112,18 +113,21 @@ def test_statuses_are_counted_and_the_worst_is_told():
     metrics = fp.measure(problem(), run(0.0, status=status))
     assert metrics.statuses == {"OK": 90, "NOT_CONVERGED": 7, "HELD": 3}
     assert metrics.worst_status == "HELD"
-    assert metrics["cycles"] == {"": 100}
+    assert repr(metrics["cycles"][""]) == "100"  # a count stays whole in files
 
 
 def test_solves_are_summed_up_over_the_whole_run():
-    """Iterations 1 to 100, residuals of a tenth of that; a plan that is held for ten cycles is one plan."""
+    """Iterations 1 to 10, residuals of a ninth of that; a plan that is held for ten cycles is one plan."""
     iterations = np.repeat(np.arange(1.0, 11.0), 10)
-    solve = np.column_stack([0 * iterations, iterations / 10, iterations / 100, iterations, 0 * iterations])
+    solve = np.column_stack([0 * iterations, iterations / 9, iterations / 81, iterations, 0 * iterations])
     metrics = fp.measure(problem(), run(0.0, solve=(Signal("solve", SOLVE), solve)))
-    wanted = {"median_iterations": 5.5, "worst_iterations": 10, "median_stationarity": 0.55, "worst_stationarity": 1.0}
-    assert metrics.solve == pytest.approx({**wanted, "worst_feasibility": 0.1, "plans": 10})
-    assert [metrics.text(f"solve.{name}") for name in ("worst_iterations", "worst_feasibility")] == ["10", "0.1"]
+    wanted = {"median_iterations": 5.5, "worst_iterations": 10, "median_stationarity": 5.5 / 9}
+    assert metrics.solve == pytest.approx(
+        {**wanted, "worst_stationarity": 10 / 9, "worst_feasibility": 10 / 81, "plans": 10}
+    )
+    assert [metrics.text(f"solve.{name}") for name in ("worst_iterations", "median_stationarity")] == ["10", "0.6"]
     assert of_solves(np.zeros(CYCLES)).text("solve.worst_iterations") == "-"  # an optimiser that tells none
+    assert metrics.entries["solve.worst_iterations"].text(0.0) == "0"
     assert fp.measure(problem(), run(0.0)).solve == {}
 
 
@@ -132,7 +136,8 @@ def test_a_run_that_ended_early_has_no_errors():
     metrics = fp.measure(problem(), run(1.0, stop="signal 'x' is not finite"))
     for numbers in (metrics.rms_error, metrics.max_error, metrics.iae, metrics.settling, metrics.effort):
         assert np.isnan(list(numbers.values())).all()
-    assert np.isnan(fp.measure(problem(), run(1e-3, stop="it ended inside the band")).settling["y"])
+    late = fp.measure(problem(measure_from=0.0), run(1e-3, stop="it ended inside the band"))
+    assert np.isnan([late.settling["y"], late.rms_error["y"]]).all()
     assert metrics.statuses == {"OK": 25, "NON_FINITE": 1}
     assert metrics.worst_status == "NON_FINITE"
 
@@ -301,6 +306,23 @@ def test_a_function_that_returns_something_else_is_refused(by, result, message):
         fp.measure(problem(), run(0.0), [metric])
 
 
+TAKEN = {
+    "rms_error": "is defined 2 times", "solve": "has another meaning", "plan": "has another meaning",
+    "plan.first": "has another meaning", "Mine": "expected a name of small letters", "mine.first": "", "solve.mine": "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TAKEN)
+def test_a_name_that_stands_for_something_else_in_results_is_refused(name, tmp_path):
+    """For a known metric, for a group of them, or for another fact of a run; one's own metrics come last."""
+    (tmp_path / "mine.py").write_text(f"{PENDULUM}\nmetrics = (fp.Metric({name!r}, lambda problem, run: 1.0),)\n")
+    if TAKEN[name]:
+        with pytest.raises(FpirhcError, match=TAKEN[name]):
+            fp.load_problem(tmp_path / "mine.py")
+    else:
+        assert fp.load_problem(tmp_path / "mine.py").metrics[-1].name == name
+
+
 # Figures of merit by value, on runs that were made by hand; 50 cycles of 0.1 s are measured, from t = 5 s on
 
 
@@ -316,6 +338,8 @@ COMMAND = np.where(np.arange(CYCLES) < 50, 10.0, np.where(np.arange(CYCLES) % 2,
         (figures.TimeOver("command.u", 2.9), 2.5, "s", "smaller"),
         (figures.TimeOver("command.u", 3.0), 0.0, "s", "smaller"),
         (figures.Total("command.u"), -2.5, "N s", "smaller"),
+        (figures.Total("state.y'"), 0.0, "m", "smaller"),
+        (figures.Overshoot("y"), 0.0, "m", "smaller"),
         (figures.Largest("command.u"), 4.0, "N", "smaller"),
         (figures.Nadir("command.u"), -4.0, "N", "larger"),
         (figures.Energy("command.u"), 62.5, "(N)^2 s", "smaller"),
@@ -330,7 +354,8 @@ def test_figures_have_the_value_of_their_definition(figure, value, unit, better)
     assert metrics[figure.name][""] == pytest.approx(value)
     assert metrics.units[figure.name][""] == unit
     assert (figure.better, figure.headline, figure.finite) == (better, True, True)
-    ended = fp.measure(problem(), run(0.0, command=COMMAND, stop="limits"), [figure])
+    assert {*figure.reads} <= {"command", "state", "true_error", "reference", "time"}
+    ended = fp.measure(problem(measure_from=0.0), run(0.0, command=COMMAND, stop="limits"), [figure])
     assert math.isnan(ended[figure.name][""])
 
 

@@ -121,11 +121,8 @@ def Norm(whats: Sequence[str], *, power: float = 2.0, name: str = "norm", headli
 
     def norm(problem: Problem, run: Run) -> float:
         late = measured_cycles(problem, run)
-        values = np.stack([np.abs(run[what][late]) for what in whats])
-        if np.isinf(power):
-            return float(values.max())
-        largest = values.max() or 1.0  # so that no power overflows
-        return float(largest * (np.sum((values / largest) ** power) * problem.period) ** (1 / power))
+        values = np.stack([run[what][late] for what in whats])
+        return float(np.linalg.norm(values.ravel(), power) * problem.period ** (1 / power))
 
     unit = (lambda problem, _: _unit(problem, whats[0])) if np.isinf(power) else ""
     reads = (*(what.partition(".")[0] for what in whats), "time")

@@ -29,8 +29,8 @@ SETTLED = 0.02  # half width of the band, as a share of the reference's range or
 def settling(problem: Problem, run: Run) -> dict[str, float]:
     """Return the time from which |error| stays within the band; 0 where it always is, NaN where the run ends outside it."""
     names, errors = run.layout["error"].elements, np.abs(run["true_error"])
-    if run.stop is not None or not run.cycles:
-        return dict.fromkeys(names, np.nan if run.stop is not None else 0.0)
+    if run.stop is not None:
+        return dict.fromkeys(names, np.nan)
     ranges = np.array([np.ptp(run[f"reference.{name}"]) for name in names])
     outside = errors > SETTLED * np.fmax(np.fmax(ranges, errors[0]), _SMALLEST)
     after = (outside * np.arange(1, run.cycles + 1)[:, None]).max(axis=0)

@@ -43,7 +43,7 @@ def _over(column: str, summary: Callable[[np.ndarray], np.floating]) -> Function
     """Function of a metric that sums up one column of 'solve'; a plan that is not finite has an entry there, but no such number."""
 
     def function(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- every metric is given the problem
-        if "solve" not in run.layout or not run.cycles:
+        if "solve" not in run.layout:
             return None
         counts = column == "iterations" or run["solve.status"] < Status.NON_FINITE
         values = run[f"solve.{column}"][np.broadcast_to(counts, run.cycles)]
@@ -56,13 +56,7 @@ def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every me
     """Return the number of different plans."""
     if "solve" not in run.layout or not run.cycles:
         return None
-    solves = run["solve"]
-    # A plan that is held for several cycles counts once.
-    first = np.concatenate([[True], (solves[1:] != solves[:-1]).any(axis=1)])
-    different = solves[first]
-    # Plans with different residuals are different; whole rows are slow to sort.
-    alone = np.unique(run["solve.stationarity"][first]).size == len(different)
-    return len(different) if alone else int(np.unique(different, axis=0).shape[0])
+    return len(np.unique(run["solve"], axis=0))  # a plan that is held for several cycles counts once
 
 
 def residual(value: float) -> str:
