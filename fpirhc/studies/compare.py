@@ -97,7 +97,7 @@ class Entry:
     exact: bool  # whether its model is exact where the others' is not
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
-    cycle: tuple[float, float] | None = None  # mean and largest time of a cycle, us
+    cycle: float | None = None  # mean time of a cycle, us
     left: tuple[Followed, ...] = ()  # hard limits that it leaves, the worst first
     noise: Finding | None = None  # what noise of its response costs, where that has none
     notes: tuple[str, ...] = ()
@@ -151,7 +151,7 @@ class Comparison(Study):
             texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
             status = f"ended early: {e.run.stop}" if e.run.stop else status_shares(e.metrics.statuses)
             status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
-            cycle = f"{round(e.cycle[0], 1):g}" if e.cycle else ""
+            cycle = f"{round(e.cycle, 1):g}" if e.cycle else ""
             table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
         about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
         notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
@@ -325,8 +325,8 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
 
 
-def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float, float] | None:
-    """Mean and largest wall time of a call of the controller, from measurement to command, us: few calls may hold all plans."""
+def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> float | None:
+    """Mean wall time of a call of the controller, from measurement to command, us: few calls may hold all plans."""
     stepper, count = Stepper.of(composed, compiled=compiled), min(run.cycles, REPLAYED)
     if count < 2:
         return None
@@ -342,7 +342,7 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
         begin = time.perf_counter_ns()
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
-    return float(taken[1:].mean()) / 1e3, float(taken[1:].max()) / 1e3
+    return float(taken[1:].mean()) / 1e3
 
 
 def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:
