@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import casadi as ca
@@ -95,15 +95,15 @@ class Gate:
 
     problem: Problem  # that the step is composed for
     inner: Composite  # the step of a controller, with the output 'command'
-    simulated: bool = False  # whether clock and memory are those of a simulated loop, which are always good
     # intervals (lower, upper) by column of the sample, "state.q1" or "realised.q1"; every finite number fits where there is none
-    ranges: Mapping[str, Interval] = field(default_factory=dict)
+    ranges: Mapping[str, Interval]
+    # number of last good samples that are kept for whoever replays missing cycles, which are then counted; 0: nobody does
+    samples: int
+    simulated: bool = False  # whether clock and memory are those of a simulated loop, which are always good
     loses: bool = False  # whether the step also reads `LOST`
     # s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
     # not later than the time, and not older than this. None: time stamps are not looked at.
     max_age: float | None = None
-    # number of last good samples that are kept for whoever replays missing cycles, which are then counted; 0: nobody does
-    samples: int = 0
 
     @cached_property
     def reads(self) -> Layout:
