@@ -72,7 +72,7 @@ class Form:
     def channels(self) -> int | None:
         """Number of controlled coordinates that it is made for; None: any number."""
         rows = self.cycles if self.weights is None else self.weights
-        return len(rows) or None if isinstance(rows, tuple) else None
+        return len(rows) if isinstance(rows, tuple) else None
 
     def weighted(self, jacobian: np.ndarray) -> np.ndarray:
         """Return J W for a response Jacobian J, shape (..., n, n): response errors are multiplied by I - a J W per cycle."""

@@ -18,7 +18,6 @@ from fpirhc.symbolic.layout import Expression
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
 
 _BEYOND = 1.01, 1e-3  # factor and amount by which the default pole exceeds the bound: at the bound nothing is damped
-_LARGEST_PRODUCT = 1.99  # below the limit of 2, so that a pole exists
 
 
 def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: float | None) -> float:
@@ -26,7 +25,7 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
     if pole is not None:
         return pole
     error = default_uncertainty(max(every(cycles))) if uncertainty is None else uncertainty
-    return default_pole(ca.fmin(ca.fmax(abs(gain), 1.0), _LARGEST_PRODUCT), error)
+    return default_pole(ca.fmax(abs(gain), 1.0), error)
 
 
 def leaked(pole: float, before: Expression, deformation: Expression) -> Expression:
@@ -67,11 +66,9 @@ def check_whole(owner: str, cycles: Cycles, name: str) -> None:
 
 
 def check_uncertainty(owner: str, uncertainty: int, cycles: Cycles) -> None:
-    """Raise InvalidValue for an uncertainty that is no whole number or exceeds the shortest dead time, rounded up."""
+    """Raise InvalidValue for an uncertainty that exceeds the shortest dead time, rounded up."""
     shortest = min(every(cycles))
-    if not (
-        isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and 0 <= uncertainty <= math.ceil(shortest)
-    ):
+    if not 0 <= uncertainty <= math.ceil(shortest):
         raise InvalidValue(
             f"{owner}(uncertainty={uncertainty!r}): expected whole cycles from 0 to {math.ceil(shortest)}, the dead time of "
             f"{shortest:g} rounded up: a dead time cannot be too long by more than itself"

@@ -68,7 +68,7 @@ def one_rate(gains: Sequence[float]) -> float | None:
     """Return Lambda where the law of these gains is (d/dt + Lambda)^m z = 0; None where its modes differ."""
     rate = gains[-1] / len(gains)
     modes = [math.comb(len(gains), s) * rate ** (len(gains) - s) for s in range(len(gains))]
-    return rate if np.allclose(gains, modes, rtol=1e-9) else None
+    return rate if np.allclose(gains, modes) else None
 
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor

@@ -68,13 +68,13 @@ class Fractional(IntegralLaw):
             InvalidValue: more than 20 000.
         """
         memory = _REACH / self.rate if self.memory is None else self.memory
-        cycles = math.ceil(memory / period - 1e-9)
+        cycles = math.ceil((1 - 1e-9) * memory / period)
         if cycles > MOST:
             raise InvalidValue(
                 f"Fractional: a memory of {memory:g} is {cycles} control cycles of {period:g}, more than {MOST}; "
                 f"give memory={MOST * period:g} or less"
             )
-        return max(cycles, 1)
+        return cycles
 
     def weights(self, cycles: int) -> np.ndarray:
         """Weights w_1 ... w_L of the past, shape (cycles,)."""

@@ -24,7 +24,7 @@ from fpirhc.symbolic.expression import Signals, power, total
 from fpirhc.symbolic.layout import Expression
 from fpirhc.tracking.base import IntegralLaw, Useful, error_chains, law_signals, own_errors
 
-_REAL = 1e-9  # share of an imaginary part that is rounding
+_SAME = 1e-9  # share of a cycle that is rounding
 
 
 class LinearLaw(IntegralLaw):
@@ -158,8 +158,7 @@ class ShiftPolynomial(LinearLaw):
             raise InvalidValue(
                 f"ShiftPolynomial(poles={self.poles!r}): {wrong}; 0 is deadbeat, and a slow mode is below 1"
             )
-        coefficients = np.poly(every)
-        if np.abs(np.imag(coefficients)).max() > _REAL:
+        if np.iscomplexobj(np.poly(every)):
             raise InvalidValue(
                 f"ShiftPolynomial(poles={self.poles!r}): give a complex pole together with its conjugate"
             )
@@ -188,7 +187,7 @@ class ShiftPolynomial(LinearLaw):
         Raises:
             InvalidValue: with the cycle.
         """
-        if abs(self.step - period) > _REAL * period:
+        if abs(self.step - period) > _SAME * period:
             raise InvalidValue(
                 f"ShiftPolynomial(step={self.step:g}): the control cycle is {period:g} {plant.time_unit}, and poles in z belong to "
                 f"one cycle; write step={period:g}, with the poles of that cycle"

@@ -79,6 +79,11 @@ def unknown_rms(true: int, deformation: Deformation, predicted: float = 0.025) -
 COVERING = fp.Increment.within(FASTEST, 50)
 
 
+def test_within_is_in_the_middle():
+    """Of all dead times up to the longest one, by half of it wrong either way."""
+    assert fp.Increment.within(FASTEST, 7) == fp.Increment(FASTEST, cycles=3.5, uncertainty=4)
+
+
 @pytest.mark.parametrize("true", [2, 20, 48])
 def test_delayed_mass_with_an_unknown_dead_time(true):
     """Predicted over half of the longest dead time the error is 6.1 to 6.3 mm wherever it is; at most 7.6 are allowed."""

@@ -106,6 +106,13 @@ def test_sigmoid(gain, shift):
     assert one.with_effective_gain(0.25).effective_gain() == pytest.approx(0.25)
 
 
+@pytest.mark.parametrize("shift", [-5.1, 5.1])
+def test_a_shift_beyond_which_nothing_moves_is_refused(shift):
+    assert fp.Sigmoid(gain=-1.0, shift=math.copysign(5.0, shift)).slope < 2e-4
+    with pytest.raises(InvalidValue, match="from -5 to 5"):
+        fp.Sigmoid(gain=-1.0, shift=shift)
+
+
 @pytest.mark.parametrize("fraction", [0.4, 1.0, -0.7])
 @pytest.mark.parametrize("scale", [1.0, 20.0])
 def test_rotation(fraction, scale):

@@ -1,5 +1,6 @@
 """A gain matrix: what it does to coupled responses, what is refused, and that every part of a review knows it."""
 
+import math
 from dataclasses import replace
 
 import casadi as ca
@@ -75,7 +76,7 @@ def test_a_gain_that_converges_with_its_weights_alone_is_not_refused():
         fp.simulate(problem, replace(controller, deformation=large), seed=0, compiled=False)
 
 
-@pytest.mark.parametrize("weights", [(), (1.0, 0.0), ((1.0, 2.0), (2.0, 4.0)), ((1.0, 2.0),)])
+@pytest.mark.parametrize("weights", [(), (1.0, 0.0), (math.inf, 1.0), ((1.0, 2.0), (2.0, 4.0)), ((1.0, 2.0),)])
 def test_weights_that_are_no_regular_matrix_are_refused(weights):
     with pytest.raises(InvalidValue, match="expected a tuple with a finite number other than zero"):
         fp.Affine(gain=-0.5, weights=weights)

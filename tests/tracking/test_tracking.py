@@ -135,17 +135,18 @@ def test_an_error_counts_within_ten_times_of_what_limits_allow(law, first, secon
     assert 0 < counts.mean() < 1
 
 
-def test_the_law_of_fractional_order_is_its_recursion_by_hand():
-    """Order 1, S = rate e_int + e; an S with rate |S| > 10 L is not remembered, and the last one stands for it."""
+@pytest.mark.parametrize("start", [-0.2, -0.3])
+def test_the_law_of_fractional_order_is_its_recursion_by_hand(start):
+    """Order 1, S = rate e_int + e; an S with rate |S| > 10 L is not remembered: the last one stands for it, at first zero."""
     rate, beta, period = 2.0, 0.8, 0.01
     law, push = fp.Fractional(rate, beta, memory=0.5, largest=LARGEST), fp.Step(at=1.0, size=0.8)
-    result = run(problem(period=period, start={"y": -0.2}, disturbances={"u": push}), law)
+    result = run(problem(period=period, start={"y": start}, disturbances={"u": push}), law)
     past, stiffness, integral = np.zeros(law.cycles(period)), (rate * period) ** beta, 0.0
     weights, first, last = law.weights(len(past)), 0.0, 0.0
     for k, error in enumerate(result["error.y"]):
         surface = rate * integral + error
         surface = last if abs(rate * surface) > 0.5 else surface
-        first = first or surface
+        first = first if k else surface
         past, last = np.append(surface - first, past[:-1]), surface
         ahead = -(weights @ past + stiffness * first) / (1 + stiffness)
         expected = rate * error - (ahead - (surface - first)) / period
@@ -166,6 +167,7 @@ def test_memory_is_static_and_bounded():
     assert law.cycles(1e-3) == 5000
     assert memory["decay_past"].size == 5000
     assert fp.Fractional(rate=1.0, order=0.8).cycles(1e-3) == 20_000
+    assert fp.Fractional(rate=1.0, order=0.8, memory=1.1).cycles(0.1) == 11  # 11.000000000000002 in floating point
     with pytest.raises(InvalidValue, match="give memory=10 or less"):
         fp.Fractional(rate=1.0, order=0.8).cycles(5e-4)
 
