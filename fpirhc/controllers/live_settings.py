@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -19,13 +19,13 @@ import numpy as np
 from fpirhc.controllers.built import Built, build, checked
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
-from fpirhc.fields.checked import expects_whole_number
 from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.open import ANEW, Opened, not_live
-from fpirhc.symbolic.paths import changed_at, content_at, entry, levels, mapped, meant, names_in, paths_to
+from fpirhc.symbolic.paths import changed_at, content_at, entry, levels, meant, names_in, paths_to
+from fpirhc.task.cases import is_whole
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -105,32 +105,27 @@ class LiveSettings:
         problem, controller = self._with({p: v for p, v in values.items() if v != self.start[p]})
         return problem, checked(problem, controller, numbers_only=True), values
 
-    def bounds(self, path: str, reach: float = math.inf) -> Interval:
+    def bounds(self, path: str) -> Interval:
         """Return the interval around the number of the build in which a setting is accepted while the others stay.
 
-        An end is the last number that was accepted of a bisection, to a millionth; infinite: every larger one is accepted. A limit
-        of an input is a fact of the machine: it ends at that of the build.
-
-        Args:
-            path: of the setting.
-            reach: sizes of its number beyond which no end is sought; an end farther away is infinite.
+        An end is the last number that a bisection accepts, to a millionth, or infinite. A limit of an input, a fact of the machine,
+        ends at that of the build.
         """
-        value, of_machine = self._content(path), path[-2:] if path.startswith("limits.inputs.") else ""
-        size, finite = max(abs(value), _SMALLEST), [reach] if math.isfinite(reach) else []
-        reaches = [*(r for r in _REACHES if r < reach), *finite]
-        lower, upper = (
-            value if of_machine == end else self._farthest(path, value, [side * size * r for r in reaches])
-            for end, side in ((".0", -1), (".1", 1))
-        )
-        return lower, upper
+        of_machine = path[-2:] if path.startswith("limits.inputs.") else ""
+        ends = (("." + "01"[side > 0], side) for side in (-1, 1))
+        low, high = (self._content(path) if end == of_machine else self._end(path, side) for end, side in ends)
+        return low, high
 
-    def _farthest(self, path: str, value: float, moves: Sequence[float]) -> float:
-        """The last accepted number, found by longer and longer moves from a value; infinite where none is refused."""
-        refused = next((k for k, move in enumerate(moves) if not self._accepts(path, value + move)), None)
-        if refused is None:
-            return math.copysign(math.inf, moves[0])
-        inside, outside = value + moves[refused - 1] if refused else value, value + moves[refused]
-        while abs(outside - inside) > _CLOSE * max(abs(inside), abs(moves[0])):
+    def _end(self, path: str, side: int) -> float:
+        value = self._content(path)
+        step, outside = side * max(abs(value), _SMALLEST), value
+        for far in _REACHES:
+            inside, outside = outside, value + step * far
+            if not self._accepts(path, outside):
+                break
+        else:
+            return side * math.inf
+        while abs(outside - inside) > _CLOSE * max(abs(inside), abs(step)):
             middle = (inside + outside) / 2
             inside, outside = (middle, outside) if self._accepts(path, middle) else (inside, middle)
         return inside
@@ -191,8 +186,8 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
     content = content_at(owner, path, "the problem" if owner is problem else "the controller")
     interval = isinstance(content, tuple) and len(content) == 2 and owner is problem
     ends = [f"{path}.{k}" for k in (0, 1) if math.isfinite(content[k])] if interval else [path]  # type: ignore[index]
-    if isinstance(content, bool) or (isinstance(content, int | float) and _is_structure(owner, path)):
-        what = f"{content!r} decides what the loop is made of, as whole numbers, switches and lengths of queues do"
+    if isinstance(content, bool) or (isinstance(content, int | float) and is_whole(owner, path)):
+        what = f"{content!r} decides what the loop is made of, as whole numbers and switches do"
         raise not_live([path], f"{what}; {ANEW}")
     if not interval and not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
@@ -203,17 +198,6 @@ def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
             f"setting '{path}' is {content!r}: there is no limit that could change; give it a finite number"
         )
     return ends
-
-
-def _is_structure(owner: object, path: str) -> bool:
-    value = owner
-    for name in path.split("."):
-        value = mapped(value, name)
-        own = [f for f in fields(value) if f.name == name] if is_dataclass(value) else []
-        if own and (own[0].metadata.get("structure") or expects_whole_number(type(value), name)):
-            return True
-        value = entry(value, name)
-    return False
 
 
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:

@@ -9,7 +9,7 @@ sends the command of the one whose turn it is.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -55,7 +55,7 @@ class Slotted(Controller):
     """
 
     slots: Mapping[str, Controller]
-    durations: Mapping[str, Positive] = field(metadata={"structure": True})
+    durations: Mapping[str, Positive]
     blend: NotNegative
 
     @property

@@ -37,11 +37,9 @@ class ModelReferenced(Wrapper):
         InvalidValue: a dead time, lag, uncertainty or pole out of range, or parts of a cycle.
     """
 
-    cycles: Cycles | None = field(default=None, metadata={"of_problem": True, "structure": True})
-    measurement: float = field(default=0.0, metadata={"structure": True})  # whether a twin runs, and in which cycle
-    lag: NotNegative | tuple[NotNegative, ...] | None = field(
-        default=None, metadata={"of_problem": True, "structure": True}
-    )
+    cycles: Cycles | None = field(default=None, metadata={"of_problem": True})
+    measurement: float = 0.0  # whether a twin runs, and in which cycle
+    lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"of_problem": True})
     uncertainty: int | None = None
     pole: BelowOne | None = None
 

@@ -47,7 +47,7 @@ class Sensor(Checked):
     noise: Disturbance | None = None
     quantum: Positive | None = None
     dropout: BelowOne = 0.0
-    range: tuple[float, float] | None = field(default=None, metadata={"setting": "where given", "structure": True})
+    range: tuple[float, float] | None = field(default=None, metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
         if self.range is not None and not self.range[0] < self.range[1]:

@@ -26,7 +26,6 @@ from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.open import nominal
 from fpirhc.task.exogenous import check_signals, not_held
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import pairs
@@ -257,7 +256,7 @@ def needed_names(
 
 def _check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
     """Add every mistake in the cost's names and weights, and in the user's functions of a stage; problems share what they share."""
-    mistakes.join(_STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, nominal(cost), nominal(limits))))
+    mistakes.join(_STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, cost, limits)))
 
 
 _STAGES: Latest[Mistakes] = Latest(8)

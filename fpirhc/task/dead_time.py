@@ -34,8 +34,8 @@ class DeadTime(Checked):
         measurement: dead time of the state and the response. At first the queue holds the start.
     """
 
-    inputs: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"structure": True})
-    measurement: NotNegative = field(default=0.0, metadata={"structure": True})
+    inputs: Mapping[str, NotNegative] = field(default_factory=dict)
+    measurement: NotNegative = 0.0
 
     @property
     def longest(self) -> float:

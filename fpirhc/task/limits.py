@@ -94,9 +94,6 @@ class Limits(Checked):
         Raises:
             InvalidProblem: all mistakes together.
         """
-        nominal(self)._check(plant)
-
-    def _check(self, plant: Plant) -> None:
         mistakes = Mistakes("limits")
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("state", self.states, plant.state.elements)

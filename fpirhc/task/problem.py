@@ -23,6 +23,7 @@ from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.layout import Signal
+from fpirhc.symbolic.open import nominal
 from fpirhc.task.checks import check_problem, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
 from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
@@ -94,7 +95,7 @@ class Problem(Checked):
             object.__setattr__(self, name, value)
         mistakes.raise_if_any()
         object.__setattr__(self, "dead_time", self.dead_time.over(self.period))
-        check_problem(self)
+        check_problem(nominal(self))
 
     def __repr__(self) -> str:
         return line(self, *problem_facts(self))

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NoReturn
 
@@ -138,7 +138,7 @@ class Setpoint(Reference):
     """
 
     values: Mapping[str, Steps]
-    rate: Positive = field(metadata={"structure": True})
+    rate: Positive
     order: Count | None = None
 
     def __post_init__(self) -> None:

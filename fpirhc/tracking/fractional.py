@@ -50,9 +50,9 @@ class Fractional(IntegralLaw):
         InvalidValue: a rate, order or memory outside its range; when the loop is built, a memory of more than 20 000 cycles.
     """
 
-    rate: Positive = field(metadata={"structure": True})
-    order: Annotated[float, _ORDERS] = field(metadata={"structure": True})
-    memory: float | None = field(default=None, metadata={"structure": True})
+    rate: Positive
+    order: Annotated[float, _ORDERS]
+    memory: float | None = None
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
 
     def __post_init__(self) -> None:
@@ -67,7 +67,7 @@ class Fractional(IntegralLaw):
         Raises:
             InvalidValue: more than 20 000.
         """
-        memory = _REACH / self.rate if self.memory is None else self.memory
+        memory = float(_REACH / self.rate if self.memory is None else self.memory)
         cycles = math.ceil((1 - 1e-9) * memory / period)
         if cycles > MOST:
             raise InvalidValue(
@@ -78,7 +78,7 @@ class Fractional(IntegralLaw):
 
     def weights(self, cycles: int) -> np.ndarray:
         """Weights w_1 ... w_L of the past, shape (cycles,)."""
-        return np.cumprod(1 - (self.order + 1) / np.arange(1, cycles + 1))
+        return np.cumprod(1 - (float(self.order) + 1) / np.arange(1, cycles + 1))
 
     def _gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, e', ...) in S below its highest derivative, for relative order n."""
@@ -120,7 +120,7 @@ class Fractional(IntegralLaw):
 
     def _row(self, cycles: int, period: float) -> np.ndarray:
         """The weights of the past, and (Lambda T)^beta."""
-        return np.append(self.weights(cycles), (self.rate * period) ** self.order)
+        return np.append(self.weights(cycles), float((self.rate * period) ** self.order))
 
     def _useful(self, plant: Plant) -> list[Useful]:
         if not self.largest:

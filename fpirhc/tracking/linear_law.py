@@ -145,7 +145,7 @@ class ShiftPolynomial(LinearLaw):
     """
 
     poles: float | Sequence[float | complex]
-    step: Duration = field(metadata={"structure": True})
+    step: Duration
     integral: bool = True
     bumpless: bool = True
     largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})

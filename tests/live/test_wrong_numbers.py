@@ -143,7 +143,7 @@ LIVE = [
     ("RHC+FPI", "optimiser.iterations", NotSupported, "what the loop is made of"),
     ("RHC+FPI", "deformation", InvalidValue, "go on with one of"),
     ("CTC", "cost.states.q1", NotSupported, "does not use it"),
-    ("CTC", "reference.rate", NotSupported, "what the loop is made of"),
+    ("CTC", "reference.rate", NotSupported, "needs its number while the loop is built"),
 ]
 
 

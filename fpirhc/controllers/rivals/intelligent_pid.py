@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -41,7 +41,7 @@ class IntelligentPID(Undeformed):
 
     tracking: Tracking
     alpha: Mapping[str, float]
-    window: Few = field(metadata={"structure": True})
+    window: Few
 
     def check(self, problem: Problem) -> None:
         """Raise if the numbers do not fit the plant.

@@ -5,7 +5,7 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import casadi as ca
@@ -19,7 +19,6 @@ from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.symbolic.open import expressed
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -38,7 +37,7 @@ class RepetitiveControl(PairedAtOnce):
     """
 
     tracking: Tracking
-    repeats: Duration = field(metadata={"structure": True})
+    repeats: Duration
     gain: Positive = 0.5
     smoothing: Annotated[float, Range("a number from 0 to 0.25", lambda v: 0 <= v <= 0.25)] = 0.0
 
@@ -74,13 +73,12 @@ class RepetitiveControl(PairedAtOnce):
 
         def step(s: Signals) -> dict[str, Expression]:
             running = s.warm_up > warm_up_cycles - 0.5
-            gain, smoothing = (expressed(number, s.realised) for number in (self.gain, self.smoothing))
-            lesson = s._deformed_last - s._desired_last - gain * (s.realised - s._desired_last)
+            lesson = s._deformed_last - s._desired_last - self.gain * (s.realised - s._desired_last)
             # The newest lesson is that of the request of the last cycle; the one for the request of now is N - 1 lessons older.
             newest = ca.if_else(ca.logic_and(running, is_finite(lesson)), lesson, s.lessons[size : 2 * size])
             queue = ca.vertcat(s.lessons[size:], newest)
             before, same, after = (queue[size * k : size * (k + 1)] for k in (0, 1, 2))
-            learned = smoothing * (before + after) + (1 - 2 * smoothing) * same
+            learned = self.smoothing * (before + after) + (1 - 2 * self.smoothing) * same
             return {"_deformed_unclipped": s.desired + learned, "_deformation": learned, "lessons_next": queue}
 
         names = ("desired", "realised", "_deformed_last", "_desired_last")

@@ -114,9 +114,9 @@ class Cascade(Controller):
 
     controller: Controller
     deformation: Deformation
-    lag: NotNegative | tuple[NotNegative, ...] | None = field(metadata={"structure": True})
-    dead_time: NotNegative | None = field(default=None, metadata={"structure": True})
-    plain: bool = field(default=False, metadata={"setting": "where given", "structure": True})
+    lag: NotNegative | tuple[NotNegative, ...] | None
+    dead_time: NotNegative | None = None
+    plain: bool = field(default=False, metadata={"setting": "where given"})
 
     deforms = "target"
 

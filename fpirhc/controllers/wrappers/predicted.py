@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import casadi as ca
@@ -57,8 +57,8 @@ class Predicted(ControllerWrapper):
 
     once: ClassVar[bool] = True
 
-    inputs: NotNegative = field(metadata={"structure": True})
-    measurement: NotNegative = field(default=0.0, metadata={"structure": True})
+    inputs: NotNegative
+    measurement: NotNegative = 0.0
     by: Literal["model", "desired"] = "model"
     residual_time: Positive | None = None
 

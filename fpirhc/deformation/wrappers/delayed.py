@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
@@ -32,7 +32,7 @@ class _Queued(Wrapper):
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
     """
 
-    cycles: Cycles = field(metadata={"structure": True})
+    cycles: Cycles
 
     def __post_init__(self) -> None:
         check_cycles(type(self).__name__, self.cycles)

@@ -166,7 +166,7 @@ def _sliders(problem: Problem, loops: list[LabLoop]) -> list[dict[str, Any]]:
         places = [[own.index(f"settings.{path}")] if f"settings.{path}" in own else [] for own in columns]
         live = next(loop.ready.live for loop in loops if path in loop.ready.live.paths)
         value = live.start[path]
-        ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *live.bounds(path, 2 * _SPAN)).tolist()
+        ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *live.bounds(path)).tolist()
         found.append((path, unit_of_setting(path, problem), value, *ends, places))
     for name, parameter in problem.plant.parameters.items():
         for side, value in (("exact", parameter.exact), ("approximate", parameter.approximate)):
