@@ -63,12 +63,13 @@ def _digest(values: np.ndarray) -> str:
 
 
 def compared(before: Loops, now: Loops) -> Iterator[str]:
-    """Yield a sentence for every loop that is gone, or has lost or changed a signal. New signals are no difference."""
+    """Yield a sentence for every loop that is gone, or has changed a signal. Signals that no loop has any more are none."""
+    logged = {name for signals in now.values() for name in signals}
     for loop, signals in before.items():
         if loop not in now:
             yield f"{loop}: not there any more"
             continue
-        changed = [name for name, digest in signals.items() if now[loop].get(name) != digest]
+        changed = [name for name, digest in signals.items() if name in logged and now[loop].get(name) != digest]
         if changed:
             yield f"{loop}: {', '.join(changed)}"
 

@@ -20,7 +20,6 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.judging import with_judgements
 from fpirhc.simulation.loop import close_loop, plans_exactly, start_memory
 from fpirhc.simulation.path import Exchange, moving
 from fpirhc.simulation.ranges import Dropped
@@ -127,7 +126,7 @@ class Simulator:
 
         Args:
             seed: of the noise of disturbances and sensors.
-            name: of the controller in the results; '': the name of its class.
+            name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
             variant: the simulator's problem with other exact parameters or another duration; None: the problem itself. A loop is
                 built for it where plans with the exact model have a fixed number of iterations.
             disturbed: whether disturbances act; the sensors' noise always does.
@@ -152,9 +151,10 @@ class Simulator:
         logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress, force.patches)
         layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)
-        model = controller.plant_model(problem)
+        model, gain = controller.plant_model(problem), float(controller.deformation.effective_gain())
         facts: dict[str, object] = {
-            "effective_gain": float(controller.deformation.effective_gain()),
+            "effective_gain": gain,
+            "iterates": gain != 0 and controller.deforms in ("response", "command"),
             "parameters": [float(v) for v in model.parameters(model.plant)],
             "controller": _DESCRIBED.of((controller,), (), lambda: describe(controller)),
             "problem": describe(problem),
@@ -170,7 +170,7 @@ class Simulator:
             facts["setpoints"] = points
         if problem.reality is not None:
             facts["model is reality"] = model.plant is not problem.plant
-        title = name or type(own.controller).__name__
+        title = name or name_in_task(own.controller)
         return Run(problem.name, title, seed, problem.period, layout, log, stop, own.compiled, facts)
 
 
@@ -264,7 +264,7 @@ def simulate(
     changes: Changes | None = None,
     setpoints: Setpoints | None = None,
 ) -> Run:
-    """Run the closed loop of problem and controller and return every signal, also those that judge the run.
+    """Run the closed loop of problem and controller and return every signal.
 
     A signal that becomes NaN or infinite, a state that leaves its physical range, or an error of more than a million times the
     reference ends the run there. The run keeps the cycles before it, and `Run.stop` is the reason.
@@ -282,34 +282,7 @@ def simulate(
     """
     live = tuple(dict.fromkeys(path for numbers in (settings or {}, *(changes or {}).values()) for path in numbers))
     ready = simulator(problem, controller, compiled=compiled, live=live)
-    return judged_run(
-        ready, seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints
-    )
-
-
-def judged_run(
-    ready: Simulator,
-    *,
-    seed: int,
-    name: str = "",
-    progress: Progress | None = None,
-    settings: Numbers | None = None,
-    changes: Changes | None = None,
-    setpoints: Setpoints | None = None,
-) -> Run:
-    """Run a loop that is ready and return every signal, also those that judge the run; see `simulate`.
-
-    Args:
-        name: of the controller in the results; '': its label, or the name of its class.
-        progress: called with (cycles done, cycles in all).
-        settings: numbers of live settings by path; the others have the numbers of the build.
-    """
-    title = name or name_in_task(ready.controller)
-    run = ready.run(seed=seed, name=title, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
-    problem, controller = ready.problem, ready.controller
-    if settings:
-        problem, controller, _ = ready.live.changed(settings)
-    return with_judgements(run, problem, controller)
+    return ready.run(seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
 
 
 def run_cycles(

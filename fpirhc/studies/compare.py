@@ -23,12 +23,12 @@ from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
-from fpirhc.simulation.metrics.entries.contraction import sampled_spectrum
+from fpirhc.simulation.metrics.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.pictures.base import Picture
 from fpirhc.simulation.ranges import Followed, limits_left
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import ComposedLoop, Simulator, judged_run
+from fpirhc.simulation.simulate import ComposedLoop, Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.tables import Changes
@@ -263,7 +263,7 @@ class _Rows:
         """Run a controller; a part that breaks is told, and loses no run."""
         problem, broken = self._task.problem, list[str]()
         part, loop = partial(attempted, broken=broken), self._loop(name)
-        run = judged_run(loop, seed=self._seed, name=name, progress=progress, changes=changes)
+        run = loop.run(seed=self._seed, name=name, progress=progress, changes=changes)
         ready, metrics = loop.controller, measure(problem, run, self._task.metrics)
         pair = pair_of(self._controllers, name) if ready.deformation.adapts else None
         pair = pair if pair in self.composed else None

@@ -9,7 +9,6 @@ from typing import Any
 
 from fpirhc.errors import InvalidName, InvalidValue, derivative_of, nearest
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.judging import JUDGING
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric
 from fpirhc.summary import in_percent
 from fpirhc.task.problem import Problem
@@ -36,10 +35,9 @@ class Objective:
         """-1 where larger is better: a number times it is better when it is smaller."""
         return -1 if self.metric is not None and self.metric.better == "larger" else 1
 
-    @property
-    def judged(self) -> bool:
-        """Whether it is of the signals that judge a run, which a study computes where somebody asks for them."""
-        return self.metric is not None and bool({*JUDGING} & {*self.metric.reads})
+    def needed(self, metrics: Sequence[Metric]) -> list[Metric]:
+        """Return the metrics that a study measures in every run."""
+        return [one for one in metrics if one.always or one is self.metric]
 
     def text(self, value: float) -> str:
         """Return a number of a run as text."""

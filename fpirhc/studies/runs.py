@@ -24,7 +24,6 @@ from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
-from fpirhc.simulation.judging import with_judgements
 from fpirhc.simulation.metrics.base import Metric, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator
@@ -44,16 +43,11 @@ Row = dict[str, Any]
 
 
 class Runner:
-    """Runs one controller in variants; a loop is built once for all that it serves.
+    """Runs one controller in variants; a loop is built once for all that it serves."""
 
-    `judged`: whether runs have the signals that judge them, which take longer than the run.
-    """
-
-    def __init__(
-        self, task: Task, name: str, metrics: Sequence[Metric], *, compiled: bool | None, judged: bool = False
-    ) -> None:
+    def __init__(self, task: Task, name: str, metrics: Sequence[Metric], *, compiled: bool | None) -> None:
         self._task, self._name, self._controller = task, name, task.controllers[name]
-        self._metrics, self._compiled, self._judged = metrics, compiled, judged
+        self._metrics, self._compiled = metrics, compiled
         self._loops: dict[object, Simulator | FpirhcError] = {}
         self._codes: dict[object, Compiled] = {}
         self._ranges, self._held = ranges(task.problem)
@@ -75,11 +69,7 @@ class Runner:
         row: Row = {"controller": self._name, "variant": one.name, "group": one.group, "seed": one.seed, **one.numbers}
         try:
             loop, live = self._loop(one, own)
-            settings = own if live else {}
-            run = loop.run(seed=one.seed, variant=one.problem, settings=settings or None)
-            if self._judged:
-                force = loop.in_force(one.problem, settings)
-                run = with_judgements(run, force.problem, force.controller)
+            run = loop.run(seed=one.seed, variant=one.problem, settings=own if live and own else None)
         except FpirhcError as error:
             return row | {"outcome": "refused", "error": math.nan, "lasted": 0.0, "why": str(error)}
         return row | self._numbers(one, run)
@@ -152,7 +142,6 @@ def run_variants(
     metrics: Sequence[Metric] | None = None,
     processes: int | None = None,
     compiled: bool | None = True,
-    judged: bool = False,
     keep: Path | None = None,
     progress: Progress | None = None,
 ) -> pd.DataFrame:
@@ -164,11 +153,10 @@ def run_variants(
 
     Args:
         controllers: names; None: all.
-        metrics: None: those of the task.
+        metrics: None: those of the task that every run of a study has.
         processes: number of processes, one for a machine; None: what a `joblib.parallel_config` around the call says, else 1.
             With `joblib.parallel_config(backend="dask")` and a Dask client the runs go to its cluster.
         compiled: whether loops are compiled; those that run once are so where the run is long.
-        judged: whether runs have the signals that judge them.
         keep: file of JSON lines; rows that it holds are not run again, and new ones are added as they come.
         progress: called with (controller, done, in all).
 
@@ -179,16 +167,16 @@ def run_variants(
         WorkerDied: a process was killed.
     """
     chosen = replace(task, controllers=select(task, controllers))
-    metrics = task.metrics if metrics is None else metrics
+    metrics = [one for one in task.metrics if one.always] if metrics is None else metrics
     every = variants.of(chosen)
     if task.problem.foreign is not None and task.problem.foreign.rest is not None:
         processes = 1  # a machine would have two loops that command it
-    with Kept(keep, header_of(chosen, {**variants.same, "judged": judged}, metrics)) as kept:
+    with Kept(keep, header_of(chosen, variants.same, metrics)) as kept:
         titles = {one: k for k, one in enumerate(one.name for one in every)}
         rows = {(r["controller"], r["variant"]): r for r in kept.rows}
         counts = {n: sum((n, title) in rows for title in titles) for n in chosen.controllers}
         jobs = _jobs(rows, titles, chosen.controllers, joblib.effective_n_jobs(processes))
-        for row in _answers(task, variants, jobs, processes, (metrics, compiled, judged), every):
+        for row in _answers(task, variants, jobs, processes, (metrics, compiled), every):
             kept.append(row)
             name = row["controller"]
             rows[name, row["variant"]], counts[name] = row, counts[name] + 1
@@ -216,19 +204,19 @@ def _answers(
     variants: Variants,
     jobs: Sequence[tuple[str, tuple[int, ...]]],
     processes: int | None,
-    how: tuple[Sequence[Metric], bool | None, bool],
+    how: tuple[Sequence[Metric], bool | None],
     every: Sequence[Variant],
 ) -> Iterator[Row]:
-    metrics, compiled, judged = how
+    metrics, compiled = how
     if joblib.effective_n_jobs(processes) == 1 or sum(len(some) for _, some in jobs) <= FEW:
         for name, group in _by_name(jobs).items():
-            runner = Runner(task, name, metrics, compiled=compiled, judged=judged)
+            runner = Runner(task, name, metrics, compiled=compiled)
             yield from runner.rows(every[k] for k in group)
         return
-    path, told = str(task.path.resolve()), _told(task, metrics)
+    path, told, names = str(task.path.resolve()), _told(task), tuple(one.name for one in metrics)
     _require_same(load_problem(path), told)
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered", batch_size=1)
-    answers = work(joblib.delayed(_remote)(path, told, variants, n, some, compiled, judged) for n, some in jobs)
+    answers = work(joblib.delayed(_remote)(path, told, variants, n, some, compiled, names) for n, some in jobs)
     try:
         for rows in answers:
             yield from rows
@@ -256,12 +244,12 @@ def _deaths() -> tuple[type[BaseException], ...]:
     return (BrokenProcessPool, *known)
 
 
-def _told(task: Task, metrics: Sequence[Metric]) -> str:
-    return digest(task.problem, task.controllers, [m.name for m in metrics])
+def _told(task: Task) -> str:
+    return digest(task.problem, task.controllers, [m.name for m in task.metrics])
 
 
 def _require_same(task: Task, told: str) -> None:
-    if _told(task, task.metrics) != told:
+    if _told(task) != told:
         raise InvalidProblem(
             f"problem '{task.name}' is not that of '{task.path}', which other processes load; write the changes into the file, or "
             "use one process"
@@ -272,19 +260,26 @@ _OWN = threading.local()  # a worker of Dask has threads, and a loop serves one
 
 
 def _remote(
-    path: str, told: str, variants: Variants, name: str, some: Sequence[int], compiled: bool | None, judged: bool
+    path: str,
+    told: str,
+    variants: Variants,
+    name: str,
+    some: Sequence[int],
+    compiled: bool | None,
+    names: tuple[str, ...],
 ) -> list[Row]:
     """The rows of some variants, in a process that keeps the loops of one study."""
     with contextlib.suppress(ValueError):  # a thread
         # Ctrl-C of a terminal reaches every process, and the first one ends the others.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    study = told, repr(variants), compiled, judged
+    study = told, repr(variants), compiled, names
     if getattr(_OWN, "study", None) != study:
         task = load_problem(path)
         _require_same(task, told)
         _OWN.study, _OWN.task, _OWN.every, _OWN.runners = study, task, variants.of(task), {}
     if name not in _OWN.runners:
-        _OWN.runners[name] = Runner(_OWN.task, name, _OWN.task.metrics, compiled=compiled, judged=judged)
+        metrics = [one for one in _OWN.task.metrics if one.name in names]
+        _OWN.runners[name] = Runner(_OWN.task, name, metrics, compiled=compiled)
     return list(_OWN.runners[name].rows([_OWN.every[k] for k in some]))
 
 

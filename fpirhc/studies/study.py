@@ -117,8 +117,9 @@ def study(
     begin, chosen = time.perf_counter(), select(task, controllers or [*dict.fromkeys([*first, *task.controllers])])
     check_gains(task, chosen)
     aim = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
-    how: dict[str, Any] = {"processes": processes, "compiled": compiled, "judged": aim.judged, "progress": progress}
-    table = run_variants(task, variants, controllers=list(chosen), keep=folder and folder / "runs.jsonl", **how)
+    how: dict[str, Any] = {"processes": processes, "compiled": compiled, "progress": progress}
+    own, keep = aim.needed(task.metrics), folder and folder / "runs.jsonl"
+    table = run_variants(task, variants, controllers=list(chosen), metrics=own, keep=keep, **how)
     named = table.loc[table.group != ""]
     groups = {str(g): summarised(some, aim) for g, some in named.groupby("group", sort=False)}
     facts = circumstances(task, chosen, command, begin)

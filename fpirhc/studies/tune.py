@@ -104,7 +104,7 @@ def tune(
     folder.mkdir(parents=True, exist_ok=True)
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "trials.log")))
     for name, controller in chosen.items():
-        runner = Runner(task, name, metrics, compiled=compiled, judged=aim.judged)
+        runner = Runner(task, name, metrics, compiled=compiled)
         search = _Search(controller, task.tuning[name], runner, every, aim)
         what = digest(task.problem, controller, task.tuning[name]), f"{variants!r}", aim.column, seed
         study = optuna.create_study(storage=storage, study_name=f"{name} {what}", load_if_exists=True)

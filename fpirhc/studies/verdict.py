@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.motion import with_space
 from fpirhc.simulation.loop import HeldInput
-from fpirhc.simulation.metrics.entries.errors import rms_error
+from fpirhc.simulation.metrics.shipped import rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
 from fpirhc.studies.objective import Objective

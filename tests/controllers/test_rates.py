@@ -49,7 +49,7 @@ def test_no_command_moves_faster_than_its_limit(name):
     run, faster = (fp.simulate(p, CONTROLLERS[name], seed=0, compiled=False) for p in (PROBLEM, free))
     assert fastest(faster) > 1.5
     assert fastest(run) <= 1 + 1e-9
-    assert fp.measure(PROBLEM, run).at_limit > 0.01
+    assert fp.measure(PROBLEM, run)["at_limit"][""] > 0.01
 
 
 def test_a_rate_that_has_a_price_may_be_passed():

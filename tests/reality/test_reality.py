@@ -33,8 +33,7 @@ def test_reality_equal_to_the_model_changes_no_bit(controller, sensing):
     problem = task(**SENSING[sensing])
     one = run(problem, CONTROLLERS[controller])
     other = run(replace(problem, reality=fp.Reality(problem.plant)), CONTROLLERS[controller])
-    judged = {"contraction"}  # with a reality it is that of a whole cycle
-    for name in set(one.layout.names) - judged:
+    for name in one.layout.names:
         assert np.array_equal(one[name], other[name]), name
     assert set(other.layout.names) == {*one.layout.names, "reality_state"}
 
@@ -51,7 +50,7 @@ def test_an_output_in_place_of_a_coordinate_changes_no_signal():
     start = {"place": 0.1, "speed": 0.0, "F": 0.0}
     realities = fp.Reality(lagged(), start={"F": 0.0}), fp.Reality(states, start=start)
     one, other = (run(task(reality=r), CONTROLLERS["plain form"]) for r in realities)
-    for name in set(one.layout.names) - {"reality_state", "contraction"}:
+    for name in set(one.layout.names) - {"reality_state"}:
         np.testing.assert_allclose(other[name], one[name], rtol=1e-12, atol=1e-12, err_msg=name)
 
 
@@ -129,9 +128,10 @@ def test_disturbance_of_a_state_that_the_model_does_not_have():
 
 def test_contraction_is_that_of_a_whole_cycle():
     """Behind the lag a request has done b / b^ (1 - exp(-T / tau)) to the response by the end of its cycle."""
-    result = run(task(reality=fp.Reality(lagged(), start={"F": 0.0})), fp.ComputedTorque(TRACK, FPI))
+    problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}))
+    factor = fp.measure(problem, run(problem, fp.ComputedTorque(TRACK, FPI)))["contraction.predicted"][""]
     expected = 1 - FPI.effective_gain() * 2.0 * (1 - np.exp(-PERIOD / TAU))
-    assert np.allclose(result["contraction"], expected, atol=1e-6)
+    assert factor == pytest.approx(expected, abs=1e-6)
 
 
 def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
@@ -243,5 +243,5 @@ def test_the_belief_is_nobodys_state():
 
 def test_no_cost_of_states_that_do_not_exist():
     """A plan has the believed tissue; a run is judged by its error, and its cost is left out."""
-    assert "cost" not in run(other(duration=0.5), BLOOD).layout
-    assert "cost" in run(infusion(duration=0.5), BLOOD).layout
+    costs = [fp.measure(one, run(one, BLOOD))["cost"] for one in (other(duration=0.5), infusion(duration=0.5))]
+    assert [bool(one) for one in costs] == [False, True]

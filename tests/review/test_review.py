@@ -107,7 +107,7 @@ def test_limits_of_inputs_that_do_not_fit_are_told(limit, rate, verdict):
     limits = fp.Limits(inputs={"u": (-limit, limit)}, rates={"u": (-rate, rate)})
     problem = mass(plant=heavy(1.0, 1.5, (10.0, 6.0)), limits=limits)
     told, run = answers(problem)["input_limits"], fp.simulate(problem, torque(), seed=0, compiled=False)
-    shares = fp.measure(problem, run).at_limit, np.abs(run["command.u"]).max() / limit, 3.75 / limit
+    shares = fp.measure(problem, run)["at_limit"][""], np.abs(run["command.u"]).max() / limit, 3.75 / limit
     names = "at_a_limit", "share_of_the_limit", "needed"
     assert (told.verdict, *map(told.numbers.get, names)) == (verdict, *map(pytest.approx, shares))
 

@@ -125,7 +125,7 @@ def test_order_of_sensor_dead_time_and_controller():
     result = run(problem)
     assert np.array_equal(result["state.y"][3:], result["measured.y"][:-3])
     assert result["true_error.y"] == pytest.approx(result["reference.y"] - result["plant_state.y"])
-    assert fp.measure(problem, result).max_error["y"] == np.abs(result["true_error.y"]).max()
+    assert fp.measure(problem, result)["max_error"]["y"] == np.abs(result["true_error.y"]).max()
 
 
 # --- estimators ---

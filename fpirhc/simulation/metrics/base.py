@@ -1,6 +1,6 @@
 """The contract of metrics: one value holds a number's name, function, appearance and comparison.
 
-A run is measured by the metrics of the folder `entries`, of installed packages, and of a problem file.
+A run is measured by the metrics of this folder, of installed packages, and of a problem file.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Metric(Checked):
         floor: size of a difference up to which two numbers count as equal.
         step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
         order: place among the columns, smallest first; metrics of one place stand as they are listed.
-        reads: names of the signals that its function reads; with 'cost' or 'contraction' a study computes these of every run.
+        always: whether every run of a study has it; False: only where it is judged by, because it takes longer than the run.
 
     Raises:
         InvalidName: a name that cannot be a key.
@@ -87,7 +87,7 @@ class Metric(Checked):
     floor: float = 1e-12
     step: Callable[[float, int], float] = _no_step
     order: float = 100.0
-    reads: tuple[str, ...] = ()
+    always: bool = True
 
     def __post_init__(self) -> None:
         if not _NAME.fullmatch(self.name):
@@ -174,9 +174,7 @@ _TAKEN = frozenset({"compiled", "cycle_us", "notes", "optimality", "outcome", "p
 @cache
 def known_metrics() -> tuple[Metric, ...]:
     """Return the shipped metrics and those of installed packages, in the order of their columns."""
-    shipped = [
-        metric for module in within("fpirhc.simulation.metrics.entries") for metric in getattr(module, "METRICS", ())
-    ]
+    shipped = [metric for module in within("fpirhc.simulation.metrics") for metric in getattr(module, "METRICS", ())]
     installed = [metric for point in entry_points(group=GROUP) for metric in _several(point.load())]
     return _ordered([*shipped, *installed])
 
@@ -251,45 +249,9 @@ class Metrics(FoundByName):
         return self["rms_error"]
 
     @property
-    def max_error(self) -> Mapping[str, float]:
-        """Largest error by coordinate."""
-        return self["max_error"]
-
-    @property
-    def iae(self) -> Mapping[str, float]:
-        """Integral of |error| by coordinate."""
-        return self["iae"]
-
-    @property
-    def settling(self) -> Mapping[str, float]:
-        """Settling time by coordinate; NaN where the run did not settle."""
-        return self["settling"]
-
-    @property
-    def effort(self) -> Mapping[str, float]:
-        """Rms command by input."""
-        return self["effort"]
-
-    @property
     def total_variation(self) -> Mapping[str, float]:
         """Movement of the command per unit of time, by input."""
         return self["total_variation"]
-
-    @property
-    def at_limit(self) -> float:
-        """Share of the cycles with a command at a limit."""
-        return self["at_limit"][""]
-
-    @property
-    def cost(self) -> Mapping[str, float]:
-        """Cost along the run by term, and 'total'; empty without a cost."""
-        return self["cost"]
-
-    @property
-    def solve(self) -> Mapping[str, float]:
-        """Median and worst values of iterations, stationarity and feasibility, and number of plans; empty without an optimiser."""
-        group = {n.partition(".")[2]: v[""] for n, v in self.values.items() if n.startswith("solve.")}
-        return ByName({**group, "plans": self["plans"][""]} if group else {}, "Metrics.solve")
 
     @property
     def statuses(self) -> Mapping[str, int]:

@@ -89,8 +89,7 @@ def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) ->
         return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
 
     unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
-    reads = ("true_error", "reference", "time")
-    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True, reads=reads)
+    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True)
 
 
 @checked_call
@@ -125,8 +124,7 @@ def Norm(whats: Sequence[str], *, power: float = 2.0, name: str = "norm", headli
         return float(np.linalg.norm(values.ravel(), power) * problem.period ** (1 / power))
 
     unit = (lambda problem, _: _unit(problem, whats[0])) if np.isinf(power) else ""
-    reads = (*(what.partition(".")[0] for what in whats), "time")
-    return Metric(name, partial(_of_whole_runs, norm), unit=unit, headline=headline, finite=True, reads=reads)
+    return Metric(name, partial(_of_whole_runs, norm), unit=unit, headline=headline, finite=True)
 
 
 def _figure(
@@ -150,13 +148,7 @@ def _figure(
 
     whole = partial(_of_whole_runs, function)
     return Metric(
-        name,
-        whole,
-        unit=lambda p, _: unit(_unit(p, what), p.time_unit),
-        headline=headline,
-        finite=True,
-        better=better,
-        reads=(what.partition(".")[0],) if isinstance(what, str) else (),
+        name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, better=better
     )
 
 

@@ -13,6 +13,7 @@ from fpirhc.contraction.spectrum import Spectrum, identified_factor, jacobians_a
 from fpirhc.simulation.metrics.base import Metric, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.summary import in_percent
+from fpirhc.task.exogenous import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
 _SHORTEST = 10  # cycles from which a run is long enough for a factor
@@ -21,24 +22,25 @@ _SAMPLES = 200  # cycles of a run whose eigenvalues are computed
 
 def predicted(problem: Problem, run: Run) -> float | None:
     """Return the largest max|1 - a lambda| in sampled cycles of the run; None for an ExternalPlant. See `fpirhc.contraction`."""
-    if not _differentiable(problem, run):
-        return None
-    return predicted_factor(sampled_spectrum(problem, run).eigenvalues, _gain(run))
+    eigenvalues = _eigenvalues(problem, run)
+    return None if eigenvalues is None else predicted_factor(eigenvalues, _gain(run))
 
 
 def growing(problem: Problem, run: Run) -> float | None:
     """Return the share of the sampled cycles with max|1 - a lambda| >= 1, in which small errors do not shrink."""
-    if not _differentiable(problem, run):
-        return None
-    factors = np.abs(1 - _gain(run) * sampled_spectrum(problem, run).eigenvalues).max(axis=1)
-    return float(np.mean(factors >= 1))
+    eigenvalues = _eigenvalues(problem, run)
+    return None if eigenvalues is None else float(np.mean(np.abs(1 - _gain(run) * eigenvalues).max(axis=1) >= 1))
 
 
-def measured(problem: Problem, run: Run) -> float | None:  # noqa: ARG001 -- every metric is given the problem
-    """Return the factor that is fitted to requests and responses of the run; NaN where they do not excite every direction."""
-    if not _adapts(run):
+def measured(problem: Problem, run: Run) -> float | None:
+    """Return the factor that is fitted to requests and responses of the run; NaN where they do not excite every direction.
+
+    None for a plant outside whose response is late, or that nothing excites.
+    """
+    if not _adapts(run) or (not problem.equations_known and problem.response_delay):
         return None
-    return identified_factor(run["deformed"], run["plant_realised"], _gain(run), _weights(run))
+    factor = identified_factor(run["deformed"], run["plant_realised"], _gain(run), _weights(run))
+    return factor if problem.equations_known or np.isfinite(factor) else None
 
 
 def _gain(run: Run) -> float:
@@ -57,31 +59,32 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
 
     The cycles are those from `measure_from` on, without the first of the run, before which there is no request.
 
-    With a reality that is a plant they are those over a whole cycle.
+    With a reality that is a plant they are those over a whole cycle; signals from outside have the values of the cycle.
     """
     first = max(1, int(np.argmax(measured_cycles(problem, run))))
     rows = np.unique(np.linspace(first, run.cycles - 1, _SAMPLES).astype(int))
-    approximate, states, deformed = np.array(run.settings["parameters"]), run["state"][rows], run["deformed"][rows]
+    states, deformed, times = run["state"][rows], run["deformed"][rows], run.time[rows] + problem.period / 2
     task = problem.of_equations
     modelled = replace(task, plant=task.real_plant) if run.settings.get("model is reality") else task
     real = run["reality_state"][rows] if "reality_state" in run.layout else states
-    exact = np.tile(task.real_plant.exact, (len(rows), 1))
-    jacobians = jacobians_along(modelled, real, states, deformed, approximate, exact)
+    known = rows_of(model_values(modelled.plant, task.signals), times, np.array(run.settings["parameters"]))
+    exact = rows_of(real_values(task.real_plant, task.signals), times, task.real_plant.exact)
+    jacobians = jacobians_along(modelled, real, states, deformed, known, exact)
     finite, weights = jacobians[np.isfinite(jacobians).all(axis=(1, 2))], _weights(run)
     return Spectrum(np.linalg.eigvals(finite if weights is None else finite @ weights))
 
 
-def _differentiable(problem: Problem, run: Run) -> bool:
-    """Whether its factors follow from equations."""
-    return _adapts(run) and problem.equations_known
+def _eigenvalues(problem: Problem, run: Run) -> np.ndarray | None:
+    """Those of sampled cycles; None where its factors do not follow from equations."""
+    eigenvalues = sampled_spectrum(problem, run).eigenvalues if _adapts(run) and problem.equations_known else None
+    return eigenvalues if eigenvalues is not None and len(eigenvalues) else None
 
 
 def _adapts(run: Run) -> bool:
     """Whether the run has a contraction: where its controller adapts the plant's own response."""
-    return "contraction" in run.layout and "effective_gain" in run.settings and run.cycles >= _SHORTEST
+    return bool(run.settings.get("iterates")) and run.cycles >= _SHORTEST
 
 
-# They read more signals of a run with a contraction, which only one that is judged has.
 # A difference of 1e-4 has no meaning: the factor is a fit, or a difference of eigenvalues from one.
 METRICS = (
     Metric(
@@ -92,7 +95,7 @@ METRICS = (
         headline=True,
         floor=1e-4,
         order=85,
-        reads=("contraction",),
+        always=False,
     ),
     Metric(
         "contraction.growing",
@@ -101,7 +104,7 @@ METRICS = (
         text=in_percent,
         compared="not",
         order=85,
-        reads=("contraction",),
+        always=False,
     ),
-    Metric("contraction.measured", measured, floor=1e-4, order=85, reads=("contraction",)),
+    Metric("contraction.measured", measured, floor=1e-4, order=85, always=False),
 )
