@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.spectrum import Array, Spectrum, assess_gain, jacobians_along, linear_limit
-from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
+from fpirhc.contraction.spectrum import Array, jacobians_along, linear_limit
+from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.evaluate import Latest
@@ -139,53 +139,46 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     gain = deformation.effective_gain()
     if gain == 0:
         return
+    what, (name, value) = with_its_gain(deformation), own_gain(deformation)
+    remembers = deformation.memory(problem.plant.controlled_names).size > 0
     jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian_at_start(problem.of_equations))
     weighted = deformation.form.weighted(jacobian)
     if not np.isfinite(jacobian).all() or np.abs(np.linalg.eigvals(weighted)).max() <= _NOTHING:
         return
-    spectrum, delay = Spectrum(np.linalg.eigvals(weighted)), problem.response_delay
-    limit, seen = sum(linear_limit(spectrum.eigenvalues)), _weights_of_estimators(problem)
-    if limit * gain <= 0:
-        report = assess_gain(deformation, spectrum, delay)
-        turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
-        if turned:
-            why = f"{report.fault}: {' and '.join(turned)} of the plant and of the model differ in sign"
-            raise NotContractive(
-                why, "give the model the plant's sign, because a plan with the other one goes the wrong way"
-            )
-        remedy, behind = report.remedy, seen is not None and deformation.form.steady
-        if behind and (largest := largest_gain(deformation.with_effective_gain(-gain), jacobian, seen or [])):
-            name, value = own_gain(deformation)
-            remedy = f"use a {'negative' if value > 0 else 'positive'} {name}, 0 < |{name}| < {abs(largest / gain * value):.3g}"
-        raise NotContractive(report.fault, remedy)
-    if not deformation.form.steady or (seen is None and abs(gain) < abs(limit)):
+    eigenvalues, delay, steady = np.linalg.eigvals(weighted), problem.response_delay, deformation.form.steady
+    limit, seen = sum(linear_limit(eigenvalues)), _weights_of_estimators(problem)
+    weights, wrong = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian), limit * gain <= 0
+    if not wrong and (
+        not steady or (seen is None and abs(gain) < abs(limit)) or converges(deformation, jacobian, weights)
+    ):
         return
-    weights = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian)
-    if converges(deformation, jacobian, weights):
-        return
-    name, value = own_gain(deformation)
-    if seen is None:
-        remembers = deformation.memory(problem.plant.controlled_names).size
-        largest = largest_gain(deformation, jacobian, weights) if remembers else limit
-        top = max(spectrum.eigenvalues.ravel(), key=abs)
-        raise NotContractive(
-            f"{with_its_gain(deformation)} is too large",
-            f"use 0 < |{name}| < {abs(largest / gain * value):.3g}, where the iteration converges: the largest eigenvalue of the "
-            f"response Jacobian at the start is {f'{top.real if top.imag == 0 else top:.3g}'}",
-        )
-    largest = largest_gain(deformation, jacobian, weights)
+    right = deformation.with_effective_gain(-gain) if wrong else deformation
+    judged = steady and (seen is not None or (remembers and not wrong))
+    largest = largest_gain(right, jacobian, weights) if judged else abs(limit)
+    interval = f"0 < |{name}| < {abs((largest or limit) / gain * value):.3g}"
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     pairs = (Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0)
-    usable = (one for one in pairs if not any(against_wrappers(one)) and converges(one, jacobian, weights))
+    usable = (one for one in pairs if not deformation.form.pairs and converges(one, jacobian, weights))
+    if wrong:
+        turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
+        why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
+        remedy = "give the model the plant's sign, because a plan with the other one goes the wrong way"
+        remedy = remedy if turned else f"use a {'negative' if value > 0 else 'positive'} {name}, {interval}"
+        raise NotContractive(f"{what} has the wrong sign, so every cycle enlarges the error{why}", remedy)
+    if seen is None:
+        top = max(eigenvalues, key=abs)
+        raise NotContractive(
+            f"{what} is too large",
+            f"use {interval}, where the iteration converges: the largest eigenvalue of the response Jacobian at the start is "
+            f"{top.real if top.imag == 0 else top:.3g}",
+        )
     estimator, of_estimator = problem.sensing.estimator, problem.sensing.delay(problem.plant, problem.period)
     apart = f"dead time {delay - of_estimator:.4g}, {estimator} {of_estimator:.4g}"
-    remedies = [f"0 < |{name}| < {abs(largest / gain * value):.3g}"] if largest else []
-    remedies += [f"Paired(map, cycles={one.cycles:.4g})" for one in usable][:1]
+    remedies = [*([interval] if largest else []), *[f"Paired(map, cycles={one.cycles:.4g})" for one in usable][:1]]
     # These remedies stay beside an advice on the gain, because all but the first change something else.
     raise NotContractive(
-        f"{with_its_gain(deformation)}: the response comes {delay:.4g} cycles late "
-        f"({estimator if delay == of_estimator else apart}), so the iteration does not converge with this {name}; what helps: "
-        f"{', '.join([*remedies, 'a shorter window or time constant'])}"
+        f"{what}: the response comes {delay:.4g} cycles late ({estimator if delay == of_estimator else apart}), so the iteration "
+        f"does not converge with this {name}; what helps: {', '.join([*remedies, 'a shorter window or time constant'])}"
     )
 
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
 from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.evaluate import Evaluator, require_unsolved
+from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
 
@@ -81,13 +81,19 @@ def jacobians_along(
         believed: parameters of the model, shape (np,), or one set per row.
         exact: parameters of the reality, one set per row.
     """
-    believed = np.asarray(believed, dtype=float)
+    given = [states, deformed, exact, believed]
     if problem.reality is None:
-        return _at_instants(problem.plant, states, deformed, exact, believed)
-    count, n = len(real), deformed.shape[1]
-    rows = (np.broadcast_to(v, (count, v.shape[-1])).T for v in (np.asarray(exact, dtype=float), believed))
-    stacked = _sampled_jacobian(problem).map(count)(real.T, states.T, deformed.T, *rows)
-    return np.asarray(stacked.full()).reshape((n, count, n)).transpose(1, 0, 2)
+        function = _response_jacobian(problem.plant)
+    else:
+        function, given = _sampled_jacobian(problem), [real, *given]
+    count, n = len(states), deformed.shape[1]
+    rows = [np.broadcast_to(np.asarray(v, dtype=float), (count, v.shape[-1])) for v in given]
+    try:
+        stacked = np.asarray(function.map(count)(*(v.T for v in rows)).full())
+        return stacked.reshape((n, count, n)).transpose(1, 0, 2)
+    except RuntimeError as error:  # Newton's method has no derivative where the inputs have no effect
+        require_unsolved(error)
+    return np.array([_value(function, n, row) for row in zip(*rows, strict=True)])
 
 
 @lru_cache(maxsize=16)  # one run needs it several times
@@ -108,20 +114,6 @@ def _response_jacobian(plant: Plant) -> ca.Function:
     jacobian = ca.densify(ca.jacobian(realised, r))
     names = ["state", "deformed", "exact", "approximate"]
     return ca.Function("fpirhc_response_jacobian", [x, r, exact, assumed], [jacobian], names, ["jacobian"])
-
-
-def _at_instants(plant: Plant, states: Array, deformed: Array, exact: Array, believed: Array) -> Array:
-    """J of every row, shape (rows, n, n); not finite where the model's inverse is not."""
-    function, count, n = _response_jacobian(plant), len(states), deformed.shape[1]
-    assumed = np.broadcast_to(believed, (count, believed.shape[-1]))
-    try:
-        [columns] = Evaluator(function.map(count))(states, deformed, exact, assumed)
-        return columns.reshape(count, n, n).transpose(0, 2, 1)
-    except RuntimeError as error:  # Newton's method has no derivative where the inputs have no effect
-        require_unsolved(error)
-    except InvalidValue:  # the same, of a buffer, which does not say what failed; the call by itself does
-        pass
-    return np.array([_value(function, n, row) for row in zip(states, deformed, exact, assumed, strict=True)])
 
 
 def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:

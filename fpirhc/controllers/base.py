@@ -16,7 +16,6 @@ from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.path import model_block
 from fpirhc.deformation.base import Deformation, Form
 from fpirhc.plant.chain import nominal_responses
-from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, rename
@@ -39,7 +38,7 @@ def reference_block(built: Built) -> Block:
         error = outputs[places] - getattr(s, seen.name)[places]
         return {"reference": outputs, "_reference_response": wanted, "error": error}
 
-    reads = Layout((time_signal(plant), seen, *built.own))
+    reads = Layout((plant.time, seen, *built.own))
     writes = Layout((like(seen, "reference"), plant.response_signal("_reference_response"), built.error))
     return Block("reference", reads, writes, step)
 

@@ -24,7 +24,7 @@ from fpirhc.controllers.seeing import against_believed, check_observed, seeing_b
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import InvalidProblem, refuse
 from fpirhc.fields.kinds import described
-from fpirhc.plant.motion import followed_units, time_signal
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, fed, rename
 from fpirhc.symbolic.driver import plans_are_compiled
@@ -207,13 +207,13 @@ def compose_with_sensing(built: Built) -> Composite:
 
 def _composed(built: Built) -> Composite:
     (blocks, delays), (seeing, seen) = _blocks_of(built), built.seeing
-    own = [*seeing, *_measuring(built, blocks), *blocks]
-    return _informed(built, _reads(built, *built.sample), own, [*delays, *seen])
+    reads, own = _reads(built, *built.sample), [*seeing, *_measuring(built, blocks), *blocks]
+    return _informed(built, reads, own, [*delays, *seen])
 
 
 def _reads(built: Built, *seen: Signal) -> Layout:
     """What a controller reads in every cycle: time, what is seen, parameters, and what a reference is given."""
-    return Layout((time_signal(built.plant), *seen, built.model.plant.parameter, *built.given))
+    return Layout((built.plant.time, *seen, built.model.plant.parameter, *built.given))
 
 
 def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
@@ -233,7 +233,7 @@ def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
 
 def _measuring(built: Built, blocks: Sequence[Block]) -> list[Block]:
     """Blocks that write what is measured, where some blocks read it: what is given, unless a controller acts on predictions."""
-    read, given = _read_by(blocks), (*built.plant.motion, time_signal(built.plant))
+    read, given = _read_by(blocks), (*built.plant.motion, built.plant.time)
     return [rename(f"measured_{one.name}", one, measured(one)) for one in given if measured(one).name in read]
 
 

@@ -23,6 +23,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import require_derivatives, without_disturbances
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
+from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
 from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous
@@ -45,6 +46,11 @@ class PlantModel:
     exact: bool = False  # whether its parameters are the exact ones; such a controller is a bound to compare with
     # values of parameters in place of the approximate ones, by name
     given: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def parameter(self) -> Signal:
+        """The signal of its parameters, with the values that they have at first."""
+        return replace(self.plant.parameter, start=tuple(map(float, self.parameters(self.plant))))
 
     def parameters(self, plant: Plant) -> np.ndarray:
         """Return the parameters with which the controller evaluates a plant, shape (np,)."""

@@ -25,7 +25,6 @@ import numpy as np
 
 from fpirhc.deformation.base import Deformation
 from fpirhc.plant.integrators import Integrator, RungeKutta4
-from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Evidence, Model, values_of
 from fpirhc.symbolic.block import Block
@@ -74,7 +73,7 @@ class Told:
             return {NOW: now, ACTED: s.signals_last, "signals_last_next": now[self.places]} if remembers else {NOW: now}
 
         writes = Layout((Signal(NOW, parameter.elements, parameter.units), *((acted,) * remembers)))
-        reads, memory = Layout((time_signal(self.plant), parameter)), Layout((last,) * remembers)
+        reads, memory = Layout((self.plant.time, parameter)), Layout((last,) * remembers)
         return Block("signals", reads, writes, step, memory, not values.is_a("SXFunction"))
 
 

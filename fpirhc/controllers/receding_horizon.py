@@ -30,7 +30,6 @@ from fpirhc.horizon.stage_data import offset_limits, shifted_reference
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import Optimiser, built
 from fpirhc.optimisers.fixed_point import FixedPoint
-from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, every
 from fpirhc.symbolic.driver import plans_are_compiled
@@ -238,7 +237,7 @@ def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
     own, outputs = problem.own_signals, plant.beside
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
-    return Layout((time_signal(plant), start, *outputs, plant.parameter, *last, *own))
+    return Layout((plant.time, start, *outputs, plant.parameter, *last, *own))
 
 
 def _open_rows(problem: Problem, ocp: OptimalControl, s: Signals) -> list[Expression]:

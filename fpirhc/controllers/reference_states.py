@@ -16,7 +16,6 @@ import numpy as np
 
 from fpirhc.deformation.base import RequestChange
 from fpirhc.errors import InvalidValue
-from fpirhc.horizon.nominal import reference_state
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
@@ -39,7 +38,8 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
     if plant.equations.hidden:
         return _of_nominal_run(problem, count)[0]
-    return np.asarray(reference_state(plant, problem.reference.function(plant).map(count)(times[None, :])[0]).full())
+    outputs = problem.reference.function(plant).map(count)(times[None, :])[0]
+    return np.asarray(plant.equations.state_of(outputs, outputs).full())
 
 
 def _of_nominal_run(problem: Problem, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -59,9 +59,9 @@ def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np
         return _of_nominal_run(problem, count)[1]
     if len(plant.controlled_names) != len(plant.inputs):
         return np.repeat(problem.inputs_before[:, None], count, axis=1)
+    states, repeated = reference_states(problem, count), np.repeat(parameters[:, None], count, axis=1)
     wanted = nominal_motion(problem).map(count)(times[None, :])[1]
-    repeated = np.repeat(parameters[:, None], count, axis=1)
-    return np.asarray(plant.equations.inverse.map(count)(reference_states(problem, count), wanted, repeated).full())
+    return np.asarray(plant.equations.inverse.map(count)(states, wanted, repeated).full())
 
 
 _SAMPLES = 100  # instants at which the reference is looked at

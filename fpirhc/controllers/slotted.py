@@ -24,7 +24,7 @@ from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
-from fpirhc.plant.motion import followed_units, time_signal
+from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
@@ -140,7 +140,7 @@ class Slotted(Controller):
                 slot += (number - before) * (phase > start - 0.5)
             return {"slot": slot}
 
-        return Block("schedule", Layout((time_signal(built.plant),)), Layout((scalar("slot"),)), step)
+        return Block("schedule", Layout((built.plant.time,)), Layout((scalar("slot"),)), step)
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
         one = build(slot_problem(built.problem, name), self.slots[name], opened=built.opened)

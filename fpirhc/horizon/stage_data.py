@@ -11,7 +11,6 @@ import numpy as np
 from fpirhc.horizon.cost import Cost, read_by_cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
-from fpirhc.plant.motion import time_signal
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind
 from fpirhc.symbolic.layout import Layout, Signal, scalar
@@ -28,7 +27,7 @@ def data_layout(plant: Plant, horizon: Horizon) -> Layout:
     length = (scalar("length"),) if horizon.lengths else ()
     return Layout(
         (
-            time_signal(plant),
+            plant.time,
             Signal("reference", plant.output.elements, plant.output.units),
             Signal("feedforward", plant.input.elements, plant.input.units),
             plant.parameter,

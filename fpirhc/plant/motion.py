@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.plant.parameter import with_exact_values
-from fpirhc.symbolic.layout import Expression, Named, Signal, scalar, vector
+from fpirhc.symbolic.layout import Expression, Named, Signal, vector
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -63,11 +63,6 @@ def followed_units(plant: Plant) -> dict[str, str]:
 def input_columns(plant: Plant) -> tuple[str, ...]:
     """Names of the inputs in tables that hold states too: "input NAME" where a coordinate has the name of an input."""
     return tuple(f"input {name}" if name in plant.coordinates else name for name in plant.inputs)
-
-
-def time_signal(plant: Plant) -> Signal:
-    """Return the time's signal."""
-    return scalar("time", plant.time_unit)
 
 
 def forcing_units(plant: Plant) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ from fpirhc.plant.parameter import Parameter
 from fpirhc.plant.plant_check import check_plant
 from fpirhc.summary import line
 from fpirhc.symbolic.expression import Expression
-from fpirhc.symbolic.layout import Signal, vector
+from fpirhc.symbolic.layout import Signal, scalar, vector
 
 __all__ = ["Output", "Parameter", "Plant"]
 
@@ -214,6 +214,11 @@ class Plant(Checked):
     def motion(self) -> tuple[Signal, ...]:
         """The signals of what a controller is given of the motion: the state, and the outputs where there are any."""
         return (self.state, *self.beside)
+
+    @property
+    def time(self) -> Signal:
+        """The time's signal."""
+        return scalar("time", self.time_unit)
 
     @cached_property
     def input(self) -> Signal:

@@ -14,7 +14,6 @@ import casadi as ca
 
 from fpirhc.controllers.gate import AGAIN
 from fpirhc.errors import InvalidValue
-from fpirhc.plant.motion import time_signal
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import FINITE, Signals, nan_where
@@ -60,12 +59,12 @@ def clock_block(problem: Problem) -> Block:
             ),
         }
 
-    return Block("clock", Layout((time_signal(problem.plant),)), Layout((Signal(CLOCK),)), step, Layout((MEMORY,)))
+    return Block("clock", Layout((problem.plant.time,)), Layout((Signal(CLOCK),)), step, Layout((MEMORY,)))
 
 
 def clock_status_block(problem: Problem, before: str, after: str) -> Block:
     """Return the block (time, believed time, status) -> status: BAD_TIME for a cycle skipped for a finite time."""
-    reads = Layout((time_signal(problem.plant), Signal(CLOCK), scalar(before)))
+    reads = Layout((problem.plant.time, Signal(CLOCK), scalar(before)))
 
     def step(s: Signals) -> dict[str, Expression]:
         refused = ca.logic_and(ca.fabs(s.time) <= FINITE, ca.logic_not(ca.fabs(getattr(s, CLOCK)) <= FINITE))

@@ -14,12 +14,11 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, commanding_blocks, reference_block
 from fpirhc.controllers.built import Built, build, compose_with_sensing
-from fpirhc.controllers.contract import PlantModel, Undeformed
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
-from fpirhc.plant.motion import time_signal
-from fpirhc.simulation.path import Mover, acting_blocks, moving, outside_blocks
+from fpirhc.simulation.path import acting_blocks, moving, outside_blocks
 from fpirhc.simulation.replay import known_samples
 from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
 from fpirhc.simulation.tables import disturbance_signals
@@ -52,11 +51,12 @@ def _closed(built: Built) -> Composite:
     seeing = sensing_blocks(mover, predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
-    clock, actuating = _clock_block(time_signal(problem.plant), problem.period), acting_blocks(mover, disturbed)
+    clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(mover, disturbed)
     around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
     constants = [Delay(signal, signal.name) for signal in open_settings(around).signals] if built.opened else []
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
-    return compose("loop", reads, around, [*_plant_delays(mover, built.model), *constants], outputs=mover.sent)
+    delays = [*mover.delays, Delay(built.model.parameter, "parameters"), *constants]
+    return compose("loop", reads, around, delays, outputs=mover.sent)
 
 
 def start_memory(
@@ -71,7 +71,7 @@ def start_memory(
     mover, whole = moving(problem), loop.memory.start()
     blocks = (*sensing_blocks(mover, predicts=False), *seeing_blocks(problem)[0])
     signals = [signal for block in blocks for signal in block.memory.signals]
-    signals += [delay.now for delay in _plant_delays(mover, controller.plant_model(problem))]
+    signals += [*(delay.now for delay in mover.delays), controller.plant_model(problem).parameter]
     if INNER in loop.memory and plans_exactly(loop, problem, controller):
         whole[loop.memory.slice(INNER)] = compose_with_sensing(build(problem, controller)).memory.start()
     # A graph has the estimator's memory inside the controller's one signal.
@@ -88,12 +88,6 @@ def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> 
     model, of_build = controller.plant_model(problem), loop.memory["parameters"].start_vector()
     exact = controller.planner is not None and model.exact
     return exact and not np.array_equal(of_build, model.parameters(model.plant))
-
-
-def _plant_delays(mover: Mover, model: PlantModel) -> list[Delay]:
-    """What moves carries from cycle to cycle, and the parameters that the model has during a run."""
-    values, parameter = tuple(map(float, model.parameters(model.plant))), model.plant.parameter
-    return [*mover.delays, Delay(Signal("parameters", parameter.elements, parameter.units, values), "parameters")]
 
 
 def _clock_block(time: Signal, period: float) -> Block:

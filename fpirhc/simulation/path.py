@@ -17,7 +17,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.plant.integrators import own_step
-from fpirhc.plant.motion import forcing_units, outside_names, time_signal
+from fpirhc.plant.motion import forcing_units, outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
@@ -227,7 +227,7 @@ class Equations(Mover):
         opaque = integrator.opaque or (values is not None and not values.is_a("SXFunction"))
         state = like(plant.state, "_state_before")
         exact = like(plant.parameter, self.parameters if values is None else Mover.parameters)
-        reads = (state, arriving, exact, *([] if values is None else [time_signal(problem.plant)]), *disturbed)
+        reads = (state, arriving, exact, *([] if values is None else [problem.plant.time]), *disturbed)
         writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
 
         def step(s: Signals) -> dict[str, Expression]:
@@ -356,7 +356,7 @@ def _block(
         mean = ca.sum2(ca.horzcat(*every))[places] / steps if steps > 1 else every[0][places]
         return {shown: mean, **({target: every[-1]} if target else {})}
 
-    reads = Layout((time_signal(plant), like(plant.parameter, source)))
+    reads = Layout((plant.time, like(plant.parameter, source)))
     return Block(name, reads, Layout(writes), step, opaque=not values.is_a("SXFunction"))
 
 

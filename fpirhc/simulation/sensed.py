@@ -11,7 +11,7 @@ import numpy as np
 
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.seeing import sensor_ranges
-from fpirhc.plant.motion import followed_units, time_signal
+from fpirhc.plant.motion import followed_units
 from fpirhc.sensing.base import backward_difference, combine, response_names
 from fpirhc.simulation.path import HELD, Mover, moving, real_signals
 from fpirhc.symbolic.block import Block, rename
@@ -137,7 +137,7 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
         return Block(
             "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
         )
-    function, reads = problem.motion(), Layout((time_signal(plant), motion, *problem.own_signals))
+    function, reads = problem.motion(), Layout((plant.time, motion, *problem.own_signals))
 
     def step(s: Signals) -> dict[str, Expression]:
         along = function(s.time, *(getattr(s, one.name) for one in problem.own_signals))[0]

@@ -34,7 +34,7 @@ class Signals:
 
     def __init__(self, symbols: Mapping[str, Expression]) -> None:
         """Store the symbol of every signal under its name."""
-        vars(self).update(symbols)
+        self.__dict__ |= symbols
 
     def __getattr__(self, name: str) -> Expression:
         raise AttributeError(f"the step neither reads nor remembers '{name}'.{nearest(name, vars(self))}")

@@ -17,7 +17,6 @@ from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.learning.rules import Pair, Rule
 from fpirhc.members import Example
-from fpirhc.plant.motion import time_signal
 from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like
@@ -114,7 +113,7 @@ class AdaptiveInverseDynamics(Controller):
         def then(s: Signals) -> Expression:
             return reference(ca.fmax(s._measured_time - pairs.late, 0), *built.own_values(s))[0]
 
-        return then, (measured(time_signal(plant)), *built.own)
+        return then, (measured(plant.time), *built.own)
 
     def _remembers(self, built: Built) -> bool:
         """Whether it learns from errors of an earlier instant, to set-points, which only a memory knows."""
@@ -135,7 +134,7 @@ def _earlier_targets(built: Built) -> Block:
     """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
     plant, period, pairs = built.plant, built.period, built.pairs
     queue = Queue(2 * built.pairs.dead_time.longest / period + built.problem.sensing.delay(plant, period))
-    target, time = like(plant.output, "_target"), time_signal(plant)
+    target, time = like(plant.output, "_target"), plant.time
     first = np.asarray(built.problem.reference.function(plant)(0.0)[0].full()).ravel()
     memory = queue.memory("targets", target.elements, tuple(map(float, first)))
 

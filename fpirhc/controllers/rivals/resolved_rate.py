@@ -15,7 +15,7 @@ from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.rivals.reference_model import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
-from fpirhc.plant.motion import controlled_places, time_signal
+from fpirhc.plant.motion import controlled_places
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, like, scalar
@@ -85,7 +85,7 @@ def _nominal_block(built: Built) -> Block:
         later = function(s.time, *built.own_values(s))[1][controlled]
         return {"nominal": s._reference_response, "_nominal_later": later}
 
-    reads = Layout((time_signal(plant), plant.response_signal("_reference_response"), *built.own))
+    reads = Layout((plant.time, plant.response_signal("_reference_response"), *built.own))
     writes = Layout((plant.response_signal("nominal"), plant.response_signal("_nominal_later")))
     return Block("nominal", reads, writes, step)
 

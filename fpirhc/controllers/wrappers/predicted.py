@@ -18,7 +18,7 @@ from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.integrators import USUAL
-from fpirhc.plant.motion import forcing_units, time_signal
+from fpirhc.plant.motion import forcing_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -105,7 +105,7 @@ class Predicted(ControllerWrapper):
         if not self._cycles(built.period):
             return self.controller.blocks(built.inner(self))
         inner = compose_controller(built.inner(self), ahead=True)
-        given = time_signal(plant), *plant.motion
+        given = plant.time, *plant.motion
         ahead = {s.name: like(s, f"{s.name}_ahead") for s in given}
         feeds = {**ahead, **{measured(s).name: s for s in given}}
         command = replace(built.before, name=plant.input.name)
@@ -135,7 +135,7 @@ class Predicted(ControllerWrapper):
         past = answered.memory("state_answered", plant.state.elements, built.state.start)
         own = (residual, *past) if corrected else ()
         responses = (plant.response_signal("realised"),) if corrected else ()
-        reads = (time_signal(plant), *plant.motion, *responses, plant.parameter, before)
+        reads = (plant.time, *plant.motion, *responses, plant.parameter, before)
         # An output that is the state is where the state is.
         outputs_ahead = {s.name: _output_ahead(plant) for s in plant.beside}
 
