@@ -11,7 +11,6 @@ import numpy as np
 
 from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.errors import Mistakes
-from fpirhc.plant.motion import input_columns
 from fpirhc.plant.plant import Plant
 
 _POINTS = 20
@@ -23,10 +22,9 @@ def check_plant(plant: Plant, *, seed: int, box: Mapping[str, tuple[float, float
     """Check every law on a plant at random points.
 
     Args:
-        box: intervals of states (q1, q1', ...) and inputs by name ("input NAME" beside a coordinate NAME), from which the points
-            are drawn; (-1, 1) for every other name.
+        box: intervals of states (q1, q1', ...) and inputs by name, from which the points are drawn; (-1, 1) for every other name.
     """
-    names, mistakes = [*plant.state.elements, *input_columns(plant)], Mistakes("box")
+    names, mistakes = [*plant.state.elements, *plant.inputs], Mistakes("box")
     mistakes.unknown("state or input", box or {}, names)
     mistakes.raise_if_any()
     box = dict.fromkeys(names, (-1.0, 1.0)) | dict(box or {})

@@ -86,14 +86,9 @@ def measured(names: Collection[str], limits: Limits, plant: Plant, next_state: E
 
 def state_prices(limits: Limits, state: Signal, plant: Plant, step: float) -> np.ndarray:
     """Price of a violation of every entry's limits at one node (ns,), in cost per unit; infinite where limits are hard."""
-    prices = {_entry(name, plant): step * price for name, price in limits.prices.items()}
+    prices = {f"{name} rate" if name in plant.inputs else name: step * price for name, price in limits.prices.items()}
     prices |= {_as_measured(entry): price for entry, price in prices.items()}
     return np.array([prices.get(e, math.inf) for e in state.elements])
-
-
-def _entry(name: str, plant: Plant) -> str:
-    """Name of the entry; a rate is priced by the name of its input where no state has it, else by its own name."""
-    return f"{name} rate" if name in plant.inputs and name not in plant.state.elements else name
 
 
 def _as_measured(name: str) -> str:

@@ -60,11 +60,6 @@ def followed_units(plant: Plant) -> dict[str, str]:
     return {name: one.unit for name, one in plant.outputs.items()} if plant.outputs else dict(plant.coordinates)
 
 
-def input_columns(plant: Plant) -> tuple[str, ...]:
-    """Names of the inputs in tables that hold states too: "input NAME" where a coordinate has the name of an input."""
-    return tuple(f"input {name}" if name in plant.coordinates else name for name in plant.inputs)
-
-
 def forcing_units(plant: Plant) -> tuple[str, ...]:
     """Return the units of the highest derivative of every coordinate, to which a forcing adds."""
     units = zip(plant.coordinates.values(), plant.orders, strict=True)

@@ -63,8 +63,9 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
         mistakes.add(
             f"time_unit is {plant.time_unit!r}; write the unit of time of the equations, such as 's', 'ms' or 'day'"
         )
-    for name in sorted(plant.outputs.keys() & plant.inputs.keys()):
-        mistakes.add(f"'{name}' names both an output and an input; rename one")
+    for name in sorted({*plant.coordinates, *plant.outputs} & plant.inputs.keys()):
+        what = "an output" if name in plant.outputs else f"a {quantities[:-1]}"
+        mistakes.add(f"'{name}' names both an input and {what}; rename one")
     _check_order_numbers(plant, mistakes)
     if plant.controlled is not None:
         what = followed(plant)

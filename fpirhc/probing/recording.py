@@ -16,7 +16,6 @@ from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Identity
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
-from fpirhc.plant.motion import input_columns
 from fpirhc.probing.identification import require_cycles
 from fpirhc.sensing.base import response_names
 from fpirhc.simulation.run import Run
@@ -123,7 +122,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
     """Return the record in a CSV file; a response without a column is the difference of its lower derivative over a cycle."""
     table = _table(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path}")
-    missing = [n for n in ("time", *input_columns(plant), *plant.state.elements) if n not in table]
+    missing = [n for n in ("time", *plant.inputs, *plant.state.elements) if n not in table]
     if missing:
         mistakes.add(f"it lacks columns for {', '.join(missing)}; its columns are {', '.join(map(str, table))}")
     for name in response_names(plant):
@@ -140,7 +139,7 @@ def read_recording(path: Path, problem: Problem) -> Record:
             f"recording {path}: its times are not {period:g} {problem.time_unit} apart, the period of the problem: "
             f"{times[k]:g} is followed by {times[k + 1]:g}"
         )
-    commands, states = (table[list(names)].to_numpy() for names in (input_columns(plant), plant.state.elements))
+    commands, states = (table[list(names)].to_numpy() for names in (plant.inputs, plant.state.elements))
     responses = [table[n] if n in table else table[n[:-1]].diff() / period for n in response_names(plant)]
     return _record(problem, f"recording {path}", times, states, commands, np.column_stack(responses))
 

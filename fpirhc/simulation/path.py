@@ -234,8 +234,8 @@ class Equations(Mover):
             u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
             if disturbed:
                 adds = by_place(problem, s.disturbance)
-                u = u + ca.vertcat(*(adds.get((True, name), 0) for name in plant.inputs))
-                w = ca.vertcat(*(adds.get((False, name), 0) for name in plant.names))
+                u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
+                w = ca.vertcat(*(adds.get(name, 0) for name in plant.names))
             after, now = s._state_before, getattr(s, exact.name)
             for k in range(count):
                 there = now if values is None else values(s.time + (k + 0.5) * (problem.period / count), now)
@@ -302,7 +302,7 @@ class Body(Mover):
             u = getattr(s, arriving.name)
             if disturbed:
                 adds = by_place(problem, s.disturbance)
-                u = u + ca.vertcat(*(adds.get((True, name), 0) for name in plant.inputs))
+                u = u + ca.vertcat(*(adds.get(name, 0) for name in plant.inputs))
             return {SENT: u}
 
         return Block("send", Layout((arriving, *disturbed)), Layout((like(plant.input, SENT),)), step)

@@ -188,7 +188,7 @@ def hard_limits(problem: Problem, run: Run) -> list[Followed]:
     """
     plant, weighed = problem.plant, problem.limits.prices.keys()
     limits = {**problem.limits.boxes(plant), **problem.limits.written(plant, problem.period)}
-    rates = {f"{name} rate": name for name in problem.limits.rates if name not in plant.state.elements}
+    rates = {f"{name} rate": name for name in problem.limits.rates}
     hard = {name: one for name, one in limits.items() if not {name, rates.get(name, name)} & weighed}
     if not hard or not run.cycles:
         return []

@@ -16,7 +16,6 @@ from fpirhc.simulation.step_arguments import Setpoints, set_point_table
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.layout import Expression, Signal
 from fpirhc.symbolic.open import SETTINGS
-from fpirhc.task.disturbance import disturbed_place
 from fpirhc.task.problem import Problem
 
 SIGNAL = "disturbance"  # what a loop reads in every cycle
@@ -76,10 +75,9 @@ def logged_signal(problem: Problem) -> Signal:
     return Signal(LOGGED, output.elements, output.units)
 
 
-def by_place(problem: Problem, disturbance: Expression) -> dict[tuple[bool, str], Expression]:
-    """Return what disturbances add by (whether to an input, name)."""
-    values, inputs = ca.vertsplit(disturbance), problem.plant.inputs
-    return {disturbed_place(key, inputs): value for key, value in zip(problem.disturbances, values, strict=False)}
+def by_place(problem: Problem, disturbance: Expression) -> dict[str, Expression]:
+    """Return what disturbances add by name."""
+    return dict(zip(problem.disturbances, ca.vertsplit(disturbance), strict=False))
 
 
 def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expression]:

@@ -1,15 +1,15 @@
 """Disturbances: signals that act on the plant and that no controller receives.
 
 A disturbance is attached by name, to an input (it adds to the clipped command), to a coordinate (it adds to the
-response), or to an output that is an expression (it adds to the output, see `output_disturbance`). Where an input and a coordinate
-share a name, they are "input NAME" and "coordinate NAME". It is sampled once per control cycle and held over the cycle.
+response), or to an output that is an expression (it adds to the output, see `output_disturbance`). It is sampled once per control
+cycle and held over the cycle.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -21,18 +21,6 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative, Range
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.symbolic.layout import Expression
-
-
-def disturbance_keys(inputs: Iterable[str], others: Collection[str]) -> tuple[str, ...]:
-    """Return the names that disturbances may have: of inputs and others, each with its kind where both have it."""
-    of_inputs = {name: f"input {name}" if name in others else name for name in inputs}
-    return (*of_inputs.values(), *(f"coordinate {name}" if name in of_inputs else name for name in others))
-
-
-def disturbed_place(key: str, inputs: Collection[str]) -> tuple[bool, str]:
-    """Return whether the name of a disturbance is that of an input, and the name without its kind."""
-    kind, _, name = key.rpartition(" ")
-    return kind == "input" or (not kind and name in inputs), name
 
 
 class Disturbance(Checked, ABC):

@@ -77,9 +77,8 @@ class Limits(Checked):
             by name of the input.
         paths: named limits on expressions of state and input in stages 0 ... N-1.
         prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1),
-            by name of a state or path, or by name of an input for its rate ("NAME rate" where a state has that name). Such a limit
-            is kept exactly while its multiplier is below the price. The price is not part of the cost's terms; `Plan.slacks` gives
-            what was paid.
+            by name of a state or path, or by name of an input for its rate. Such a limit is kept exactly while its multiplier is
+            below the price. The price is not part of the cost's terms; `Plan.slacks` gives what was paid.
     """
 
     inputs: Mapping[str, Interval] = field(default_factory=dict)
@@ -98,7 +97,6 @@ class Limits(Checked):
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("state", self.states, plant.state.elements)
         mistakes.unknown("rates: input", self.rates, plant.inputs)
-        rates = [f"{name} rate" if name in plant.state.elements else name for name in self.rates]
         for name in sorted(self.paths.keys() & {f"{name} rate" for name in self.rates}):
             mistakes.add(f"paths: '{name}' is already the name of the limit in rates; choose another")
         for name, interval in [*self.inputs.items(), *self.states.items(), *self.rates.items()]:
@@ -107,7 +105,7 @@ class Limits(Checked):
             if name in plant.state.elements or name in plant.inputs:
                 mistakes.add(f"paths: '{name}' is already the name of a state or input; choose another")
             _check_interval(name, (path.lower, path.upper), mistakes)
-        mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *rates])
+        mistakes.unknown("prices: limit of", self.prices, [*self.states, *self.paths, *self.rates])
         mistakes.raise_if_any()
 
     def boxes(self, plant: Plant) -> dict[str, PathConstraint]:
@@ -132,11 +130,7 @@ class Limits(Checked):
 
     def rate_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of the change of every input, shape (nu,) each; infinite where free or priced."""
-        rates = {
-            name: ends
-            for name, ends in self.rates.items()
-            if (f"{name} rate" if name in plant.state.elements else name) not in self.prices
-        }
+        rates = {name: ends for name, ends in self.rates.items() if name not in self.prices}
         return _bounds(rates, plant.input.elements)
 
     def state_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:

@@ -26,7 +26,7 @@ from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.open import nominal
 from fpirhc.task.checks import check_problem, settled_maps
 from fpirhc.task.dead_time import MEASUREMENT, DeadTime
-from fpirhc.task.disturbance import Disturbance, disturbance_keys, disturbed_place
+from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.exogenous import Exogenous, real_values, rows_of, signals_of
 from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.limits import Limits
@@ -46,8 +46,7 @@ class Problem(Checked):
         duration: length of a run, which has the nearest whole number of cycles.
         limits: of inputs, states, rates and paths.
         disturbances: by name of the input, coordinate or output to which they add; a name of both a coordinate of the moving plant
-            and an output is the coordinate's, and adds to its response. Where an input and a coordinate share a name, they are
-            "input NAME" and "coordinate NAME".
+            and an output is the coordinate's, and adds to its response.
         dead_time: of inputs and measurement. A controller may assume another one.
         sensing: sensors and estimator between the plant and the controller; ideal by default.
         horizon: stages over which a receding-horizon controller plans.
@@ -172,11 +171,8 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        inputs, others = self.plant.inputs, dict.fromkeys([*self.plant.coordinates, *followed_units(self.plant)])
-        known = [*((True, name) for name in inputs), *((False, name) for name in others)]
-        keys = dict(zip(known, disturbance_keys(inputs, others), strict=True))
-        there = {disturbed_place(name, inputs): one for name, one in self.disturbances.items()}
-        disturbances = {keys[place]: one for place, one in there.items() if place in keys}
+        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.outputs}
+        disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)
 
@@ -215,12 +211,8 @@ class Problem(Checked):
     @property
     def disturbable(self) -> tuple[str, ...]:
         """Names that disturbances may have: of the inputs in the plant's order, then of what else moves."""
-        return disturbance_keys(self.plant.inputs, self._pushed)
-
-    @property
-    def _pushed(self) -> tuple[str, ...]:
-        """Names beside the inputs that disturbances may have; nothing reaches into an object outside."""
-        return () if self.foreign else (*self.real_plant.coordinates, *self.plant.outputs)
+        # Nothing reaches into an object outside.
+        return (*self.plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *self.plant.outputs)))
 
     @cached_property
     def start_state(self) -> np.ndarray:

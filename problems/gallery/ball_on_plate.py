@@ -43,13 +43,13 @@ def response(q, v, u, p):
 
 def of_the_table(q, v, u, p):
     """Accelerations of the ball, and rates of the servos behind which the plate turns."""
-    across, along = (u.across - q.across) / p.servo, (u.along - q.along) / p.servo
+    across, along = (u.across - q.turned) / p.servo, (u.along - q.tilted) / p.servo
     thrown = q.x * across + q.y * along
     return {
-        "x": p.rolling * (G * ca.sin(q.across - p.lean_x) + thrown * across) - p.drag * v.x,
-        "y": p.rolling * (G * ca.sin(q.along - p.lean_y) + thrown * along) - p.drag * v.y,
-        "across": across,
-        "along": along,
+        "x": p.rolling * (G * ca.sin(q.turned - p.lean_x) + thrown * across) - p.drag * v.x,
+        "y": p.rolling * (G * ca.sin(q.tilted - p.lean_y) + thrown * along) - p.drag * v.y,
+        "turned": across,
+        "tilted": along,
     }
 
 
@@ -65,9 +65,9 @@ parameters = {
 }
 plant = fp.Plant(coordinates={"x": "m", "y": "m"}, inputs=inputs, response=response, parameters=parameters)
 table = fp.Plant(
-    coordinates={"x": "m", "y": "m", "across": "rad", "along": "rad"},
+    coordinates={"x": "m", "y": "m", "turned": "rad", "tilted": "rad"},
     inputs=inputs,
-    order={"x": 2, "y": 2, "across": 1, "along": 1},
+    order={"x": 2, "y": 2, "turned": 1, "tilted": 1},
     response=of_the_table,
     parameters={
         **parameters,
@@ -79,7 +79,7 @@ camera = fp.Sensor(noise=fp.Noise(2e-4))  # m
 
 problem = fp.Problem(
     plant=plant,
-    reality=fp.Reality(table, start={"along": 0.0, "across": 0.0}),
+    reality=fp.Reality(table, start={"turned": 0.0, "tilted": 0.0}),
     reference=fp.Trajectory(eight),
     start={"x": 0.05, "y": -0.05},
     period=2e-2,  # s

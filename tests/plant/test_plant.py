@@ -205,6 +205,7 @@ BAD: dict[str, dict[str, Any]] = {
     "order is 1000000000, and the highest possible is 20": {"order": 10**9},
     "must be one scalar": {"response": lambda q, v, u, p: {"y": ca.vertcat(u.u, u.u)}},
     "no input reaches coordinate": {"response": lambda q, v, u, p: {"y": -q.y}},
+    "'y' names both an input and a coordinate; rename one": {"inputs": {"y": "N"}},
 }
 HARD: dict[str, Any] = {
     "number 4": lambda: two_mass_chain(("a",)),

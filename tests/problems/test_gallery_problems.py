@@ -227,7 +227,7 @@ def test_the_ball_rolls_as_lagrange_has_it():
         place, speed, tilt, command = random.uniform(-0.2, 0.2, (4, 2))
         rate = (command - tilt) / level["servo"]
         x = dict(zip(plant.state.elements, np.zeros(6), strict=True))
-        x |= {"x": place[0], "y": place[1], "x'": speed[0], "y'": speed[1], "across": tilt[0], "along": tilt[1]}
+        x |= {"x": place[0], "y": place[1], "x'": speed[0], "y'": speed[1], "turned": tilt[0], "tilted": tilt[1]}
         answer = plant.equations.rate(list(x.values()), command, list(level.values())).full().ravel()
         found = dict(zip(plant.state.elements, answer, strict=True))
         expected = lagrange(place, speed, tilt, rate).full().ravel()
