@@ -117,9 +117,9 @@ class Comparison(Study):
     entries: tuple[Entry, ...]
     skipped: Mapping[str, str]
     findings: tuple[Finding, ...]
-    pictures: tuple[Picture, ...] = ()
-    time_unit: str = "s"
-    steps: bool = False
+    pictures: tuple[Picture, ...]
+    time_unit: str
+    steps: bool
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -193,9 +193,9 @@ def compare(
         progress: called with (controller, cycles done, cycles in all).
         changes: of live settings by controller and time.
     """
-    begin, selected = time.perf_counter(), select(task, controllers)
+    begin, selected, changes = time.perf_counter(), select(task, controllers), changes or {}
     mistakes = Mistakes("changes")
-    mistakes.unknown("controller", changes or (), selected)
+    mistakes.unknown("controller", changes, selected)
     mistakes.raise_if_any()
     check_gains(task, selected)
     problem, skipped = task.problem, dict[str, str]()
@@ -204,12 +204,12 @@ def compare(
     with compiling_ahead() as compiling:
         for name in selected:
             try:
-                rows.compose(name, (changes or {}).get(name, {}), compiling)
+                rows.compose(name, changes.get(name, {}), compiling)
             except FpirhcError as error:
                 skipped[name] = str(error)
         for name in rows.composed:
             try:
-                entries.append(rows.entry(name, (changes or {}).get(name, {}), progress and partial(progress, name)))
+                entries.append(rows.entry(name, changes.get(name, {}), progress and partial(progress, name)))
             except FpirhcError as error:
                 skipped[name] = str(error)
             except KeyboardInterrupt:
@@ -328,7 +328,7 @@ REPLAYED = 2000  # cycles of a run that are stepped again, one by one
 def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> float | None:
     """Mean wall time of a call of the controller, from measurement to command, us: few calls may hold all plans."""
     stepper, count = Stepper.of(composed, compiled=compiled), min(run.cycles, REPLAYED)
-    if count < 2:
+    if not count:
         return None
     step: Callable[..., Any] = stepper.step_measured if stepper.estimates else stepper.step
     samples: tuple[np.ndarray, ...] = (run.time, run["state"], run["realised"])
@@ -342,7 +342,7 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> float | Non
         begin = time.perf_counter_ns()
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
-    return float(taken[1:].mean()) / 1e3
+    return float(taken.mean()) / 1e3
 
 
 def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:

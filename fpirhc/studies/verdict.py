@@ -83,10 +83,10 @@ def ranges(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         place, (low, high) = plant.output.elements.index(name), problem.limits.states.get(name, (0.0, 1.0))
         size, span = float(np.abs(rows[place]).max()), float(np.ptp(rows[place]))
         found[name] = max(span, abs(float(rows[place, 0] - problem.start_output[place])))
-        small = max(ROUNDING * size, 1e-300)
+        small = ROUNDING * size
         if found[name] <= small:
             wide = high - low if math.isfinite(high - low) else 1.0
-            found[name] = weights[name] ** -0.5 if weights.get(name, 0) > 0 else wide
+            found[name] = weights[name] ** -0.5 if weights.get(name) else wide
         resting |= {name: size} if span <= small else {}
     return found, resting
 
@@ -106,13 +106,13 @@ class Yardstick:
     def of(problem: Problem, seed: int) -> Yardstick:
         """Return the yardstick of a problem."""
         (scales, sizes), alone = ranges(problem), left_alone(problem, seed)
-        resting = {n: max(s, alone.get(n, 0.0)) if problem.disturbances or not s else s for n, s in sizes.items()}
+        resting = {n: max(s, alone.get(n, s)) if problem.disturbances or not s else s for n, s in sizes.items()}
         span = f"t = {problem.measure_from:.4g} to {problem.duration:.4g}{with_space(problem.time_unit)}"
         return Yardstick(scales, alone, resting, span)
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
-        return entry.errors[name] > max(self.scales[name], self.resting.get(name, 0.0))
+        return entry.errors[name] > max(one[name] for one in (self.scales, self.resting) if name in one)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,66 +127,62 @@ class Pair:
 
 def _left_alone(pair: Pair) -> float:
     alone = pair.yard.alone
-    return min((pair.adaptive.errors[n] / max(alone[n], 1e-300) for n in pair.names if n in alone), default=0.0)
+    return min((pair.adaptive.errors[n] / alone[n] for n in pair.names if alone.get(n)), default=math.nan)
 
 
 def _growth(pair: Pair) -> float:
     """By how much the error grows from quarter to quarter of the run, as that of an unstable loop."""
     errors = np.abs(pair.adaptive.run["true_error"])
     if len(errors) < 40:
-        return 0.0
+        return math.nan
     largest = np.array([part.max(axis=0) for part in np.array_split(errors, 4)])
     steps = largest[1:] / np.maximum(largest[:-1], 1e-300)
     exponential = (steps[0] > 1) & (steps[1:] >= 1.5).all(axis=0) & (steps[-1] >= 0.6 * steps[0])
-    return float(np.where(exponential, largest[-1] / np.maximum(largest[0], 1e-300), 0.0).max(initial=0.0))
+    return max((largest[-1] / np.maximum(largest[0], 1e-300))[exponential], default=math.nan)
 
 
 def _unsolved(pair: Pair) -> float:
-    return pair.adaptive.metrics.statuses.get(Status.NOT_CONVERGED.name, 0) / max(1, pair.adaptive.run.cycles)
-
-
-def _at_limit(entry: Entry) -> float:
-    return float(entry.metrics.values.get("at_limit", {}).get("", 0.0))
+    return pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles
 
 
 def _saturates(pair: Pair) -> float:
-    return _at_limit(pair.adaptive)
+    return pair.adaptive.metrics.at_limit
 
 
 def _moved(pair: Pair) -> dict[str, float]:
     """How many times as much each input moves; what stands still counts as moving by a millionth of its size."""
-    before, after = (e.metrics.values.get("total_variation", {}) for e in (pair.plain, pair.adaptive))
-    size = pair.adaptive.metrics.values.get("effort", {})
-    return {n: v / max(before[n], _STILL * size.get(n, 0.0), 1e-300) for n, v in after.items() if n in before and v > 0}
+    before, after = (e.metrics.total_variation for e in (pair.plain, pair.adaptive))
+    size = pair.adaptive.metrics.effort
+    return {n: v / max(before[n], _STILL * size[n]) for n, v in after.items() if v > 0}
 
 
 def _moves(pair: Pair) -> float:
-    return max(_moved(pair).values(), default=0.0)
+    return max(_moved(pair).values(), default=math.nan)
 
 
 def _chatters(pair: Pair) -> float:
     """The same of inputs that move many times their own span: a command that settles once moves by its span."""
     moved = _moved(pair)
     command = {n: pair.adaptive.run[f"command.{n}"] for n in moved}
-    back_and_forth = {n for n, c in command.items() if np.abs(np.diff(c)).sum() >= 10 * np.ptp(c) > 0}
-    return max((moved[n] for n in back_and_forth), default=0.0)
+    back_and_forth = {n for n, c in command.items() if np.abs(np.diff(c)).sum() >= 10 * np.ptp(c)}
+    return max((moved[n] for n in back_and_forth), default=math.nan)
 
 
 def _grows(pair: Pair) -> float:
-    return 0.0 if pair.adaptive.contraction is None else pair.adaptive.contraction.growing
+    return math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing
 
 
 def _null(pair: Pair) -> float:
     """How many times as large it makes the error of a right model, where the null test fails."""
     null = pair.adaptive.null
-    return null.ratio(null.worst) if null is not None and null.fails and not null.stuck else 0.0
+    return null.ratio(null.worst) if null is not None and null.fails and not null.stuck else math.nan
 
 
 @dataclass(frozen=True)
 class Flag:
     """A row of the table of flags."""
 
-    measure: Callable[[Pair], float]
+    measure: Callable[[Pair], float]  # NaN: there is nothing to measure
     least: float  # value from which it is raised
     text: str  # with the {value}, and the share of cycles at a limit {before}
     doubts: bool = False  # whether it turns a smaller error into a doubtful one
@@ -207,7 +203,7 @@ FLAGS = (
 
 def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
-    every, before = [(flag, flag.measure(pair)) for flag in FLAGS], _at_limit(pair.plain)
+    every, before = [(flag, flag.measure(pair)) for flag in FLAGS], pair.plain.metrics.at_limit
     raised = [(f, in_words(f.text, {"value": v, "before": before}, {})) for f, v in every if v > f.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
     return [one for one in raised if not (chatter and one[0].measure is _moves)]
@@ -260,7 +256,7 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     if abs(after - before) <= metric.floor or HELPS <= ratio <= HURTS:
         outcome = Outcome.NO_DIFFERENCE
     else:
-        outcome = Outcome.BETTER if aim.sign * (after - before) < 0 else Outcome.WORSE
+        outcome = Outcome.BETTER if aim.sign * after < aim.sign * before else Outcome.WORSE
     text = f"{names[1]} against {names[0]} by {aim.column}: {outcome} ({aim.text(before)} -> {aim.text(after)})."
     return Finding(text, outcome, names, {aim.column: ratio})
 

@@ -114,10 +114,10 @@ def test_a_shift_beyond_which_nothing_moves_is_refused(shift):
 
 
 @pytest.mark.parametrize("fraction", [0.4, 1.0, -0.7])
-@pytest.mark.parametrize("scale", [1.0, 20.0])
-def test_rotation(fraction, scale):
+@pytest.mark.parametrize(("scale", "longest"), [(1.0, 0), (20.0, 0), (20.0, 1), (20.0, 2)])
+def test_rotation(fraction, scale, longest):
     """The request, with its dummy component, is turned by a fraction of the angle from f to d in their plane; R outgrows them."""
-    r, f, d = (scale * np.array(v) for v in ([1.0, -2.0], [3.0, 1.0], [2.0, 2.5]))
+    r, f, d = scale * np.roll([[3.0, 1.0], [1.0, -2.0], [2.0, 2.0]], longest, axis=0)
     radius = max(10.0, 2 * float(np.linalg.norm([r, f, d], axis=1).max()))
     request, start, end = (np.append(v, math.sqrt(radius**2 - v @ v)) for v in (r, f, d))
     first = start / radius

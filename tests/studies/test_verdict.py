@@ -158,6 +158,7 @@ def test_flags_turn_a_smaller_error_into_a_doubtful_one():
 NUMBERS = {
     "lower": (2.0, 1.0, "better"), "higher": (1.0, 1.5, "worse"), "near": (0.1, 0.105, "no difference"),
     "below zero": (-2.0, -1.0, "worse"), "beyond zero": (1.0, -1.0, "better"), "from nothing": (0.0, 1.0, "worse"),
+    "to nothing": (1.0, 0.0, "better"),
     "rounding": (0.0, 1e-13, "no difference"), "none": (math.nan, math.nan, "not comparable"),
     "none with": (1.0, math.nan, "WORSE"), "none without": (math.nan, 1.0, "BETTER"),
 }  # fmt: skip
@@ -248,10 +249,11 @@ def test_plans_contraction_and_null_tests_raise_flags_and_a_cost_says_what_count
         ({"reference": fp.Trajectory(lambda t: {"y": 1.5 + 0.1 * ca.sin(t)}), "start": {"y": 1.0}}, 0.5),
         ({"start": {"y": 0.5}}, 0.5),
         ({"limits": fp.Limits(states={"y": (0.0, 4.0)}), "start": {"y": 1.0}}, 4.0),
-        ({"cost": fp.Quadratic(states={"y": 4.0}), "horizon": fp.Horizon(5, 1e-2), "start": {"y": 1.0}}, 0.5),
+        ({"limits": fp.Limits(states={"y": (0.0, math.inf)}), "start": {"y": 1.0}}, 1.0),
+        ({"cost": fp.Quadratic(states={"y": 0.25}), "horizon": fp.Horizon(5, 1e-2), "start": {"y": 1.0}}, 2.0),
         ({"reference": fp.Trajectory(lambda t: {"y": 1e3 + 0 * t}), "start": {"y": 1e3 + 1e-7}}, 1.0),
     ],
-    ids=["range", "start", "limits", "weight", "rounding"],
+    ids=["range", "start", "limits", "an open limit", "weight", "rounding"],
 )
 def test_errors_are_measured_against_the_motion_that_is_wanted(changes, scale):
     """The range of the reference, or how far the start is from it, m; else the cost's weight, the limits, or 1."""
