@@ -29,14 +29,6 @@ def advance(deformation: Deformation, request: Any, response: Any, desired: Any)
     return np.asarray(function(request, response, desired).full())[:, 0]
 
 
-def iterate(deformation: Deformation, jacobian: np.ndarray, start: np.ndarray, cycles: int) -> np.ndarray:
-    """Requests r_0 ... r_cycles on the plant f(r) = J r with desired response 0, so with fixed point 0."""
-    n = len(start)
-    r = ca.SX.sym("r", n)
-    one = ca.Function("one", [r], [deformation.step(r, ca.mtimes(ca.DM(jacobian), r), ca.SX.zeros(n), {})[0]])
-    return np.vstack([start, np.asarray(one.mapaccum(cycles)(start).full()).T])
-
-
 @pytest.mark.parametrize("elements", [("q1",), ("q1", "q2", "q3")], ids=len)
 @pytest.mark.parametrize("deformation", ITERATING, ids=name_of)
 def test_conformance(deformation: Deformation, elements: tuple[str, ...]) -> None:
@@ -84,18 +76,3 @@ def test_sigmoid_keeps_its_digits(gain: float, shift: float, size: float) -> Non
     step = float(advance(fp.Sigmoid(gain=gain, shift=shift, scale=1.0), 0.0, size, 0.0)[0])
     rounded_off = 1e-9 / math.hypot(size, 1e-9)  # the norm's floor changes the step where the error is near 1e-9
     assert step == pytest.approx(exact_sigmoid_step(gain, shift, size), rel=1e-13 + 1e-8 * rounded_off)
-
-
-@pytest.mark.parametrize("gain", [-4.2, -4.3, -4.9])  # unit plant: sector limit 4.2315, linear limit 5.0411
-def test_sector_and_linear_limit(gain: float) -> None:
-    """Between the sector and the linear limit large errors end in a bounded 2-cycle, small ones die out."""
-    sigmoid, plant = fp.Sigmoid(gain=gain, scale=1.0), np.eye(1)
-    small = np.abs(iterate(sigmoid, plant, np.array([1e-3]), 3000)[-1, 0])
-    large = iterate(sigmoid, plant, np.array([5.0]), 3000)[-2:, 0]
-    assert small < 1e-6
-    if sigmoid.secant_gain() < 2:
-        assert np.abs(large).max() < 1e-6
-    else:
-        assert large[0] == pytest.approx(-large[1], rel=1e-6)
-        assert 0.01 < np.abs(large[0]) < 1.0
-    assert sigmoid.effective_gain() < 2
