@@ -146,13 +146,13 @@ def _unsolved(pair: Pair) -> float:
 
 
 def _saturates(pair: Pair) -> float:
-    return pair.adaptive.metrics.at_limit
+    return pair.adaptive.metrics["at_limit"][""]
 
 
 def _moved(pair: Pair) -> dict[str, float]:
     """How many times as much each input moves; what stands still counts as moving by a millionth of its size."""
     before, after = (e.metrics.total_variation for e in (pair.plain, pair.adaptive))
-    size = pair.adaptive.metrics.effort
+    size = pair.adaptive.metrics["effort"]
     return {n: v / max(before[n], _STILL * size[n]) for n, v in after.items() if v > 0}
 
 
@@ -203,7 +203,7 @@ FLAGS = (
 
 def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
-    every, before = [(flag, flag.measure(pair)) for flag in FLAGS], pair.plain.metrics.at_limit
+    every, before = [(flag, flag.measure(pair)) for flag in FLAGS], pair.plain.metrics["at_limit"][""]
     raised = [(f, in_words(f.text, {"value": v, "before": before}, {})) for f, v in every if v > f.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
     return [one for one in raised if not (chatter and one[0].measure is _moves)]
