@@ -125,9 +125,9 @@ def _split(ocp: OptimalControl) -> _Parts:
     rates, slopes = jacobian[:ns, :], jacobian[ns, :].T
     return {
         "evaluate": _dense("fpirhc_evaluate_stage", [s, u, theta], [next_state, cost, values]),
-        "pull": _dense("fpirhc_pull_stage", [symbols, after, theta], [pulled[:ns], pulled[ns:]]),
+        "pull": _dense("fpirhc_pull_stage", [symbols, after], [pulled[:ns], pulled[ns:]]),
         "linearise": _dense(
-            "fpirhc_linearise_stage", [symbols, theta], [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]]
+            "fpirhc_linearise_stage", [symbols], [rates[:, :ns], rates[:, ns:], slopes[:ns], slopes[ns:]]
         ),
     }
 

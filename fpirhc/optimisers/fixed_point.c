@@ -22,7 +22,7 @@ typedef struct {
 /* The costate of a node: that of the end stays, and of the others all or the last two. */
 #define COSTATE(i) (s->lambda + NS * (COSTATES > N ? (i) : (i) == N ? 2 : (i) & 1))
 
-typedef char search_fits[sizeof(Search) == ROOM * sizeof(casadi_real) ? 1 : -1];
+FITS(Search, search_fits);
 
 static const casadi_real scale[NU] = SCALE;
 
@@ -41,8 +41,7 @@ INLINE casadi_real descended(const Search* s, const Plan* plan, int k) {
 INLINE int try_next(Search* s, const Plan* best, Plan* plan, In gains, In s0, In data, In lower, In upper) {
   int i, j, l;
   int bold = s->tau >= SHORTEST, untried = best->value >= UNTRIED;
-  In arg[8];
-  Out res[8];
+  SLOTS;
   casadi_real cost, slope[NS];
   plan->value = 0;
   for (j = 0; j < NS; ++j) plan->x[j] = s0[j];
@@ -58,20 +57,20 @@ INLINE int try_next(Search* s, const Plan* best, Plan* plan, In gains, In s0, In
     }
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
     res[0] = x + NS, res[1] = &cost, res[2] = s->partials + i * NM;
-    if (evaluate(arg, res, 0, 0, 0)) return 0;
+    NEEDED(evaluate);
     plan->value += cost;
   }
   arg[0] = plan->x + N * NS, arg[1] = data + N * NT;
   res[0] = &cost, res[1] = slope, res[2] = s->final;
-  if (end(arg, res, 0, 0, 0)) return 0;
+  NEEDED(end);
   plan->value += cost;
   for (j = 0; j < NS; ++j) COSTATE(N)[j] = slope[j];
   for (i = N - 1; i >= 0; --i) {
-    arg[0] = s->partials + i * NM, arg[1] = COSTATE(i + 1), arg[2] = data + i * NT;
+    arg[0] = s->partials + i * NM, arg[1] = COSTATE(i + 1);
     res[0] = COSTATE(i), res[1] = plan->g + i * NU;
-    if (pull(arg, res, 0, 0, 0)) return 0;
+    NEEDED(pull);
   }
-  return all_finite(&plan->value, 1) & all_finite(plan->g, N * NU) & all_finite(plan->x, (N + 1) * NS);
+  return IS_FINITE(plan);
 }
 
 /* The plain fixed-point step t = clip(U - gamma D g); returns g'(t - U), and in reach |t - U|^2 / (2 gamma). */
@@ -109,7 +108,7 @@ INLINE int judged(Search* s, const Plan* best, const Plan* plan, int ok, In lowe
   if (ok) {
     s->envelope = envelope, s->reach = reach;
     s->tau = untried ? s->resume : 1;
-    s->sent = 10 * UNTRIED;
+    s->sent = BEYOND;
     return 1;
   }
   if (!untried && !bold) {
@@ -193,22 +192,21 @@ INLINE void box_policy(In slope, In matrix, In low, In high, Out v, int* free, O
 /* Note what a sweep at the plan wants. Where the cost is flat a move is no error: it lowers the cost by nothing. */
 INLINE void want(Search* s, const Plan* plan, casadi_real most, casadi_real fall) {
   casadi_real flat = FLAT * fabs(plan->value);
-  s->sent = fall > flat ? most : fall <= flat ? 0 : 10 * UNTRIED; /* what is no number is no certificate */
+  s->sent = fall > flat ? most : fall <= flat ? 0 : BEYOND; /* what is no number is no certificate */
 }
 
 /* What a sweep at an accepted plan would want, by one adjoint pass with the factors of the last sweep. */
-INLINE int look(Search* s, const Plan* plan, In gains, In data, In lower, In upper) {
+INLINE int look(Search* s, const Plan* plan, In gains, In lower, In upper) {
   int i, j, l;
-  In arg[8];
-  Out res[8];
+  SLOTS;
   casadi_real ahead[NS], fall = 0, most = 0;
   for (j = 0; j < NS; ++j) ahead[j] = COSTATE(N)[j];
   for (i = N - 1; i >= 0; --i) {
     casadi_real next[NS], steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], v[NU];
     int free[NU];
-    arg[0] = s->partials + i * NM, arg[1] = ahead, arg[2] = data + i * NT;
+    arg[0] = s->partials + i * NM, arg[1] = ahead;
     res[0] = next, res[1] = steep;
-    if (pull(arg, res, 0, 0, 0)) return 1;
+    NEEDED(pull);
     for (l = 0; l < NU; ++l) low[l] = lower[l] - plan->u[i * NU + l], high[l] = upper[l] - plan->u[i * NU + l];
     box_policy(steep, s->curved + i * NU * NU, low, high, v, free, factor, pivots);
     for (l = 0; l < NU; ++l) fall -= 0.5 * steep[l] * v[l], most = larger(most, fabs(v[l]));
@@ -216,14 +214,13 @@ INLINE int look(Search* s, const Plan* plan, In gains, In data, In lower, In upp
       for (ahead[j] = next[j], l = 0; l < NU; ++l) ahead[j] += gains[(i * NS + j) * NU + l] * steep[l];
   }
   want(s, plan, most, fall);
-  return 0;
+  return 1;
 }
 
 /* One Riccati sweep around the accepted plan: feedforward v, deformed, and feedback K. */
 INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In upper) {
   int i, j, l, m;
-  In arg[8];
-  Out res[8];
+  SLOTS;
   casadi_real p[NS * NS], lean[NS], wanted[N * NU], moved[N * NU], fall = 0, most = 0;
   for (j = 0; j < NS * NS; ++j) p[j] = s->final[j];
   for (j = 0; j < NS; ++j) lean[j] = COSTATE(N)[j];
@@ -233,12 +230,12 @@ INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In 
     casadi_real steep[NU], low[NU], high[NU], factor[NU * NU], pivots[NU], *v = wanted + i * NU, k[NU * NS];
     casadi_real next[NS], pull[NU], gap[NU];
     int free[NU];
-    arg[0] = s->partials + i * NM, arg[1] = data + i * NT;
+    arg[0] = s->partials + i * NM;
     res[0] = a, res[1] = b, res[2] = ls, res[3] = lu;
-    if (linearise(arg, res, 0, 0, 0)) return 1;
+    NEEDED(linearise);
     arg[0] = plan->x + i * NS, arg[1] = plan->u + i * NU, arg[2] = data + i * NT, arg[3] = COSTATE(i + 1);
     res[0] = q, res[1] = cross, res[2] = r;
-    if (hessian(arg, res, 0, 0, 0)) return 1;
+    NEEDED(hessian);
     condense(q, cross, r, p, a, b, turned);
     for (l = 0; l < NU; ++l) {
       r[l * NU + l] += DAMPING / scale[l];
@@ -272,11 +269,11 @@ INLINE int direct(Search* s, const Plan* plan, Out gains, In data, In lower, In 
     for (j = 0; j < NS; ++j)
       for (m = 0; m < NS; ++m) p[j * NS + m] = 0.5 * (q[j * NS + m] + q[m * NS + j]);
   }
-  arg[0] = wanted, arg[1] = data, res[0] = moved;
-  if (deformed(arg, res, 0, 0, 0)) return 1;
+  arg[0] = wanted, res[0] = moved;
+  NEEDED(deformed);
   for (i = 0; i < N * NU; ++i) s->v[i] = moved[i];
   want(s, plan, most, fall);
-  return 0;
+  return 1;
 }
 
 /* max |U - clip(U - D g)| */
@@ -301,9 +298,9 @@ INLINE void begin(Search* s, Plan* best, Out gains, In memory, int posed, In low
     }
   for (i = 0; i < N * NS; ++i) best->x[i] = known ? memory[N * NU + i] : 0;
   for (i = 0; i < N * NU * NS; ++i) gains[i] = (known | !posed) ? memory[GAINS + i] : 0;
-  best->value = s->envelope = 10 * UNTRIED;
+  best->value = s->envelope = BEYOND;
   s->reach = 0;
-  s->sent = 10 * UNTRIED;
+  s->sent = BEYOND;
   s->tau = 1;
   s->resume = tau > 0 ? smaller(tau, 1) : 1;
   /* After a rejected T a longer gamma would be rejected again, in every call of one iteration. */
@@ -324,8 +321,7 @@ INLINE void remember(const Search* s, const Plan* best, int good, int posed, In 
 
 /* The gains of the new memory serve as those of the search, and stay the old ones where nothing is posed. */
 static int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
-  static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
-#define GIVEN(k) (arg[k] ? arg[k] : nothing)
+  NOTHING;
   In s0 = GIVEN(0), data = GIVEN(1), lower = GIVEN(2), upper = GIVEN(3), memory = GIVEN(4);
   Search* restrict s = (Search*)w;
   Plan *best = s->plans, *plan = s->plans + 1;
@@ -340,7 +336,7 @@ static int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
       Plan* other = best;
       best = plan, plan = other;
     }
-    if (accepted && swept && (STOP_EARLY || tried == ITERATIONS) && look(s, best, gains, data, lower, upper)) return 1;
+    if (accepted && swept && (STOP_EARLY || tried == ITERATIONS) && !look(s, best, gains, lower, upper)) return 1;
     if (tried == ITERATIONS) break;
     if (STOP_EARLY) {
       /* A small gradient alone is no certificate: at a plan where the inputs do nothing it is small too. In open loop a sweep at the
@@ -349,7 +345,7 @@ static int run(const casadi_real** arg, casadi_real** res, casadi_real* w) {
       if (plain >= PLAIN) break;
       if ((sure || !CONVERGING) && best->value < UNTRIED && s->sent <= TOLERANCE && residual(best, lower, upper) <= TOLERANCE) break;
     }
-    if (accepted && direct(s, best, gains, data, lower, upper)) return 1;
+    if (accepted && !direct(s, best, gains, data, lower, upper)) return 1;
     swept |= accepted;
   }
   good = posed && best->value < UNTRIED;

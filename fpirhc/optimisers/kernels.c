@@ -3,6 +3,18 @@
 typedef const casadi_real* In;
 typedef casadi_real* Out;
 
+#define BEYOND (10 * FINITE) /* every number */
+#define SOME(count) ((count) + 1) /* so that no array is empty */
+#define GIVEN(k) (arg[k] ? arg[k] : nothing) /* CasADi passes no address for zeros */
+#define NOTHING static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]
+/* A stage function needs no work; where it fails, so does the function that calls it, and returns 0. */
+#define SLOTS In arg[8]; Out res[8]
+#define CALLED(leaf) (void)leaf(arg, res, 0, 0, 0)
+#define NEEDED(leaf) do { if (leaf(arg, res, 0, 0, 0)) return 0; } while (0)
+/* Structs of numbers alone. */
+#define FITS(type, fits) typedef char fits[sizeof(type) == ROOM * sizeof(casadi_real) ? 1 : -1]
+#define IS_FINITE(of) all_finite((In)(of), sizeof *(of) / sizeof(casadi_real))
+
 /* fmax and fmin without calls of the library: where one is not a number, the other. */
 INLINE casadi_real larger(casadi_real a, casadi_real b) { return ((a > b) | (b != b)) ? a : b; }
 INLINE casadi_real smaller(casadi_real a, casadi_real b) { return ((a < b) | (b != b)) ? a : b; }

@@ -17,7 +17,6 @@
 #define MU_MOST 0.1
 #define MU_END 1e-5    /* where pure steps are tried first, and last: there limits whose multipliers nearly vanish are 1e-7 of a unit away */
 #define MU_LEAST 1e-15
-#define MU_ROUNDS 8    /* reductions after one accepted plan */
 #define FILTER 64      /* pairs that the filter holds */
 #define POOR 0.1       /* share of a step from a remembered plan below which its barrier is raised, at most so often in a call */
 #define MOST_REWARMS 3
@@ -38,7 +37,7 @@ typedef struct {
   Point points[2];
   Duals y, by;
   Direction move;
-  casadi_real next_z[2][COUNT], best_u[N * NU], best_x[(N + 1) * NS], best_z[2][COUNT];
+  casadi_real next_z[SIDES][COUNT], best_u[N * NU], best_x[(N + 1) * NS], best_z[SIDES][COUNT];
   casadi_real weight[COUNT], lean[COUNT], costates[(N + 1) * NS], g[N * NU], gaps[N * NS];
   union {
     casadi_real partials[N * NM]; /* while a plan is expanded */
@@ -49,12 +48,12 @@ typedef struct {
   } shared;
 } Room;
 
-typedef char room_fits[sizeof(Room) == ROOM * sizeof(casadi_real) ? 1 : -1];
+FITS(Room, room_fits);
 
 typedef struct {
   Room* room;
   Limits limits;
-  casadi_real filter[FILTER][2], inside[2][NU], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
+  casadi_real thetas[FILTER], phis[FILTER], inside[SIDES][NU], price, mu, floor, delta, error, alpha, alpha_dual, theta, phi, dphi;
   Certificate last;
   int phase, place_of, fresh, again, slacks, misses, steps, halvings, raises, filtered, start, use_exact, stuck, rolled, rewarms;
   int known;    /* whether a plan is remembered */
@@ -89,11 +88,10 @@ static casadi_real gap_price(const Machine* m) {
 
 /* Change of phi along the move, to first order. */
 static casadi_real log_slope(const Machine* m, const Point* p) {
-  int side, i, r, k, j;
+  int side, i, r, k;
   casadi_real sum = 0;
   for (k = 0; k < N * NU; ++k) sum += p->lu[k] * m->room->move.du[k];
-  for (k = 0; k < N * NS; ++k) sum += p->ls[k] * m->room->move.dx[k];
-  for (j = 0; j < NS; ++j) sum += p->tail[j] * m->room->move.dx[N * NS + j];
+  for (k = NS; k < (N + 1) * NS; ++k) sum += (k < N * NS ? p->ls[k] : p->tail[k - N * NS]) * m->room->move.dx[k];
   EACH_LIMIT(&m->limits) {
     sum -= m->mu * m->room->by.t[side][k] / m->room->y.t[side][k];
     if (r >= NU) sum += (capacity(r) - m->mu / m->room->y.e[side][k]) * m->room->by.e[side][k];
@@ -113,7 +111,7 @@ static casadi_real squared_move(const Machine* m) {
 static casadi_real barrier_error(const Machine* m, const Point* p, casadi_real* least, casadi_real* most) {
   int side, i, r, k, j, l;
   casadi_real worst = largest_gap(p), push[COUNT];
-  *least = 10 * FINITE, *most = 0;
+  *least = BEYOND, *most = 0;
   for (k = 0; k < COUNT; ++k) push[k] = 0;
   EACH_LIMIT(&m->limits) {
     casadi_real t = m->room->y.t[side][k], z = m->room->y.z[side][k], e = m->room->y.e[side][k];
@@ -157,7 +155,7 @@ static casadi_real returned_left(Machine* m, const Point* p) {
     casadi_real u = p->u[k];
     left = larger(left, fabs(u - between(u - g[k] / curvature[k % NU], m->limits.at[0][k % NU], m->limits.at[1][k % NU])));
   }
-  return all_finite(g, N * NU) ? left : 10 * FINITE;
+  return all_finite(g, N * NU) ? left : BEYOND;
 }
 
 /* Begin without a memory: the inputs given or fed forward; the state held, rolled out, or the reference. */
@@ -165,10 +163,9 @@ static void begin_cold(Machine* m, Point* p, In s0, In data, In lower, In upper,
   int i, j, l;
   casadi_real x[NS], u[NU];
   for (i = 0; i <= N; ++i) {
-    In arg[8];
-    Out res[8];
+    SLOTS;
     arg[0] = data + i * NT, res[0] = x, res[1] = u;
-    guess(arg, res, 0, 0, 0);
+    CALLED(guess);
     for (j = 0; j < NS; ++j) p->x[i * NS + j] = m->start == REFERENCE || m->start == DESCENT ? x[j] : s0[j];
     for (l = 0; l < NU && i < N; ++l) {
       casadi_real hair = smaller(0.01 * unit[l], 0.25 * (upper[l] - lower[l]));
@@ -200,7 +197,7 @@ static In box(Machine* m, int side, In limit, In other) {
 static void keep(Machine* m, const Point* p) {
   int k;
   for (k = 0; k < N * NU; ++k) m->room->best_u[k] = p->u[k];
-  for (k = 0; k < (N + 1) * NS; ++k) m->room->best_x[k] = p->x[k];
+  for (k = NS; k < (N + 1) * NS; ++k) m->room->best_x[k] = p->x[k];
   for (k = 0; k < COUNT; ++k) m->room->best_z[0][k] = m->room->y.z[0][k], m->room->best_z[1][k] = m->room->y.z[1][k];
 }
 
@@ -214,7 +211,7 @@ static void enter_interior(Machine* m, Point* p) {
     if (m->misses == 0) return;
   }
   for (k = 0; k < N * NU; ++k) p->u[k] = m->room->best_u[k];
-  for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = m->room->best_x[k];
+  for (k = NS; k < (N + 1) * NS; ++k) p->x[k] = m->room->best_x[k];
   for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = m->room->best_z[0][k], m->room->y.z[1][k] = m->room->best_z[1][k];
   m->fresh = 1;
   if (m->place_of == BEGINS) return;
@@ -231,9 +228,8 @@ static void enter_pure(Machine* m, const Point* p, int place_of) {
 
 /* After an accepted interior plan: lower mu, and see whether pure steps can end it. */
 static void advance_interior(Machine* m, const Point* p) {
-  int k;
   casadi_real least, most, rest = barrier_error(m, p, &least, &most);
-  for (k = 0; k < MU_ROUNDS; ++k) {
+  for (;;) {
     casadi_real worst = larger(rest, larger(most - m->mu, least < FINITE ? m->mu - least : 0) / COST);
     if (worst > 10 * m->mu / COST || m->mu <= m->floor) break;
     m->mu = larger(m->floor, smaller(0.2 * m->mu, m->mu * sqrt(m->mu / COST)));
@@ -254,12 +250,12 @@ static int passes(Machine* m, casadi_real theta, casadi_real phi) {
   int k, falls, descends;
   casadi_real slack = ROUNDING * (COST + fabs(m->phi));
   for (k = 0; k < m->filtered; ++k)
-    if (theta > (1 - 1e-5) * m->filter[k][0] && phi > m->filter[k][1] - 1e-5 * m->filter[k][0] * COST) return 0;
+    if (theta > (1 - 1e-5) * m->thetas[k] && phi > m->phis[k] - 1e-5 * m->thetas[k] * COST) return 0;
   if (theta <= m->theta && phi <= m->phi + slack) return 1;
   descends = m->dphi < 0 && m->theta <= 1e-4 * N && pow(m->alpha * -m->dphi / COST, 2.3) > pow(m->theta, 1.1);
   if (descends) return phi <= m->phi + 1e-4 * m->alpha * m->dphi + slack;
   falls = theta <= (1 - 1e-5) * m->theta || phi <= m->phi - 1e-5 * m->theta * COST;
-  if (falls && m->filtered < FILTER) m->filter[m->filtered][0] = m->theta, m->filter[m->filtered++][1] = m->phi;
+  if (falls && m->filtered < FILTER) m->thetas[m->filtered] = m->theta, m->phis[m->filtered++] = m->phi;
   return falls;
 }
 
@@ -363,7 +359,7 @@ static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   m->use_exact |= m->phase == INTERIOR || !ok;
   if (!ok) {
     m->delta = larger(10 * m->delta, 1e-6);
-    m->fresh = 2; /* try again from the same plan */
+    m->fresh = 1; /* try again from the same plan */
     if (m->delta > 1e8) restart(m, p, s0, data, lower, upper);
   } else if (m->phase == PURE) {
     pure_multipliers(&m->limits, p, &m->room->y, &m->room->move, m->room->next_z);
@@ -379,16 +375,14 @@ static void direct(Machine* m, Point* p, In s0, In data, In lower, In upper) {
   }
 }
 
-static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In upper) {
+static void begin(Machine* m, Room* room, Point* p, In memory, In s0, In data, In lower, In upper) {
   int k, has_guess = 0;
   In z = memory + N * NU + 2 * N * NS + N * NU * NS;
+  memset(m, 0, sizeof *m);
+  m->room = room;
   set_limits(&m->limits, lower, upper);
   m->known = all_finite(memory, MEMORY) && memory[MEMORY - 2] > 0;
-  m->stuck = m->again = m->rolled = m->descends = m->filtered = m->raises = m->halvings = m->misses = m->steps = m->rewarms = 0;
-  m->price = m->alpha = m->alpha_dual = m->dphi = m->theta = m->phi = m->error = 0;
-  m->last.gap = m->last.error = m->last.left = m->last.violation = m->last.broken = 10 * FINITE;
   for (k = 0; k < COUNT; ++k) m->room->y.z[0][k] = m->known ? z[k] : 0, m->room->y.z[1][k] = m->known ? z[COUNT + k] : 0;
-  for (k = 0; k < COUNT; ++k) m->room->y.t[0][k] = m->room->y.t[1][k] = 1, m->room->y.e[0][k] = m->room->y.e[1][k] = 0;
   for (k = 0; k < COUNT; ++k) m->room->next_z[0][k] = m->room->next_z[1][k] = 0; /* limits that are not there stay so */
   m->start = m->known ? -1 : 0;
   if (!m->known) {
@@ -397,10 +391,9 @@ static void begin(Machine* m, Point* p, In memory, In s0, In data, In lower, In 
     return;
   }
   for (k = 0; k < N * NU; ++k) p->u[k] = between(memory[k], lower[k % NU], upper[k % NU]);
-  for (k = 0; k < NS; ++k) p->x[k] = s0[k];
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k], m->room->costates[NS + k] = memory[N * NU + N * NS + k];
   for (k = 0; k < N * NU * NS; ++k) m->room->move.k[k] = memory[N * NU + 2 * N * NS + k];
-  m->mu = memory[MEMORY - 2] * COST, m->delta = memory[MEMORY - 1], m->floor = MU_END * COST;
+  m->delta = memory[MEMORY - 1];
   m->phase = PURE, m->place_of = BEGINS, m->fresh = 1, m->slacks = WARM, m->use_exact = !PLAIN_FIRST;
 }
 
@@ -424,15 +417,14 @@ static int next_plan(Machine* m, const Point* best, Point* p) {
   for (k = 0; k < (N + 1) * NS; ++k) p->x[k] = best->x[k] + (share > 0 && !descends ? share * m->room->move.dx[k] : 0);
   if (pure) {
     casadi_real made[N * NU];
-    In arg[8];
-    Out res[8];
+    SLOTS;
     arg[0] = m->room->move.v, res[0] = made;
-    deformed(arg, res, 0, 0, 0);
+    CALLED(deformed);
     for (k = 0; k < N * NU; ++k) p->u[k] += made[k];
   }
-  for (k = 0; k < N * NS && descends; ++k) m->room->gaps[k] = (1 - share) * (best->f[k] - best->x[k + NS]);
+  for (k = 0; k < N * NS; ++k) m->room->gaps[k] = descends ? (1 - share) * (best->f[k] - best->x[k + NS]) : 0;
   if (descends && !m->fresh) return 1;
-  return m->fresh ? m->fresh == 1 && m->slacks == COLD && m->start == ROLLED : pure;
+  return m->fresh ? m->slacks == COLD && m->start == ROLLED : pure;
 }
 
 /* Cost of a plan with the price of its violations. */
@@ -454,27 +446,25 @@ static int plan_in_force(Machine* m, Point* p, const Point* other, In memory, In
   for (k = 0; k < N * NS; ++k) p->x[NS + k] = memory[N * NU + k];
   if (!evaluated(p, memory + N * NU + 2 * N * NS, 1, 0, s0, data, lower, upper, m->room->shared.partials)) return 0;
   if (other && !(priced_cost(&m->limits, p) < priced_cost(&m->limits, other))) return 0;
-  return differentiated(p, data, m->room->shared.partials);
+  return differentiated(p, m->room->shared.partials);
 }
 
 int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_real* w, int mem) {
-  static const casadi_real nothing[(N + 1) * NT + MEMORY + NS + NU]; /* CasADi passes no address for zeros */
-  In s0 = arg[0] ? arg[0] : nothing, data = arg[1] ? arg[1] : nothing, memory = arg[4] ? arg[4] : nothing;
-  In lower = arg[2] ? arg[2] : nothing, upper = arg[3] ? arg[3] : nothing;
+  NOTHING;
+  In s0 = GIVEN(0), data = GIVEN(1), lower = GIVEN(2), upper = GIVEN(3), memory = GIVEN(4);
   Room* room = (Room*)w;
   Machine m;
   Point *best = room->points, *p = room->points + 1, *other;
   const Point* certain; /* the plan whose certificate is known */
   casadi_real left = 0;
   Certificate c = {0, 0, 0, 0, 0};
-  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, ok = 0, ended = 0;
+  int i, posed = sane(s0, data, lower, upper), count = 0, empty = 0, status, held, ok, ended = 0;
   (void)iw, (void)mem;
-  m.room = room;
   for (i = 0; i < NU; ++i) empty |= lower[i] > upper[i];
-  begin(&m, best, memory, s0, data, lower, upper);
+  begin(&m, room, best, memory, s0, data, lower, upper);
   for (; posed; ++count) {
     int final = count == ITERATIONS, rolled = next_plan(&m, best, p), accepted;
-    ok = expand(p, m.room->move.k, rolled, m.descends && m.phase == INTERIOR ? m.room->gaps : 0, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), room->shared.partials);
+    ok = expand(p, m.room->move.k, rolled, m.room->gaps, s0, data, box(&m, 0, lower, upper), box(&m, 1, upper, lower), room->shared.partials);
     accepted = judged(&m, best, p, ok, rolled, s0, data, lower, upper);
     if (accepted) other = best, best = p, p = other, m.rolled = rolled && !m.descends;
     ended = !m.fresh && m.phase == PURE && is_done(&m.last, FEASIBLE) && (left = returned_left(&m, best)) <= TOLERANCE;
@@ -490,7 +480,8 @@ int ENTRY(const casadi_real** arg, casadi_real** res, casadi_int* iw, casadi_rea
   }
   if (posed && !ended) {
     p = best == m.room->points ? m.room->points + 1 : m.room->points;
-    if (plan_in_force(&m, p, ok ? best : 0, memory, s0, data, lower, upper)) best = p, ok = 1;
+    held = plan_in_force(&m, p, ok ? best : 0, memory, s0, data, lower, upper);
+    ok |= held, best = held ? p : best;
   }
   if (ok) {
     casadi_real g[N * NU];

@@ -24,7 +24,7 @@ typedef struct {
 
 /* Feedforward v, feedback K, the linear prediction (dx, du) and the costates of s_1 ... s_N. */
 typedef struct {
-  casadi_real v[N * NU], k[N * NU * NS], dx[(N + 1) * NS], du[N * NU], costates[(N + 1) * NS];
+  casadi_real v[N * NU], k[N * NU * NS], costates[(N + 1) * NS], dx[(N + 1) * NS], du[N * NU];
 } Direction;
 
 /* A sweep's cost to go. */
@@ -32,16 +32,15 @@ typedef struct {
   casadi_real values[(N + 1) * NS * NS], slopes[(N + 1) * NS];
 } Scratch;
 
-static const int place[NB + 1] = PLACES;
+static const int place[SOME(NB)] = PLACES;
 static const casadi_real curvature[NU] = CURVATURE; /* step times curvature of the cost rate */
-static const casadi_real unit[NU + NB + 1] = UNITS, spread[NS] = SPREADS;
+static const casadi_real unit[SOME(ROWS)] = UNITS, spread[NS] = SPREADS;
 
 /* Evaluate the plan at its own nodes, or (rolled) at the states that follow from s_0 with u = clip(U + K (x - X)), less the gaps that
    the plan is to have, if any; 0 where a function fails. */
 static int evaluated(Point* p, In k, int rolled, In gaps, In s0, In data, In lower, In upper, Out partials) {
   int i, j, l;
-  In arg[8];
-  Out res[8];
+  SLOTS;
   casadi_real cost, at[NS];
   for (j = 0; j < NS; ++j) at[j] = s0[j];
   p->value = 0;
@@ -54,34 +53,32 @@ static int evaluated(Point* p, In k, int rolled, In gaps, In s0, In data, In low
     for (j = 0; j < NS && (rolled || i == 0); ++j) x[j] = at[j];
     arg[0] = x, arg[1] = u, arg[2] = data + i * NT;
     res[0] = p->f + i * NS, res[1] = &cost, res[2] = partials + i * NM;
-    if (evaluate(arg, res, 0, 0, 0)) return 0;
+    NEEDED(evaluate);
     p->value += cost;
     for (j = 0; j < NS; ++j) at[j] = p->f[i * NS + j] - (gaps ? gaps[i * NS + j] : 0);
   }
   for (j = 0; j < NS && rolled; ++j) p->x[N * NS + j] = at[j];
   arg[0] = p->x + N * NS, arg[1] = data + N * NT;
   res[0] = &cost, res[1] = p->tail, res[2] = p->final;
-  if (end(arg, res, 0, 0, 0)) return 0;
+  NEEDED(end);
   p->value += cost;
   return 1;
 }
 
 /* The derivatives of a plan that has just been evaluated; 0 when it is not finite. */
-static int differentiated(Point* p, In data, In partials) {
-  int i, ok;
-  In arg[8];
-  Out res[8];
+static int differentiated(Point* p, In partials) {
+  int i;
+  SLOTS;
   for (i = 0; i < N; ++i) {
-    arg[0] = partials + i * NM, arg[1] = data + i * NT;
+    arg[0] = partials + i * NM;
     res[0] = p->a + i * NS * NS, res[1] = p->b + i * NS * NU, res[2] = p->ls + i * NS, res[3] = p->lu + i * NU;
-    if (linearise(arg, res, 0, 0, 0)) return 0;
+    NEEDED(linearise);
   }
-  ok = all_finite(&p->value, 1) && all_finite(p->f, N * NS) && all_finite(p->ls, N * NS) && all_finite(p->lu, N * NU);
-  return ok && all_finite(p->tail, NS) && all_finite(p->a, N * NS * NS) && all_finite(p->b, N * NS * NU);
+  return IS_FINITE(p);
 }
 
 static int expand(Point* p, In k, int rolled, In gaps, In s0, In data, In lower, In upper, Out partials) {
-  return evaluated(p, k, rolled, gaps, s0, data, lower, upper, partials) && differentiated(p, data, partials);
+  return evaluated(p, k, rolled, gaps, s0, data, lower, upper, partials) && differentiated(p, partials);
 }
 
 /* L D L'; 0 when a pivot is not positive. */
@@ -120,12 +117,10 @@ INLINE void solved(In lower, In pivots, Out column) {
    Source for the gaps: H. G. Bock, K. J. Plitt, IFAC World Congress 1984. */
 static int sweep(Direction* d, const Point* p, In weight, In lean, In costates, casadi_real delta, int use_exact, In data, Scratch* s) {
   int i, j, l, m;
-  In arg[8];
-  Out res[8];
+  SLOTS;
   casadi_real *values = s->values, *slopes = s->slopes, factor[NU * NU];
   for (j = 0; j < NS * NS; ++j) values[N * NS * NS + j] = p->final[j];
   for (j = 0; j < NS; ++j) slopes[N * NS + j] = p->tail[j];
-  for (j = 0; j < NU * NU; ++j) factor[j] = 0; /* no compiler shall take it for unwritten */
   for (i = N; i-- > 0;) {
     In a = p->a + i * NS * NS, b = p->b + i * NS * NU;
     Out value = values + (i + 1) * NS * NS, slope = slopes + (i + 1) * NS, k = d->k + i * NU * NS, v = d->v + i * NU;
@@ -139,11 +134,12 @@ static int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
     arg[0] = p->x + i * NS, arg[1] = p->u + i * NU, arg[2] = data + i * NT, arg[3] = costates + (i + 1) * NS;
     if (use_exact) {
       res[0] = bends;
-      if (bend(arg, res, 0, 0, 0)) return 0;
+      NEEDED(bend);
       arg[0] = bends;
     }
     res[0] = q, res[1] = cross, res[2] = r;
-    if (use_exact ? curve(arg, res, 0, 0, 0) : plain(arg, res, 0, 0, 0)) return 0;
+    if (use_exact) NEEDED(curve);
+    else NEEDED(plain);
     for (j = 0; j < NS; ++j) {
       pushed[j] = slope[j];
       for (m = 0; m < NS; ++m) pushed[j] += value[m * NS + j] * (p->f[i * NS + m] - p->x[(i + 1) * NS + m]);
@@ -189,29 +185,30 @@ static int sweep(Direction* d, const Point* p, In weight, In lean, In costates, 
       d->costates[(i + 1) * NS + m] = sum;
     }
   }
-  return all_finite(d->du, N * NU) && all_finite(d->dx, (N + 1) * NS) && all_finite(d->costates + NS, N * NS);
+  return all_finite(d->costates + NS, N * NS + (N + 1) * NS + N * NU);
 }
 
+#define SIDES 2
 #define SIGN(side) (1 - 2 * (side))
 
 typedef struct {
-  casadi_real z[2][COUNT], t[2][COUNT], e[2][COUNT]; /* multipliers, slacks, and by how much a limit gives way */
+  casadi_real z[SIDES][COUNT], t[SIDES][COUNT], e[SIDES][COUNT]; /* multipliers, slacks, and by how much a limit gives way */
 } Duals;
 
 typedef struct {
-  casadi_real at[2][ROWS];
-  int present[2][ROWS];
+  casadi_real at[SIDES][ROWS];
+  int present[SIDES][ROWS];
 } Limits;
 
 typedef struct {
   casadi_real gap, error, left, violation, broken; /* largest gap, scaled error, stationarity, violation, and the share of a unit that is not certified */
 } Certificate;
 
-static const casadi_real state_limits[2][NB + 1] = {STATE_LOWER, STATE_UPPER};
+static const casadi_real state_limits[][SOME(NB)] = {STATE_LOWER, STATE_UPPER};
 
-static const casadi_real capacities[NB + 1] = CAPACITIES, hard[NB + 1] = HARD;
+static const casadi_real capacities[SOME(NB)] = CAPACITIES, hard[SOME(NB)] = HARD;
 
-INLINE casadi_real capacity(int r) { return r < NU ? 10 * FINITE : capacities[r - NU]; }
+INLINE casadi_real capacity(int r) { return r < NU ? BEYOND : capacities[r - NU]; }
 INLINE casadi_real reach(int r) { return unit[r] * unit[r] / COST; } /* gamma */
 INLINE casadi_real entry(const Point* p, int i, int r) { return r < NU ? p->u[i * NU + r] : p->x[(i + 1) * NS + place[r - NU]]; }
 INLINE casadi_real moved(const Direction* d, int i, int r) { return r < NU ? d->du[i * NU + r] : d->dx[(i + 1) * NS + place[r - NU]]; }
@@ -221,7 +218,7 @@ INLINE casadi_real distance(const Limits* limits, const Point* p, int side, int 
 
 /* For every limit that there is: side, stage i, row r, and k = i ROWS + r. The rows of states are the last. */
 #define EACH_LIMIT_FROM(first, limits)                                             \
-  for (side = 0; side < 2; ++side)                                                 \
+  for (side = 0; side < SIDES; ++side)                                                 \
     for (r = first; r < ROWS; ++r)                                                 \
       if ((limits)->present[side][r])                                              \
         for (i = 0, k = r; i < N; ++i, k += ROWS)
@@ -230,7 +227,7 @@ INLINE casadi_real distance(const Limits* limits, const Point* p, int side, int 
 
 static void set_limits(Limits* limits, In lower, In upper) {
   int side, r;
-  for (side = 0; side < 2; ++side)
+  for (side = 0; side < SIDES; ++side)
     for (r = 0; r < ROWS; ++r) {
       casadi_real at = r < NU ? (side ? upper : lower)[r] : state_limits[side][r - NU];
       limits->present[side][r] = at <= FINITE && at >= -FINITE;
@@ -240,7 +237,7 @@ static void set_limits(Limits* limits, In lower, In upper) {
 
 /* Multipliers of states as they enter the gradient, whose other rows stay; where a limit is farther than `near` of its unit they count
    as zero. */
-static void pushes(Out push, const Limits* limits, const Point* p, casadi_real z[2][COUNT], casadi_real near) {
+static void pushes(Out push, const Limits* limits, const Point* p, casadi_real z[][COUNT], casadi_real near) {
   int side, i, r, k;
   for (i = 0; i < N; ++i)
     for (r = NU; r < ROWS; ++r) push[i * ROWS + r] = 0;
@@ -282,12 +279,12 @@ static casadi_real largest_gap(const Point* p) {
 
    with g the reduced gradient with the multipliers. A limit that is given up (z = rho) need not be kept: its plan is a stationary
    point of the cost plus rho times the violations, so the limits cannot all be kept nearby. */
-static Certificate certified(const Limits* limits, const Point* p, casadi_real z[2][COUNT], Out g) {
+static Certificate certified(const Limits* limits, const Point* p, casadi_real z[][COUNT], Out g) {
   int side, i, r, k;
   casadi_real push[COUNT];
   Certificate c = {largest_gap(p), 0, 0, 0, 0};
   c.error = c.gap;
-  pushes(push, limits, p, z, 10 * FINITE);
+  pushes(push, limits, p, z, BEYOND);
   adjoint(p, push, g);
   for (k = 0; k < N * NU; ++k) {
     casadi_real u = p->u[k], low = limits->at[0][k % NU], high = limits->at[1][k % NU];
@@ -305,18 +302,18 @@ static Certificate certified(const Limits* limits, const Point* p, casadi_real z
       c.broken = larger(c.broken, -d / unit[r]);
     }
   }
-  if (!all_finite(g, N * NU)) c.error = c.left = 10 * FINITE; /* fmax would hide NaN */
+  if (!all_finite(g, N * NU)) c.error = c.left = BEYOND; /* fmax would hide NaN */
   return c;
 }
 
-/* Whether multipliers prove that no inputs within their limits keep the hard limits of states, along the model linearised at p: the
-   violations are linear in the inputs, and so is
+/* Whether multipliers prove that no inputs within their limits keep the hard limits of states, along the model linearised at p, which
+   is rolled out: the violations are linear in the inputs, and so is
 
-       sum z (violation) = sum -z d + sum lambda' gap + sum g' (u - U),   lambda = A' (lambda + push),   g = B' (lambda + push).
+       sum z (violation) = sum -z d + sum g' (u - U),   lambda = A' (lambda + push),   g = B' (lambda + push).
 
    Where it is above zero even at its least in the box of the inputs, not all violations can be zero (Farkas' lemma). For a linear model
    this is a proof; for others it holds where the linearisation does. */
-static int cannot_be_kept(const Limits* limits, const Point* p, casadi_real z[2][COUNT]) {
+static int cannot_be_kept(const Limits* limits, const Point* p, casadi_real z[][COUNT]) {
   int side, i, r, k, j, l;
   casadi_real push[COUNT], costate[NS], before[NS], sum = 0, size = 0;
   for (k = 0; k < COUNT; ++k) push[k] = 0;
@@ -328,10 +325,6 @@ static int cannot_be_kept(const Limits* limits, const Point* p, casadi_real z[2]
   for (j = 0; j < NS; ++j) costate[j] = 0;
   for (i = N; i-- > 0;) {
     for (j = 0; j < NB; ++j) costate[place[j]] += push[i * ROWS + NU + j];
-    for (j = 0; j < NS; ++j) {
-      casadi_real gap = costate[j] * (p->f[i * NS + j] - p->x[(i + 1) * NS + j]);
-      sum += gap, size += fabs(gap);
-    }
     for (l = 0; l < NU; ++l) {
       casadi_real slope = 0, steep = 0, low = limits->at[0][l], high = limits->at[1][l];
       for (j = 0; j < NS; ++j) {
@@ -377,7 +370,7 @@ static void pure_terms(const Limits* limits, const Point* p, Duals* y, In g, int
   }
 }
 
-static void pure_multipliers(const Limits* limits, const Point* p, const Duals* y, const Direction* move, casadi_real next[2][COUNT]) {
+static void pure_multipliers(const Limits* limits, const Point* p, const Duals* y, const Direction* move, casadi_real next[][COUNT]) {
   int side, i, r, k;
   EACH_LIMIT(limits) {
     casadi_real d = distance(limits, p, side, i, r), z = y->z[side][k], kappa = STIFF / reach(r);

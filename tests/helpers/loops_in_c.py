@@ -70,10 +70,46 @@ def coupled(limits: fp.Limits | None = None, stages: int = 4) -> tuple[Any, np.n
     return horizon_of(plant, REST, horizon, cost, limits, time=0.3)
 
 
+RING = [f"x{k}" for k in range(13)]  # rows of a matrix in a block of eight, one of four, and one more
+
+
 @cache
-def pair(kind: str, optimiser: fp.FixedPoint, limits: fp.Limits | None = None, stages: int = 4) -> Pair:
+def ring(limits: fp.Limits | None = None, stages: int = 3) -> tuple[Any, np.ndarray]:
+    """The horizon of a ring of thirteen states, each driven by two of three inputs, whose cost is small in its unit."""
+
+    def response(q, u, p):
+        x, v = [getattr(q, name) for name in RING], [u.u0, 0.05 * u.u1, 3.0 * u.u2]
+        pairs = enumerate(zip(x, x[1:] + x[:1], strict=True))
+        return {
+            RING[k]: p.k * ca.sin(after) - 0.3 * (k % 4) * one + 0.4 * one * after + v[k % 3] - 0.1 * k * v[(k + 1) % 3]
+            for k, (one, after) in pairs
+        }
+
+    def terms(v):
+        x, (a, b, c) = [v.state[name] for name in RING], (v.input.u0, 0.05 * v.input.u1, 3.0 * v.input.u2)
+        error = sum((1 + k % 3) * (one - 0.1) ** 2 + 0.3 * one * x[k - 1] + 0.2 * one**4 for k, one in enumerate(x))
+        return {
+            "all": 1e-3 * (error + 0.4 * a * a + 0.3 * b * b + 0.6 * c * c + 0.2 * a * b - 0.1 * b * c + 0.1 * a * x[3])
+        }
+
+    plant = fp.Plant(
+        coordinates=dict.fromkeys(RING, "m"),
+        inputs=dict.fromkeys(("u0", "u1", "u2"), "N"),
+        order=1,
+        controlled=RING[:3],
+        parameters={"k": fp.Parameter(1.3, 1.3, "1/s")},
+        response=response,
+    )
+    rest, cost = fp.Trajectory(lambda t: dict.fromkeys(RING, 0 * t)), fp.CustomCost(terms=terms)
+    return horizon_of(plant, rest, fp.Horizon(stages=stages, step=0.15), cost, limits, time=0.3)
+
+
+@cache
+def pair(
+    kind: str, optimiser: fp.FixedPoint, limits: fp.Limits | None = None, stages: int = 4, of: Any = coupled
+) -> Pair:
     """Graph and loops of `step` or `converging`."""
-    ocp, data = coupled(limits, stages)
+    ocp, data = of(limits, stages)
     graph = getattr(optimiser, kind)(ocp)
     return Pair(ocp, data, graph, compiled(graph))
 
