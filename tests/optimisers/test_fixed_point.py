@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers.horizons import SWING, horizon_of, linear_problem, pendulum_problem
+from helpers.machine import needs_compiler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -210,3 +211,37 @@ def test_a_multiplier_counts_at_its_own_bound_alone():
     counts = {pair for pair in pairs if residual(bound, *pair) != pytest.approx(residual(free, pair[0], 0.0))}
     assert counts == {(-0.3, -2.0), (0.4, 2.0)}
     assert residual(bound, 0.1, np.nan) > 1
+
+
+@pytest.mark.parametrize(("beside", "status"), [(0.0, fp.Status.NOT_CONVERGED), (100.0, fp.Status.OK)])
+def test_a_move_that_lowers_the_cost_by_nothing_is_no_error(beside, status):
+    """A sweep at 1.01 of (u - 1)^4 wants a third of the way, which lowers it by 7e-9: all of it, or 1e-10 of a cost beside it."""
+    gain = {"b": fp.Parameter(1.0, 1.0, "1")}
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, gain, lambda q, u, p: {"y": p.b * u.u - 0.0 * q.y}, order=1)
+    cost = fp.CustomCost(terms=lambda v: {"flat": (v.input.u - 1) ** 4, "beside": beside + 0 * v.state.y})
+    reference, limits = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Limits(inputs={"u": (-3.0, 3.0)})
+    ocp, data = horizon_of(plant, reference, fp.Horizon(stages=1, step=1.0), cost, limits)
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-4)
+    memory = optimiser.memory(ocp).start()
+    memory[optimiser.memory(ocp).slice("plan_inputs")] = 1.01
+    assert call(optimiser, ocp, data, np.zeros(1), [-3.0], [3.0], memory)[1][4] == status
+
+
+@needs_compiler
+@pytest.mark.parametrize("side", [-1, 1])
+def test_of_two_starts_the_plan_that_costs_less_with_its_violations_is_taken(side):
+    """A remembered plan stays in its valley, although the one from nothing is in a deeper one, beyond a limit with a price."""
+    gain = {"b": fp.Parameter(1.0, 1.0, "1")}
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, gain, lambda q, u, p: {"y": p.b * u.u}, order=1)
+    cost = fp.CustomCost(terms=lambda v: {"valleys": (v.input.u**2 - 1) ** 2 - 0.3 * side * v.input.u})
+    states = {"y": (-0.5, 9.0) if side < 0 else (-9.0, 0.5)}
+    limits = fp.Limits(inputs={"u": (-3.0, 3.0)}, states=states, prices={"y": 1.5})
+    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6, hessian=fp.ExactHessian(), second_start=True)
+    reference, horizon = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Horizon(stages=1, step=1.0)
+    ocp, data = horizon_of(plant, reference, horizon, cost, limits)
+    memory, layout = optimiser.memory(ocp).start(), optimiser.memory(ocp)
+    memory[layout.slice("plan_inputs")], memory[layout.slice("plan_barrier")] = -1.2 * side, 1e-4
+    one = ocp, data, np.zeros(1), [-3.0], [3.0]
+    warm, cold = (call(replace(optimiser, second_start=False), *one, m) for m in (memory, None))
+    assert cold[1][0] < warm[1][0] < cold[1][0] + 1.5 * (side * cold[0] - 0.5)
+    assert call(optimiser, *one, memory)[0] == warm[0]

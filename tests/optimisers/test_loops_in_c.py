@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from helpers.loops_in_c import pair, within_its_arrays
+from helpers.loops_in_c import pair, ring, within_its_arrays
 from helpers.machine import needs_compiler
 
 import fpirhc as fp
@@ -27,15 +27,41 @@ def stepping(request):
     return pair("step", fp.FixedPoint(iterations=iterations, tolerance=1e-7, damping=0.02, hessian=hessian))
 
 
+WAYS = {
+    "one-wide": 2160.0626624770,
+    "four-wide": 2253.6903639869,
+    "solved-wide": 2429.2013723188,
+    "one-narrow": 1444.3201471803,
+    "four-narrow": 1526.2722150584,
+    "solved-narrow": 1624.3232326178,
+}
+
+
 @pytest.mark.parametrize("bounds", [WIDE, NARROW], ids=["wide", "narrow"])
-def test_calls_one_after_the_other(stepping, bounds):
+def test_calls_one_after_the_other(stepping, bounds, request):
     """From nothing and from what was remembered, with free inputs and with inputs at their bounds, near and far."""
-    random = np.random.default_rng(0)
+    random, way = np.random.default_rng(0), 0.0  # a solution hides the way to it
     for size in (0.1, 1.0, 3.0, 8.0):
         memory = np.zeros(stepping.size)
         for _ in range(5):
             first = size * random.normal(size=3)
             results = list(stepping.both(first, stepping.data, *bounds, memory))
+            same(results[0], results[1], 1e-6)
+            way += results[0][1][3:].sum() + sum(np.log1p(np.abs(v)).sum() for v in results[0])
+            memory = results[0][2]
+    assert way == pytest.approx(WAYS[request.node.callspec.id], rel=1e-8)
+
+
+def test_matrices_of_many_rows():
+    """Thirteen states and three inputs, of which some are at their bounds."""
+    wide, random = pair("step", fp.FixedPoint(iterations=1, tolerance=1e-7), of=ring), np.random.default_rng(0)
+    for size in (0.3, 1.0, 3.0):
+        memory = np.zeros(wide.size)
+        for _ in range(5):
+            first = size * random.normal(size=13)
+            results = list(
+                wide.both(first, wide.data, np.array([-1.0, -20.0, -0.3]), np.array([1.5, 10.0, 0.4]), memory)
+            )
             same(results[0], results[1], 1e-6)
             memory = results[0][2]
 
