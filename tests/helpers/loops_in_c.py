@@ -92,14 +92,8 @@ def ring(limits: fp.Limits | None = None, stages: int = 3) -> tuple[Any, np.ndar
             "all": 1e-3 * (error + 0.4 * a * a + 0.3 * b * b + 0.6 * c * c + 0.2 * a * b - 0.1 * b * c + 0.1 * a * x[3])
         }
 
-    plant = fp.Plant(
-        coordinates=dict.fromkeys(RING, "m"),
-        inputs=dict.fromkeys(("u0", "u1", "u2"), "N"),
-        order=1,
-        controlled=RING[:3],
-        parameters={"k": fp.Parameter(1.3, 1.3, "1/s")},
-        response=response,
-    )
+    inputs, gain = dict.fromkeys(("u0", "u1", "u2"), "N"), {"k": fp.Parameter(1.3, 1.3, "1/s")}
+    plant = fp.Plant(dict.fromkeys(RING, "m"), inputs, gain, response, order=1, controlled=RING[:3])
     rest, cost = fp.Trajectory(lambda t: dict.fromkeys(RING, 0 * t)), fp.CustomCost(terms=terms)
     return horizon_of(plant, rest, fp.Horizon(stages=stages, step=0.15), cost, limits, time=0.3)
 

@@ -17,11 +17,9 @@ SLEDGE = fp.Plant(
 STEP = 0.1  # s
 
 
-def plan_of(
-    start: tuple[float, float], states: dict[str, tuple[float, float]], stages: int, at: float = 0.0, **more: Any
-) -> fp.Plan:
-    """The plan from (y, y') towards y = `at`."""
-    reference = fp.Trajectory(lambda t: {"y": at + 0 * t})
+def plan_of(start: tuple[float, float], states: dict[str, tuple[float, float]], stages: int, **more: Any) -> fp.Plan:
+    """The plan from (y, y') towards y = 0."""
+    reference = fp.Trajectory(lambda t: {"y": 0 * t})
     horizon = fp.Horizon(stages=stages, step=STEP)
     cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.01})
     limits = fp.Limits(inputs={"u": (-1.0, 1.0)}, states=states, **more)
@@ -30,31 +28,22 @@ def plan_of(
     return fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
 
 
-OUT_OF_REACH = {
-    # what: (start, limits, stages, more, the limit, the largest violation in m)
-    "too fast to stop": (
-        (0.9, 1.0),
-        {"y": (-5.0, 1.0)},
-        25,
-        {},
-        "above 1",
-        0.4,
-    ),  # full braking stops at 1.4 m after 1 s
-    "outside at rest": ((1.3, 0.0), {"y": (-5.0, 1.0)}, 25, {}, "above 1", 0.295),  # after one stage of full braking
-    "a far limit": ((0.0, 0.0), {"y": (3.0, 4.0)}, 5, {}, "below 3", 2.995),
+OUT_OF_REACH = {  # first state, limits of y, stages, the limit, the largest violation in m
+    "too fast to stop": ((0.9, 1.0), (-5.0, 1.0), 25, "above 1", 0.4),  # full braking stops at 1.4 m after 1 s
+    "outside at rest": ((1.3, 0.0), (-5.0, 1.0), 25, "above 1", 0.295),  # after one stage of full braking
+    "a far limit": ((0.0, 0.0), (3.0, 4.0), 5, "below 3", 2.995),
 }
 
 
-@pytest.mark.parametrize("case", OUT_OF_REACH)
-def test_what_cannot_be_kept_is_named_by_how_much(case):
+@pytest.mark.parametrize(("start", "limits", "stages", "limit", "most"), OUT_OF_REACH.values(), ids=OUT_OF_REACH)
+def test_what_cannot_be_kept_is_named_by_how_much(start, limits, stages, limit, most):
     """Full braking, known by hand, is the plan of least violation; the worst stage is named, and the remedy is the status' own."""
-    start, states, stages, more, limit, most = OUT_OF_REACH[case]
-    plan = plan_of(start, states, stages, **more)
+    plan = plan_of(start, {"y": limits}, stages)
     assert plan.status == fp.Status.INFEASIBLE
     violations = plan.violations()
     assert limit in " ".join(violations)
     values = [float(text.partition(" is ")[2].split()[0]) for text in violations if "at stage 0" not in text]
-    bound = next(v for v in states["y"] if f" {v:g}" in limit)
+    bound = next(v for v in limits if f" {v:g}" in limit)
     assert max(abs(value - bound) for value in values) == pytest.approx(most, abs=1e-3)
     assert "soften state limits, or lengthen the horizon" in plan._repr_html_()
 

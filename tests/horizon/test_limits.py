@@ -57,11 +57,6 @@ def test_limits_are_kept_at_the_same_optimum_as_ipopt(case):
     assert plan.violations() == ()
 
 
-def swapped(arguments):
-    ocp, data, first = arguments
-    return ocp, FIXED, first, data
-
-
 @pytest.mark.parametrize(
     "optimiser",
     [fp.FixedPoint(iterations=1, tolerance=1e-6), fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic()],
@@ -117,7 +112,8 @@ def test_mistakes_are_named(limits, message):
 
 def priced(price):
     limits = fp.Limits(states={"angle'": (-0.5, 0.5)}, prices={"angle'": price})
-    return limited(limits)
+    ocp, data, first = limited(limits)
+    return ocp, FIXED, first, data
 
 
 def test_priced_limits_are_kept_exactly_below_their_price_and_given_up_beyond():
@@ -125,11 +121,11 @@ def test_priced_limits_are_kept_exactly_below_their_price_and_given_up_beyond():
     ocp, data, first = limited(fp.Limits(states={"angle'": (-0.5, 0.5)}))
     strict = fp.solve(ocp, FIXED, first, data)
     largest = np.abs(strict.state_multipliers).max() / ocp.step
-    plan_inside = fp.solve(*swapped(priced(1.1 * largest)))
+    plan_inside = fp.solve(*priced(1.1 * largest))
     assert plan_inside.status == fp.Status.OK
     np.testing.assert_allclose(plan_inside.inputs, strict.inputs, atol=1e-6)
     assert plan_inside.slacks() == {"angle'": pytest.approx(0.0, abs=1e-6)}
-    given_up = fp.solve(*swapped(priced(0.3 * largest)))
+    given_up = fp.solve(*priced(0.3 * largest))
     assert given_up.status == fp.Status.OK
     assert given_up.states[1, 1:].min() < -0.51
     assert given_up.slacks()["angle'"] > 0
@@ -142,7 +138,7 @@ def test_priced_limits_have_the_optimum_of_a_problem_with_slacks():
     """SLSQP of scipy on the inputs and one slack per node finds the same sum of cost and prices."""
     from scipy.optimize import minimize
 
-    ocp, data, first = priced(3.0)
+    ocp, _, first, data = priced(3.0)
     plan, n = fp.solve(ocp, FIXED, first, data), ocp.stages
 
     def room(v):
@@ -161,6 +157,6 @@ def test_priced_limits_have_the_optimum_of_a_problem_with_slacks():
 
 def test_prices_are_refused_by_who_cannot_take_them():
     """A solver that keeps limits must not turn a priced one into a hard one."""
-    ocp, data, first = priced(1.0)
+    ocp, _, first, data = priced(1.0)
     with pytest.raises(NotSupported, match="takes no prices"):
         fp.solve(ocp, IPOPT, first, data)

@@ -94,12 +94,12 @@ def test_exact_hessian_converges_quadratically():
 
 def test_single_iterations_get_out_of_a_bad_plan():
     """A plan whose full, short and plain steps are all too long, one iteration per call: what is learned lasts over calls."""
+    mass = {"mass": fp.Parameter(0.2, 0.2, "kg")}
     plant = fp.Plant(
-        coordinates={"height": "m"},
-        inputs={"thrust": "N"},
-        order=2,
-        response=lambda q, v, u, p: {"height": (u.thrust - 0.3 * v.height * ca.fabs(v.height)) / p.mass - 9.81},
-        parameters={"mass": fp.Parameter(0.2, 0.2, "kg")},
+        {"height": "m"},
+        {"thrust": "N"},
+        mass,
+        lambda q, v, u, p: {"height": (u.thrust - 0.3 * v.height * ca.fabs(v.height)) / p.mass - 9.81},
     )
     reference = fp.Trajectory(lambda t: {"height": 2 + 1.5 * ca.sin(1.2 * t)})
     cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, deviation={"thrust": 1e-2})

@@ -49,20 +49,6 @@ def test_all_find_the_same_stationary_plan(optimiser, limits):
     assert np.all(plan.inputs.max(axis=1) <= ocp.input_upper)
 
 
-@pytest.mark.parametrize(
-    "nominal", [pytest.param(None, marks=pytest.mark.slow), fp.Exponential(rate=6.0)], ids=lambda n: type(n).__name__
-)
-def test_every_variant_is_cured_by_adaptation(nominal):
-    """Restart, restart with tracking, and a propagated plan that is tracked: each follows the reference with FPI."""
-    problem = replace(SHIPPED.two_mass.problem, duration=4.0, measure_from=2.0)
-    errors = {}
-    for name, deformation in (("plain", fp.Identity()), ("adaptive", fp.Sigmoid(gain=-0.5, scale=20.0))):
-        run = fp.simulate(problem, fp.RecedingHorizon(GRADIENT, deformation, tracking=nominal), seed=0)
-        errors[name] = max(fp.measure(problem, run).rms_error.values())
-    assert errors["adaptive"] < 0.1 * errors["plain"]
-    assert errors["adaptive"] < 5e-3
-
-
 def test_bounds_of_the_plan_are_shifted_by_the_correction():
     """The deformation takes part of the actuator, so the plan gets the rest: planned + correction stays inside."""
     tight = replace(
