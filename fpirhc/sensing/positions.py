@@ -139,13 +139,10 @@ class SavitzkyGolay(_Finite):
     def __post_init__(self) -> None:
         what = f"SavitzkyGolay(window={self.window!r}, degree={self.degree!r})"
         least = self.degree + 1 + self.degree % 2
-        if self.window % 2 == 0:
+        if self.window % 2 == 0 or self.window < least:  # an even one has no sample at its centre
             odd = sorted({max(least, self.window - 1), max(least, self.window + 1)})
-            raise InvalidValue(
-                f"{what}: expected an odd window, whose centre is a sample; use {' or '.join(map(str, odd))}"
-            )
-        if not self.degree < self.window:
-            raise InvalidValue(f"{what}: expected more samples than the degree; use a window of at least {least}")
+            wanted = f"an odd window of at least {least} samples for degree {self.degree}"
+            raise InvalidValue(f"{what}: expected {wanted}; use {' or '.join(map(str, odd))}")
 
     def check(self, plant: Plant) -> None:
         """Raise if the polynomial has too low a degree.
