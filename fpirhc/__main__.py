@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import sys
 import threading
@@ -14,7 +15,8 @@ from typing import Any
 from typer import Abort, Exit
 from typer.main import get_command
 
-from fpirhc.cli import MADE, app, list_
+from fpirhc.cli import list_
+from fpirhc.options import MADE, app
 
 _INTERRUPTED = "interrupted; finished results are kept, and the same command goes on"
 
@@ -51,9 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> Any:
-    if words == [
-        "list"
-    ]:  # what comes first is quick: typer reads even no options with pydantic, longer to import than casadi
+    if words == ["list"]:  # is quick: typer reads even no options with pydantic, longer to import than casadi
         return list_()
     command: Any = get_command(app)
     if not words or words[0] == "help":  # as git, pip and cargo have it
@@ -100,7 +100,10 @@ def _of_typer(error: Any) -> str:
     """What typer says of wrong words, with the nearest option."""
     from fpirhc.errors import nearest
 
-    context, text = getattr(error, "ctx", None), error.format_message().rstrip(".")
+    context, text = getattr(error, "ctx", None), error.format_message().rstrip(".").removeprefix("Invalid value: ")
+    text = re.sub("Input should be (?:a valid )?([^,]*)(?:, unable.*)?", r"expected \1", text).replace(
+        "integer", "whole number"
+    )
     if context is None:
         return str(text)
     if type(error).__name__ == "NoSuchOption":

@@ -4,145 +4,23 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
-_ABOUT = """Adaptive receding-horizon control by fixed-point iteration.
-
-\b
-To begin:
-  fpirhc new my_plant          writes my_plant.py: put in your equations
-  fpirhc review my_plant.py    asks whether adaptation can work there
-  fpirhc compare my_plant.py   runs its controllers and writes a report
-  fpirhc compare two_mass      does so for a shipped problem; fpirhc list has all
-
-\b
-Exit codes:
-  0  finished                      1  review answered no, or probe proposes nothing
-  2  bad input                     3  a file or folder cannot be written
-  4  the run of fpirhc run ended early, or a plan of compare --plans did not converge
-  5  a metric changed (check)      6  a baseline is missing or unusable (check)
-  7  a faulty installation (doctor)
-  70 an error inside fpirhc        130 interrupted from the keyboard
-  141 the reader of the output closed it"""
-app = typer.Typer(add_completion=True, pretty_exceptions_enable=False, help=_ABOUT, rich_markup_mode=None)
-MADE: list[Path] = []  # folders that this command has made, the innermost first
-
-
-class _Command(TyperCommand):
-    """A command with examples below its options. Several values may follow one option that may be given again: `-c A B`."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        options = {name: p for p in self.params if p.param_type_name == "option" for name in p.opts}
-        places = sum(p.param_type_name == "argument" and p.required for p in self.params)
-        # The option that may have more values, and whether its first one comes next.
-        words, last, value = list[str](), "", False
-        for word in args:
-            name = word.partition("=")[0]
-            if value:
-                value = False
-            elif name in options:
-                last = name if getattr(options[name], "multiple", False) else ""
-                value = name == word and not getattr(options[name], "is_flag", False)
-            elif places > 0:
-                places -= not word.startswith("-")
-            elif last and not word.startswith("-"):
-                words.append(last)
-            words.append(word)
-        return super().parse_args(ctx, words)
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
-        formatter.write(f"\nExamples:\n{self.epilog}\n")
-
-
-def _command(*examples: str, name: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    return app.command(name, cls=_Command, epilog="\n".join(f"  fpirhc {one}" for one in examples))
-
-
-def _percent(text: str) -> float:  # also of a default, which is a number
-    try:
-        value = float(str(text).strip().removesuffix("%"))
-    except ValueError:
-        value = -1.0
-    if not 0 <= value < float("inf"):
-        raise typer.BadParameter(f"expected percent of at least 0, such as 20%, got '{text}'")
-    return value
-
-
-def _given(metavar: str, text: str, **more: Any) -> Any:
-    return typer.Option(metavar=metavar, help=text, **more)
-
-
-Problem = Annotated[str, typer.Argument(metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")]
-Controller = Annotated[str, typer.Argument(metavar="CONTROLLER", help="name of a controller of the problem")]
-Controllers = Annotated[
-    list[str] | None, typer.Option("--controllers", "-c", metavar="NAME ...", help="only these controllers of the file")
-]
-Out = Annotated[Path | None, _given("FOLDER", "folder of the results [default: results/PROBLEM]")]
-Seed = Annotated[int, _given("N", "seed of noise and of what is drawn", min=0)]
-Percent = typer.Option(
-    metavar="PERCENT", parser=_percent, help="draw exact parameters and dead times within so much of the file's"
-)
-Mismatch = Annotated[float, Percent]
-Set = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="PATH=NUMBER ...", help="replace numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"),
-]  # fmt: skip
-Json = Annotated[bool, typer.Option("--json", help="print one JSON object")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="print every column and every remark")]
-NoCompile = Annotated[
-    bool,
-    typer.Option("--no-compile", help="do not wait for a C compiler: loops run in CasADi's virtual machine, slower"),
-]
-Processes = Annotated[int, _given("N", "number of processes", min=1)]
-Count = _given("N", "number of plants that are drawn at random", min=1)
-Cases = Annotated[list[str] | None, _given("NAME ...", "named cases of the file: names, groups, or all")]
-Baselines = Annotated[Path | None, _given("FOLDER", "folder of the baselines [default: baselines, beside the problem]")]
+import fpirhc.options as opt
+from fpirhc.options import command, given
 
 
 def _task(problem: str, settings: Sequence[str] | None = None, controllers: Sequence[str] | None = None) -> Any:
     from fpirhc.problem_files.problem_file import load_problem, with_numbers_of_all
 
     task = load_problem(problem)
-    return with_numbers_of_all(task, _numbers(settings), controllers) if settings else task
-
-
-def _numbers(settings: Sequence[str]) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for text in settings:
-        path, _, value = text.partition("=")
-        try:
-            parts = tuple(map(float, value.split(",")))
-        except ValueError:
-            parts = ()
-        if not path.strip() or not parts:
-            raise typer.BadParameter(
-                f"--set {text}: expected PATH=NUMBER, such as deformation.gain=-1.2, or PATH=LOWER,UPPER for an interval"
-            )
-        values[path.strip()] = parts if len(parts) > 1 else parts[0]
-    return values
-
-
-def _folder(out: Path | None, *default: str) -> Path:
-    """The folder for results, made before anything runs, so that a wrong path fails at once."""
-    from fpirhc.errors import not_writable
-    from fpirhc.whole_file import missing_folders
-
-    folder = out or Path("results", *default)
-    try:
-        MADE.extend(missing_folders(folder))
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / ".fpirhc-probe").touch()
-        (folder / ".fpirhc-probe").unlink()
-    except OSError as error:
-        raise not_writable(folder, error, "--out") from None
-    return folder
+    return with_numbers_of_all(task, opt.numbers(settings), controllers) if settings else task
 
 
 def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -> None:
@@ -156,17 +34,18 @@ def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -
     print(facts) if as_json else show(view, folder / "report.html", verbose=verbose)
 
 
-@_command(
+@command(
     "compare two_mass",
     "compare my_arm.py -c RHC RHC+FPI --set deformation.gain=-1.2",
     "compare cart_pole --optimisers fixed-point ipopt    every planning controller once with each",
     "compare cart_pole --plans --optimisers all          their first plans to 1e-6, with certificates, and no run",
 )
 def compare(
-    problem: Problem, controllers: Controllers = None, set_: Set = None,
-    optimisers: Annotated[list[str] | None, _given("NAME ...", "run planning controllers with each of these, or all")] = None,
+    problem: opt.Problem, controllers: opt.Controllers = None, set_: opt.Set = None,
+    optimisers: Annotated[list[str] | None, given("NAME ...", "run planning controllers with each of these, or all")] = None,
     plans: Annotated[bool, typer.Option("--plans", help="solve and certify the first plans alone; no run")] = False,
-    seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
+    seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
+    verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Run controllers side by side and write a report. It names the winner, by how much, and at what price."""
     task = _task(problem, set_, controllers)
@@ -176,10 +55,10 @@ def compare(
 
     named = list(select(task, controllers)) if controllers else None
     if plans:
-        return _show_plans(task, first_plans(task, optimisers, named), _folder(out, task.name))
+        return _show_plans(task, first_plans(task, optimisers, named), opt.folder_of(out, task.name))
     if optimisers:
         task, named = with_optimisers(task, optimisers, named), None
-    folder = _folder(out, task.name)
+    folder = opt.folder_of(out, task.name)
     from fpirhc.report.html import render
     from fpirhc.report.terminal import announce_backend, progress_bars
 
@@ -205,10 +84,10 @@ def _line() -> str:
     return shlex.join(["fpirhc", *sys.argv[1:]])
 
 
-@_command("review two_mass", "review my_arm.py -c RHC+FPI --mismatch 20%    for plants around the problem's, too")
+@command("review two_mass", "review my_arm.py -c RHC+FPI --mismatch 20%    for plants around the problem's, too")
 def review(
-    problem: Problem, controllers: Controllers = None, mismatch: Mismatch = 0.0, seed: Seed = 0, json: Json = False,
-    verbose: Verbose = False,
+    problem: opt.Problem, controllers: opt.Controllers = None, mismatch: opt.Mismatch = 0.0, seed: opt.Seed = 0,
+    json: opt.Json = False, verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Ask every loop, by short runs, whether it can work. Each no comes with what to do, and ends the command with exit code 1."""
     task = _task(problem)
@@ -228,19 +107,21 @@ def review(
     raise typer.Exit(0 if found.ready else 1)
 
 
-@_command(
+@command(
     "run two_mass RHC+FPI",
     "run two_mass RHC+FPI --set deformation.gain=-1.2 limits.inputs.Q1=-50,20",
     "run two_mass RHC+FPI --draw 7 --mismatch 20%    plant number 7 of study --draws N --mismatch 20%",
     "run anaesthesia CTC+FPI --case 'patient 03'",
 )
 def run(
-    problem: Problem, controller: Controller, set_: Set = None,
-    case: Annotated[str | None, _given("NAME", "in this case of the file")] = None,
-    draw: Annotated[int | None, _given("K", "with plant number K of study --draws", min=0)] = None,
-    mismatch: Mismatch = 0.0, seed: Seed = 0, out: Out = None, no_compile: NoCompile = False,
+    problem: opt.Problem, controller: opt.Controller, set_: opt.Set = None,
+    case: Annotated[str | None, given("NAME", "in this case of the file")] = None,
+    draw: Annotated[int | None, given("K", "with plant number K of study --draws", min=0)] = None,
+    mismatch: opt.Mismatch = 0.0, seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False,
 ) -> None:  # fmt: skip
     """Run one controller and save every signal. NAME.npz holds them (fpirhc.load_run reads it), NAME.png draws them."""
+    if mismatch and draw is None:
+        raise typer.BadParameter("--mismatch is of a drawn plant: give --draw K too")
     task = _task(problem, set_, [controller])
     from dataclasses import replace
 
@@ -248,7 +129,7 @@ def run(
     from fpirhc.studies.compare import harm_of_adaptation, select
 
     task = in_case(task, case) if case else task
-    chosen, folder = select(task, [controller])[controller], _folder(out, task.name)
+    chosen, folder = select(task, [controller])[controller], opt.folder_of(out, task.name)
     from fpirhc.controllers.contract import resolved
     from fpirhc.report.figures import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, show_run
@@ -263,9 +144,8 @@ def run(
     with progress_bars() as progress:
         report = lambda done, total: progress(controller, done, total)  # noqa: E731
         found = simulate(task.problem, chosen, seed=seed, name=controller, compiled=not no_compile, progress=report)
-    files = [
-        folder / f"{''.join(c if c.isalnum() or c == '-' else '_' for c in controller)}.{s}" for s in ("npz", "png")
-    ]
+    plain = "".join(c if c.isalnum() or c == "-" else "_" for c in controller)
+    files = [folder / f"{plain}.npz", folder / f"{plain}.png"]
     found.save(files[0])
     save_figure(found.plot(), files[1])
     announce_backend([found])
@@ -274,21 +154,22 @@ def run(
     raise typer.Exit(0 if found.stop is None else 4)
 
 
-@_command(
+@command(
     "study two_mass --draws 100 --mismatch 20%        exact parameters within 20 % of the problem's",
     "study anaesthesia --cases all --headline in_band",
     "study two_mass --over deformation.gain=-2:-0.1:40 exact.m1=0.5:2:9:log -c RHC+FPI",
     "study two_mass --limits latency noise            up to where each controller fails",
 )
 def study(
-    problem: Problem, cases: Cases = None, draws: Annotated[int | None, Count] = None,
-    over: Annotated[list[str] | None, _given("PATH=LOW:HIGH:COUNT[:log] ...", "sweep one or two settings")] = None,
-    limits: Annotated[list[str] | None, _given("WORD ...", "what grows: mismatch, plants, latency, noise, lost")] = None,
-    mismatch: Mismatch = 0.0, controllers: Controllers = None,
-    headline: Annotated[str | None, _given("METRIC", "number by which runs are compared [default: the error]")] = None,
-    processes: Annotated[int | None, _given("N", "number of processes [default: one per core]", min=1)] = None,
-    cluster: Annotated[str | None, _given("ADDRESS", "run on the Dask cluster with this scheduler, tcp://HOST:PORT")] = None,
-    seed: Seed = 0, out: Out = None, no_compile: NoCompile = False, json: Json = False, verbose: Verbose = False,
+    problem: opt.Problem, cases: opt.Cases = None, draws: Annotated[int | None, opt.Count] = None,
+    over: Annotated[list[str] | None, given("PATH=LOW:HIGH:COUNT[:log] ...", "sweep one or two settings")] = None,
+    limits: Annotated[list[str] | None, given("WORD ...", "what grows: mismatch, plants, latency, noise, lost")] = None,
+    mismatch: opt.Mismatch = 0.0, controllers: opt.Controllers = None,
+    headline: Annotated[str | None, given("METRIC", "number by which runs are compared [default: the error]")] = None,
+    processes: Annotated[int | None, given("N", "number of processes [default: one per core]", min=1)] = None,
+    cluster: Annotated[str | None, given("ADDRESS", "run on the Dask cluster with this scheduler, tcp://HOST:PORT")] = None,
+    seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
+    verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Run controllers in many variants of a problem. Variants are named cases, drawn plants, or swept settings; or one quantity
     grows until each controller fails (--limits).
@@ -301,9 +182,7 @@ def study(
     if sum(map(bool, (cases, draws, over, limits))) != 1:
         raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
     if limits and (headline or (processes or 1) > 1 or cluster):
-        raise typer.BadParameter(
-            "--limits searches by the error, run after run: leave out --headline, --processes, --cluster"
-        )
+        raise typer.BadParameter("--limits takes the error, run by run: leave out --headline, --processes, --cluster")
     task = _task(problem)
     from fpirhc.studies.compare import select
     from fpirhc.studies.limits import limits as find_limits
@@ -313,10 +192,9 @@ def study(
     from fpirhc.summary import write_csv
 
     select(task, controllers)
-    folder = _folder(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")
+    folder = opt.folder_of(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")
     import joblib
 
-    from fpirhc.errors import package
     from fpirhc.report.html import render_charted
     from fpirhc.report.terminal import progress_bars
 
@@ -324,7 +202,7 @@ def study(
         facts: dict[str, Any] = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
         facts["progress"] = stack.enter_context(progress_bars())
         if cluster:
-            stack.enter_context(package("distributed", "cluster", "--cluster").Client(cluster))
+            stack.enter_context(_cluster(cluster))
             stack.enter_context(joblib.parallel_config(backend="dask"))
         if limits:
             result: Any = find_limits(task, over=limits, seed=seed, folder=folder, **facts)
@@ -339,20 +217,30 @@ def study(
     _publish(result.view, page, folder, json, verbose)
 
 
-@_command(
+def _cluster(address: str) -> Any:
+    from fpirhc.errors import InvalidValue, package
+
+    try:
+        return package("distributed", "cluster", "--cluster").Client(address)
+    except (ValueError, OSError) as error:
+        raise InvalidValue(f"--cluster {address}: {error}; start a scheduler by: dask scheduler") from None
+
+
+@command(
     "probe my_arm.py                             excitation, candidates, trials, and a line to paste",
     "probe my_arm.py --cycles 500 --no-trials    for a machine: nothing but the excitation is run",
     "probe my_arm.py --recording run.csv         from a record of a run",
 )
 def probe(
-    problem: Problem, controller: Annotated[
+    problem: opt.Problem, controller: Annotated[
         str | None, typer.Option("--controller", "-c", metavar="NAME", help="that runs the plant [default: first that can]")
     ] = None,
-    cycles: Annotated[int | None, _given("N", "length of the excitation [default: 300]")] = None,
-    amplitude: Annotated[float | None, _given("NUMBER", "size of the excitation, in the unit of the response")] = None,
-    recording: Annotated[Path | None, _given("CSV", "estimate from a recorded run: time, inputs, measurements")] = None,
-    chatter: Annotated[float | None, _given("NUMBER", "largest rms step of a command per cycle that is allowed")] = None,
-    trials: Annotated[bool, typer.Option(help="try candidates on the plant itself")] = True, seed: Seed = 0, json: Json = False,
+    cycles: Annotated[int | None, given("N", "length of the excitation [default: 300]")] = None,
+    amplitude: Annotated[float | None, given("NUMBER", "size of the excitation, in the unit of the response")] = None,
+    recording: Annotated[Path | None, given("CSV", "estimate from a recorded run: time, inputs, measurements")] = None,
+    chatter: Annotated[float | None, given("NUMBER", "largest rms step of a command per cycle that is allowed")] = None,
+    trials: Annotated[bool, typer.Option(help="try candidates on the plant itself")] = True, seed: opt.Seed = 0,
+    json: opt.Json = False,
 ) -> None:  # fmt: skip
     """Measure an unknown plant and propose an adaptation. Exit code 1 where none is proposed."""
     task = _task(problem)
@@ -375,16 +263,16 @@ def probe(
     raise typer.Exit(0 if answer.deformation is not None else 1)
 
 
-@_command(
+@command(
     "tune two_mass                                   50 trials of every controller that may be tuned",
     "tune two_mass --trials 200 --draws 5 --mismatch 20%    each trial on 5 plants; goes on after finished trials",
 )
 def tune(
-    problem: Problem, controllers: Controllers = None,
-    trials: Annotated[int, _given("N", "number of trials of every controller", min=1, max=1_000_000)] = 50,
-    draws: Annotated[int | None, Count] = None, mismatch: Mismatch = 0.0, cases: Cases = None,
-    metric: Annotated[str | None, _given("METRIC", "number that is to become better [default: the error]")] = None,
-    seed: Seed = 0, out: Out = None, json: Json = False,
+    problem: opt.Problem, controllers: opt.Controllers = None,
+    trials: Annotated[int, given("N", "number of trials of every controller", min=1, max=1_000_000)] = 50,
+    draws: Annotated[int | None, opt.Count] = None, mismatch: opt.Mismatch = 0.0, cases: opt.Cases = None,
+    metric: Annotated[str | None, given("METRIC", "number that is to become better [default: the error]")] = None,
+    seed: opt.Seed = 0, out: opt.Out = None, json: opt.Json = False,
 ) -> None:  # fmt: skip
     """Search better settings, at equal cost for every controller. The problem file says what is searched: tuning = {...}."""
     task = _task(problem)
@@ -396,30 +284,25 @@ def tune(
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     drawn = Draws(draws, mismatch, seed + 10**6) if draws else None  # never the plants of a comparison
     variants = CasesOf(tuple(cases), seed) if cases else drawn
-    facts: dict[str, Any] = {
-        "trials": trials,
-        "variants": variants,
-        "seed": seed,
-        "controllers": controllers,
-        "metric": metric,
-    }
+    folder = opt.folder_of(out, task.name, "tuning")
+    facts: dict[str, Any] = {"trials": trials, "seed": seed, "controllers": controllers, "metric": metric}
     with progress_bars() as progress:
-        found = search(task, folder=_folder(out, task.name, "tuning"), progress=progress, **facts)
+        found = search(task, variants=variants, folder=folder, progress=progress, **facts)
     for sentences in found.harm.values():
         show_harm(sentences)
     table = found.table
     print(table.to_json(orient="records") if json else f"{table.to_string(index=False)}\n\n{found.python()}")
 
 
-@_command(
+@command(
     "check                        every problem of ./problems, or of this folder",
     "check my_arm.py two_mass     these problems",
     "check --ignore-below 0.1%    another machine or library, whose last digits differ",
 )
 def check(
-    problems: Annotated[list[str] | None, typer.Argument(metavar="PROBLEM ...", help="[default: all of this folder]")] = None,
-    ignore_below: Annotated[float, _given("PERCENT", "smaller changes than this count as none", parser=_percent)] = 0.0,
-    baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
+    problems: Annotated[list[str] | None, typer.Argument(metavar="PROBLEM", help="[default: all of this folder]")] = None,
+    ignore_below: Annotated[float, given("PERCENT", "smaller changes than this count as none", parser=opt.percent)] = 0.0,
+    baselines: opt.Baselines = None, processes: opt.Processes = 1, no_compile: opt.NoCompile = False,
 ) -> None:  # fmt: skip
     """Compare fresh results with their baselines. Exit code 5: a metric changed; 6: a baseline is missing or unusable; the highest
     one of all problems counts, and one that cannot be run (2) stops no other.
@@ -445,14 +328,14 @@ def check(
     raise typer.Exit(max([2 * bool(broken), *(6 if one.unusable else 5 * (not one.holds) for one in found)]))
 
 
-@_command(
+@command(
     'accept my_arm.py --reason "20 -> 30 stages"     the new numbers are right, and why',
     'accept my_arm.py --reason "new" --seeds 20      bands from more seeds, where there is noise',
 )
 def accept(
-    problem: Problem, reason: Annotated[str, _given("TEXT", "why the new numbers are right")],
-    seed: Seed = 0, seeds: Annotated[int, _given("N", "number of noise seeds from which the bands follow", min=2)] = 8,
-    baselines: Baselines = None, processes: Processes = 1, no_compile: NoCompile = False,
+    problem: opt.Problem, reason: Annotated[str, given("TEXT", "why the new numbers are right")],
+    seed: opt.Seed = 0, seeds: Annotated[int, given("N", "number of noise seeds from which the bands follow", min=2)] = 8,
+    baselines: opt.Baselines = None, processes: opt.Processes = 1, no_compile: opt.NoCompile = False,
 ) -> None:  # fmt: skip
     """Measure a problem anew and write its baseline. fpirhc check compares later results with it."""
     task = _task(problem)
@@ -465,13 +348,11 @@ def accept(
     print(f"baseline: {path}")
 
 
-@_command("new my_arm", "new my_arm --dir problems")
+@command("new my_arm", "new my_arm --dir problems")
 def new(
-    name: Annotated[
-        str, typer.Argument(metavar="NAME", help="name of the problem; letters, digits and _, as in Python")
-    ],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="name of the problem; letters, digits and _, as in Python")],
     folder: Annotated[Path, typer.Option("--dir", metavar="FOLDER", help="folder of the files")] = Path(),
-) -> None:
+) -> None:  # fmt: skip
     """Write a problem file and its test to start from."""
     from fpirhc.scaffold import create_problem
 
@@ -481,7 +362,7 @@ def new(
     print(f"next: fpirhc review {problem}; fpirhc compare {problem}; {install}python -m pytest {test}")
 
 
-@_command("list", name="list")
+@command("list", name="list")
 def list_() -> None:
     """List the shipped problems."""
     from fpirhc.problem_files.shipped import shipped_groups, title_of
@@ -490,8 +371,8 @@ def list_() -> None:
         print(title, *(f"  {name:24s} {title_of(path)}" for name, path in problems.items()), sep="\n")
 
 
-@_command("doctor")
-def doctor(json: Json = False) -> None:
+@command("doctor")
+def doctor(json: opt.Json = False) -> None:
     """Say what is installed, what is missing, and how to get it. Exit code 7 where something that is needed is broken; a part that
     is missing and has a substitute (warn), or that few need (none), ends with 0.
     """
@@ -502,18 +383,18 @@ def doctor(json: Json = False) -> None:
     raise typer.Exit(7 if any(outcome == "fail" for _, outcome, *_ in findings) else 0)
 
 
-@_command(
+@command(
     "export two_mass RHC+FPI --out device                    C99 in the folder device",
     "export two_mass RHC+FPI --live deformation.gain limits.inputs.Q1",
     "export two_mass RHC+FPI --to fmu2                       a unit for co-simulation",
     "export two_mass RHC+FPI --to lab                        a page with sliders",
 )
 def export(
-    problem: Problem, controller: Controller,
-    out: Annotated[Path | None, _given("FOLDER", "new or empty folder [default: results/PROBLEM/TARGET]")] = None,
-    to: Annotated[str, _given("TARGET", "what is written: c, arduino, fmu2, library, wasm, or lab")] = "c",
-    live: Annotated[list[str] | None, _given("PATH ...", "settings that can be changed on the device")] = None,
-    name: Annotated[str | None, _given("NAME", "prefix of all names in C [default: problem and controller]")] = None,
+    problem: opt.Problem, controller: opt.Controller,
+    out: Annotated[Path | None, given("FOLDER", "new or empty folder [default: results/PROBLEM/TARGET]")] = None,
+    to: Annotated[str, given("TARGET", "what is written: c, arduino, fmu2, library, wasm, or lab")] = "c",
+    live: Annotated[list[str] | None, given("PATH ...", "settings that can be changed on the device")] = None,
+    name: Annotated[str | None, given("NAME", "prefix of all names in C [default: problem and controller]")] = None,
 ) -> None:  # fmt: skip
     """Write a controller for use without Python. C99 for a device, a unit of FMI 2, WebAssembly, or a page with sliders."""
     task = _task(problem)
@@ -525,11 +406,10 @@ def export(
     if to == "lab":
         from fpirhc.export.lab import write_lab
 
+        sliders = "a lab has sliders of parameters, gains and limits of inputs, and no others"
         if live:
-            raise typer.BadParameter(
-                "--live: a lab has sliders of parameters, gains and limits of inputs, and no others"
-            )
-        page = _folder(folder) / f"{task.name}-lab.html"
+            raise typer.BadParameter(f"--live: {sliders}")
+        page = opt.folder_of(folder) / f"{task.name}-lab.html"
         write_lab(task, problem, {controller: chosen}, page)
         print(f"wrote {page}")
         return
@@ -541,13 +421,11 @@ def export(
         print(f"wrote {file}")
 
 
-@app.callback(invoke_without_command=True)
+@opt.app.callback(invoke_without_command=True)
 def about(
     version: Annotated[bool, typer.Option("--version", help="print the version")] = False,
-    _debug: Annotated[
-        bool, typer.Option("--debug", help="print the traceback of an error; may stand anywhere")
-    ] = False,
-) -> None:
+    _debug: Annotated[bool, typer.Option("--debug", help="print the traceback of an error; may stand anywhere")] = False,
+) -> None:  # fmt: skip
     """What stands before a command."""
     if version:
         from importlib.metadata import version as version_of

@@ -14,15 +14,15 @@ from fpirhc.problem_files.shipped import shipped_problems
 
 _LONGEST = 60  # characters of a name
 _FALLBACK = "my_plant"
+_BETWEEN = "# ---- its test ----\n"  # of templates.txt
 
 
 def create_problem(name: str, folder: Path) -> tuple[Path, Path]:
     """Write NAME.py and test_NAME.py into the folder, which is created where it is missing, and return their paths."""
     check_name(name)
-    texts = {
-        folder / f"{name}.py": _template("problem.txt", name),
-        folder / f"test_{name}.py": _template("test.txt", name),
-    }
+    template = resources("fpirhc.scaffold").joinpath("templates.txt").read_text(encoding="utf-8")
+    parts = template.replace("NAME", name).split(_BETWEEN)
+    texts = dict(zip((folder / f"{name}.py", folder / f"test_{name}.py"), parts, strict=True))
     for path in texts:
         if path.exists() or path.is_symlink():
             raise OutputError(f"'{path}' exists already and is kept; choose another name or --dir")
@@ -79,7 +79,3 @@ def _usable(name: str) -> str:
 def _shown(name: str) -> str:
     """The name between quotes, at most a line long, with escapes for characters that cannot be printed."""
     return ascii(name if len(name) <= _LONGEST else name[:_LONGEST] + "...")
-
-
-def _template(file: str, name: str) -> str:
-    return resources("fpirhc.scaffold").joinpath(file).read_text(encoding="utf-8").replace("NAME", name)

@@ -54,15 +54,17 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
 
 def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
     """Raise for gains of the wrong sign, which are mistakes in the file and no results, before anything runs."""
-    mistakes = Mistakes(f"problem '{task.name}'")
+    mistakes, owners = Mistakes(f"problem '{task.name}'"), dict[str, list[str]]()
     for name, controller in controllers.items():
         try:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            mistakes.add(f"controller '{name}': {error}{best and f'; write {best}'}")
+            owners.setdefault(f"{error}{best and f'; write {best}'}", []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
+    for why, names in owners.items():
+        mistakes.add(f"controller {', '.join(names)}: {why}")
     mistakes.raise_if_any()
 
 

@@ -261,7 +261,7 @@ def test_ctrl_c_keeps_what_is_finished(folder, capsys):
     Path("line.py").write_text(Path("line.py").read_text() + INTERRUPTED)
     assert main(["compare", "line.py", "--no-compile"]) == 130
     assert (folder / "results/line/report.html").exists()
-    assert "CTC+FPI: interrupted before it finished" in capsys.readouterr().out
+    assert "CTC+FPI (interrupted before it finished)" in capsys.readouterr().out
 
 
 def test_a_reader_that_closes_the_output_ends_it_in_silence():
