@@ -101,9 +101,7 @@ def _of_typer(error: Any) -> str:
     from fpirhc.errors import nearest
 
     context, text = getattr(error, "ctx", None), error.format_message().rstrip(".").removeprefix("Invalid value: ")
-    text = re.sub("Input should be (?:a valid )?([^,]*)(?:, unable.*)?", r"expected \1", text).replace(
-        "integer", "whole number"
-    )
+    text = re.sub("Input should be (?:a valid )?([^,]*)(?:, unable.*)?", r"expected \1", text)
     if context is None:
         return str(text)
     if type(error).__name__ == "NoSuchOption":

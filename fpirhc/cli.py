@@ -208,8 +208,8 @@ def study(
             result: Any = find_limits(task, over=limits, seed=seed, folder=folder, **facts)
             page = render_charted(result.view)
         else:
-            drawn: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
-            variants = Grid.parsed(over, seed) if over else drawn
+            named: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
+            variants = Grid.parsed(over, seed) if over else named
             facts["processes"] = processes or (None if cluster else -1)
             result = run_study(task, variants, headline=headline, folder=folder, **facts)
             page = render_charted(result.view, figure_of(result), "Every run", "")
@@ -415,9 +415,8 @@ def export(
         return
     if to not in targets():
         raise InvalidName(f"the target '{to}' is unknown.{nearest(to, [*targets(), 'lab'])}")
-    target = targets()[to]
     device = device_of(task.problem, chosen, controller, name=name, live=live or [])
-    for file in write(device, target, folder):
+    for file in write(device, targets()[to], folder):
         print(f"wrote {file}")
 
 

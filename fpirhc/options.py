@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -65,10 +66,9 @@ def command(*examples: str, name: str | None = None) -> Callable[[Callable[..., 
 
 def percent(text: str) -> float:
     """Return the number of a percentage, or of a default, which is a number."""
-    try:
+    value = -1.0
+    with suppress(ValueError):
         value = float(str(text).strip().removesuffix("%"))
-    except ValueError:
-        value = -1.0
     if not 0 <= value < float("inf"):
         raise typer.BadParameter(f"expected percent of at least 0, such as 20%, got '{text}'")
     return value
@@ -86,14 +86,16 @@ Controllers = Annotated[
 ]
 Out = Annotated[Path | None, given("FOLDER", "folder of the results [default: results/PROBLEM]")]
 Seed = Annotated[int, given("N", "seed of noise and of what is drawn", min=0)]
-_DRAWN = "draw exact parameters and dead times within so much of the file's"
-Mismatch = Annotated[float, given("PERCENT", _DRAWN, parser=percent)]
+Mismatch = Annotated[
+    float, given("PERCENT", "draw exact parameters, dead times within so much of the file's", parser=percent)
+]
 _REPLACED = "replace numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"
 Set = Annotated[list[str] | None, given("PATH=NUMBER ...", _REPLACED, "--set")]
 Json = Annotated[bool, given(None, "print one JSON object", "--json")]
 Verbose = Annotated[bool, given(None, "print every column and every remark", "--verbose", "-v")]
-_UNCOMPILED = "do not wait for a C compiler: loops run in CasADi's virtual machine, slower"
-NoCompile = Annotated[bool, given(None, _UNCOMPILED, "--no-compile")]
+NoCompile = Annotated[
+    bool, given(None, "do not compile: loops run in CasADi's virtual machine, slower", "--no-compile")
+]
 Processes = Annotated[int, given("N", "number of processes", min=1)]
 Count = given("N", "number of plants that are drawn at random", min=1)
 Cases = Annotated[list[str] | None, given("NAME ...", "named cases of the file: names, groups, or all")]
@@ -105,10 +107,9 @@ def numbers(settings: Sequence[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for text in settings:
         path, _, value = text.partition("=")
-        try:
+        parts: tuple[float, ...] = ()
+        with suppress(ValueError):
             parts = tuple(map(float, value.split(",")))
-        except ValueError:
-            parts = ()
         if not path.strip() or not parts:
             mend = "expected PATH=NUMBER, such as deformation.gain=-1.2, or PATH=LOWER,UPPER for an interval"
             raise typer.BadParameter(f"--set {text}: {mend}")

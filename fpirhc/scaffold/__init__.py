@@ -13,7 +13,6 @@ from fpirhc.errors import InvalidName, OutputError, not_writable
 from fpirhc.problem_files.shipped import shipped_problems
 
 _LONGEST = 60  # characters of a name
-_FALLBACK = "my_plant"
 _BETWEEN = "# ---- its test ----\n"  # of templates.txt
 
 
@@ -41,13 +40,12 @@ def check_name(name: str) -> None:
     usable = _usable(name)
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise InvalidName(
-            f"{_shown(name)} is no name for a problem: it must begin with a letter and go on with letters, digits and "
+            f"{name[:_LONGEST]!a} is no name for a problem: it must begin with a letter and go on with letters, digits and "
             f"underscores. Try '{usable}'; a folder is given by --dir"
         )
     if len(name) > _LONGEST:
         raise InvalidName(f"a name of {len(name)} characters is too long: at most {_LONGEST}. Try '{usable}'")
-    reason = _taken(name)
-    if reason:
+    if reason := _taken(name):
         raise InvalidName(f"'{name}' cannot be the name of a problem: {reason}. Try '{usable}'")
 
 
@@ -70,12 +68,6 @@ def _usable(name: str) -> str:
     """A name like the given one that can be used."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", name.removesuffix(".py")).strip("_")[: _LONGEST - 8].lower()
     if not plain:
-        return _FALLBACK
-    candidate = plain if plain[0].isalpha() else f"plant_{plain}"
-    candidate = re.sub(r"(^|_)test$", r"\1plant", candidate)
+        return "my_plant"
+    candidate = re.sub(r"(^|_)test$", r"\1plant", plain if plain[0].isalpha() else f"plant_{plain}")
     return f"my_{candidate}" if _taken(candidate) else candidate
-
-
-def _shown(name: str) -> str:
-    """The name between quotes, at most a line long, with escapes for characters that cannot be printed."""
-    return ascii(name if len(name) <= _LONGEST else name[:_LONGEST] + "...")

@@ -48,7 +48,6 @@ WRONG: dict[str, tuple[Any, str]] = {
         "the reference of 'y' goes from 0 to 0, but its sensor shows 0.5 to 0.9",
     ),
     "even window": (lambda: FIT(window=10, degree=2), "use 9 or 11"),
-    "even and short window": (lambda: FIT(window=4, degree=9), "at least 11 samples for degree 9; use 11"),
     "smallest window": (lambda: FIT(window=2, degree=1), "at least 3 samples for degree 1; use 3"),
     "short window": (lambda: FIT(window=3, degree=3), "at least 5"),
     "window of a float": (lambda: FIT(window=5.0, degree=2), "expected a whole number from 1 to 1001, got 5.0"),  # type: ignore[arg-type]
