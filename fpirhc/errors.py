@@ -118,11 +118,7 @@ class NotInstalled(NotSupported):
 
 
 def package(name: str, extra: str, what: str = "this") -> Any:
-    """Import a package of an extra.
-
-    Raises:
-        NotInstalled: it is not installed.
-    """
+    """Import a package of an extra."""
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as missing:

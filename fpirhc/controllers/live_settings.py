@@ -53,11 +53,7 @@ class LiveSettings:
         return {path: float(self._content(path)) for path in self.paths}
 
     def composed(self, compose: Callable[[Built], Composite]) -> Composite:
-        """Return what `compose` makes of the controller that is built with open numbers.
-
-        Raises:
-            NotSupported: a number that the loop does not read, or with which Python computes while the loop is built.
-        """
+        """Return what `compose` makes of the controller that is built with open numbers."""
         checked(self.problem, self.controller)
         opened = Opened(self.start)
         try:
@@ -92,10 +88,7 @@ class LiveSettings:
         return not_live(self.paths, f"{where} needs its number while the loop is built; {ANEW}", " here")
 
     def changed(self, numbers: Numbers) -> tuple[Problem, Controller, dict[str, float]]:
-        """Return problem and controller with other numbers, checked, and the numbers of all settings by path.
-
-        `numbers`: by path, a pair for an interval; settings that are not named have the numbers of the build.
-        """
+        """Return problem and controller with other numbers, checked, and the numbers of all settings by path."""
         values = self.start | self.flat(numbers)
         for path, value in values.items():
             if not math.isfinite(value):  # whether there is a limit decides what is compiled

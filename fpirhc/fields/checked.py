@@ -84,10 +84,7 @@ Value = TypeVar("Value")
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:
-    """Return the function with a check of its arguments: a decorator for the verbs of the library.
-
-    An annotation whose name the module imports for type checkers only checks nothing.
-    """
+    """Return the function with a check of its arguments: a decorator for the verbs of the library."""
 
     @wraps(function)
     def checked(*arguments: P.args, **named: P.kwargs) -> R:
@@ -218,11 +215,7 @@ def replaced(value: Value, field: str, content: object) -> Value | None:
 
 
 class ByName(dict[str, Value]):
-    """A dictionary with names as keys; dictionaries in it are such ones too.
-
-    Raises:
-        InvalidName: a name that is not there.
-    """
+    """A dictionary with names as keys; dictionaries in it are such ones too."""
 
     def __init__(self, entries: Mapping[str, Value] | Iterable[tuple[str, Value]], where: str = "the mapping") -> None:
         """Copy the entries; `where` is the subject of the error: "Task.controllers"."""

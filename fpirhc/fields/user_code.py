@@ -49,13 +49,7 @@ def scalar_expression(
     symbols: Sequence[Expression] = (),
     finite: bool = True,
 ) -> Expression:
-    """Return a result of a user's function as one scalar expression.
-
-    Args:
-        of: the user's function, whose place is said where it gives NaN.
-        symbols: those that the result may hold; without them any.
-        finite: whether NaN is refused. CasADi makes NaN of math.sin(symbol), and says nothing.
-    """
+    """Return a result of a user's function as one scalar expression."""
     if not isinstance(value, ca.SX | ca.MX | ca.DM | int | float | np.number):
         raise InvalidProblem(f"{what} must be one scalar expression, got {described(value)}")
     made = expression(value if isinstance(value, ca.SX | ca.MX | ca.DM) else ca.DM(float(value)))
@@ -65,7 +59,7 @@ def scalar_expression(
         raise InvalidProblem(
             f"{what} holds the symbol {strange}, which has no value; use the arguments of the function, or a Parameter"
         )
-    if finite and _holds_nan(made):
+    if finite and _holds_nan(made):  # CasADi makes NaN of math.sin(symbol), and says nothing
         place = f" ({place_of(of)})" if of is not None else ""
         raise InvalidProblem(f"{what} holds NaN{place}: {_OF_CASADI}")
     return made

@@ -110,10 +110,7 @@ def without_disturbances(plant: Plant) -> Plant:
 
 
 def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
-    """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order.
-
-    `wanted`: (coordinate or output, number of the derivative) of every entry.
-    """
+    """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order."""
     return _FUNCTIONS.of((plant,), tuple(wanted), lambda: _derivatives(plant, wanted))
 
 
@@ -139,12 +136,7 @@ def response_units(plant: Plant) -> tuple[str, ...]:
 def nominal_responses(
     plant: Plant, outputs: Matrix, responses: Matrix, later: Callable[[], Matrix] | None = None
 ) -> Matrix:
-    """Return the nominal responses of the controlled quantities: highest derivatives, or the outputs of order 0 themselves.
-
-    Args:
-        outputs: nominal outputs and their derivatives, in the order of `Plant.output`; without outputs the state.
-        later: gives the outputs at the end of the cycle, where one is of order 0; None: `outputs`.
-    """
+    """Return the nominal responses of the controlled quantities: highest derivatives, or the outputs of order 0 themselves."""
     instant = plant.at_once
     if not instant:
         return responses[controlled_places(plant)]
@@ -164,12 +156,7 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
 
 
 def require_derivatives(plant: Plant, who: str, *, of_time: bool, instead: str) -> None:
-    """Raise for an output of order 0, and where derivatives are `of_time` for a map: they have none.
-
-    Args:
-        who: what needs derivatives, as the beginning of a sentence.
-        instead: what to do, as its end.
-    """
+    """Raise for an output of order 0, and where derivatives are `of_time` for a map: they have none."""
     reasons = [f"the command moves '{name}' at once (order 0)" for name in plant.at_once]
     if of_time and plant.step is not None:
         reasons.append("a map has differences of its steps")

@@ -74,10 +74,7 @@ class Equations:
 
     @cached_property
     def output_orders(self) -> dict[str, int]:
-        """Relative order of every output, or coordinate: the derivative that the command moves at once; 0 for the output itself.
-
-        An output that no input reaches has the order one; coordinates without outputs have those that are stated.
-        """
+        """Relative order of every output, or coordinate: the derivative that the command moves at once; 0 for the output itself."""
         if not self.plant.outputs:
             return dict(zip(self.plant.names, self.plant.orders, strict=True))
         orders = {name: output_order(self.plant, name) for name in self.plant.outputs}
@@ -145,14 +142,7 @@ class Equations:
 
     @cached_property
     def inverse(self) -> ca.Function:
-        """Function (state, response of the controlled coordinates, parameters) -> input.
-
-        A user's own inverse comes first. A response that is affine in the inputs, r = f_0 + G u, is solved by u = G^-1 (r - f_0),
-        any other one by Newton's method; an input that it does not find is NaN.
-
-        Raises:
-            NotInvertible: the inputs and the controlled coordinates differ in number.
-        """
+        """Function (state, response of the controlled coordinates, parameters) -> input."""
         if len(self.plant.controlled_names) != len(self.plant.inputs):
             raise NotInvertible(f"{len(self.plant.controlled_names)} controlled coordinates need as many inputs")
         if self.plant.inverse is not None:

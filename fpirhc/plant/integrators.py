@@ -244,14 +244,7 @@ _INSIDE = 2.0  # |pole| times sub-step at which Runge-Kutta 4 is stable for all 
 def stiffness(
     plant: Plant, integrator: Integrator, period: float, state: np.ndarray, command: np.ndarray, parameters: np.ndarray
 ) -> str:
-    """Return a sentence that names the pole that the integrator makes grow, and what would do; empty where all is well.
-
-    Args:
-        period: control cycle, in the plant's unit of time.
-        state: shape (nx,).
-        command: shape (nu,).
-        parameters: shape (np,).
-    """
+    """Return a sentence that names the pole that the integrator makes grow, and what would do; empty where all is well."""
     modes = poles(plant, state, command, parameters)
     if not np.isfinite(modes).all():
         return ""
@@ -276,13 +269,7 @@ def stiffness(
 def spurious_growth(
     plant: Plant, integrator: Integrator, period: float, states: np.ndarray, commands: np.ndarray
 ) -> np.ndarray:
-    """Return the largest factor by which steps along a trajectory make a mode of the model grow that decays, shape (N,); 1: none.
-
-    Args:
-        period: of a step, in the plant's unit of time.
-        states: shape (nx, N).
-        commands: shape (nu, N).
-    """
+    """Return the largest factor by which steps along a trajectory make a decaying mode of the model grow, shape (N,); 1: none."""
     points = zip(states.T, commands.T, strict=True)
     modes = [poles(plant, state, command, plant.approximate) for state, command in points]
     return np.array(

@@ -134,10 +134,7 @@ def differentiated(value: Expression, t: Expression, order: int) -> list[Express
 
 
 def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
-    """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked.
-
-    `gains`: lowest derivative first; with delta for the derivatives the modes are z = 1 + T times their roots.
-    """
+    """Raise if a law with these gains has a mode that does not decay in the cycles of a map; elsewhere nothing is checked."""
     if plant.step is None or not gains:
         return
     cycle = sampling(plant)

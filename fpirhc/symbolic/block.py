@@ -49,12 +49,7 @@ class Block:
 
     @property
     def function(self) -> ca.Function:
-        """Function of (each of `inputs`, each remembered) -> (each written, each remembered, one cycle later).
-
-        Raises:
-            InvalidName: the step leaves out a signal.
-            InvalidShape: a signal has the wrong size.
-        """
+        """Function of (each of `inputs`, each remembered) -> (each written, each remembered, one cycle later)."""
         return self._built[0]
 
     @cached_property

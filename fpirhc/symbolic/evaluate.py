@@ -129,12 +129,7 @@ class Latest(threading.local, Generic[T]):
         self._known: deque[tuple[tuple[object, ...], tuple[object, ...], T]] = deque(maxlen=most)
 
     def of(self, same: tuple[object, ...], equal: tuple[object, ...], build: Callable[[], T]) -> T:
-        """Return what `build` returns, or what it returned for these arguments.
-
-        Args:
-            same: arguments that must be the same objects, because values with functions and arrays cannot be compared.
-            build: function without arguments.
-        """
+        """Return what `build` returns, or what it returned for the `same` objects and `equal` values."""
         for objects, others, result in tuple(self._known):
             alike = len(objects) == len(same) and all(map(is_, objects, same))
             if alike and _equal(others, equal):
@@ -159,10 +154,7 @@ def words_of(error: BaseException) -> str:
 
 
 def attempted(what: str, compute: Callable[..., T], *arguments: object, broken: list[str], **named: object) -> T | None:
-    """Return what a function returns; None where it raises, with a sentence about it added to `broken`.
-
-    `compute`: the function.
-    """
+    """Return what a function returns; None where it raises, with a sentence about it added to `broken`."""
     try:
         with np.errstate(all="ignore"):  # numbers that overflow show in the result
             return compute(*arguments, **named)

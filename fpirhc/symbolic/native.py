@@ -52,10 +52,7 @@ class Native:
 
 
 def find_compiler() -> str | None:
-    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc, clang or ziglang; None where FPIRHC_CC is 'none' or there is none.
-
-    Where FPIRHC_CC names a compiler, no other one replaces it.
-    """
+    """Path of the C compiler: FPIRHC_CC, else CC, cc, gcc, clang or ziglang; None where FPIRHC_CC is 'none' or there is none."""
     setting = os.environ.get("FPIRHC_CC", "")
     if setting:
         return None if setting.lower() == "none" else shutil.which(setting)
@@ -73,18 +70,7 @@ def command_of(compiler: str) -> tuple[str, ...]:
 
 
 def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool = False, calls: int = 0) -> Native:
-    """Return `function` compiled, or as it is with the reason why not.
-
-    What FPIRHC_CFLAGS has goes to the compiler behind all other flags: with -O0 a plan compiles in a ninth of the time, runs many
-    times as long, and has the same bits.
-
-    Args:
-        required: whether a failure of the compiler is an error; without a compiler `function` is returned as it is all the same.
-        calls: number of calls in a row that the compiled Function makes, see `program.chained`; 0: one call of `function` itself.
-
-    Raises:
-        CompileError: `required`, and the compiler failed.
-    """
+    """Return so many calls of a Function compiled, 0 for itself, or it as it is with the reason; a failure may be an error."""
     if function.is_a("External"):
         return Native(function, True, "")
     compiler = find_compiler()

@@ -24,10 +24,7 @@ _OWN = re.compile(r"/\* (?P<name>\w+):\(.*\*/\nstatic int (?P<place>casadi_f\d+)
 
 
 def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
-    """Return the C files of a Function: its own under a fixed name, and the files of the drivers that it calls.
-
-    `function`: the Function. `calls`: number of calls in a row, as in `chained`; 0: it is called once.
-    """
+    """Return the C files of a Function: its own under a fixed name, and the files of the drivers that it calls."""
     called = _called(function)
     if any(f.is_a("External") for f in called):
         raise NoCode("it calls a Function that is already compiled; compile the whole instead")
@@ -127,13 +124,7 @@ def _loop(source: str, function: ca.Function) -> str:
 
 
 def chained(function: ca.Function, calls: int, base: int) -> ca.Function:
-    """Return a Function (memory, reads of all calls, count) -> (memory after so many calls, results of all calls).
-
-    Its arguments and results are tables with a column per call, but for the memory. Compiled, what is behind the count stays.
-
-    Args:
-        function: (memory, reads...) -> (memory one call later, results...).
-    """
+    """Return a Function (memory, reads of all calls, count) -> (memory after so many calls, results of all calls)."""
     whole = function.mapaccum(f"{function.name()}_run", calls, {"base": base})
     arguments = [ca.MX.sym(whole.name_in(k), *whole.size_in(k)) for k in range(whole.n_in())]
     memories, *results = whole.call(arguments)

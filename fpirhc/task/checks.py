@@ -240,11 +240,7 @@ def _check_disturbances(problem: Problem) -> None:
 def needed_names(
     plant: Plant, sensing: Sensing, judged: Sequence[str] | None
 ) -> tuple[frozenset[str], tuple[str, ...]]:
-    """Return the names of the model's coordinates and outputs that what moves must have, and of what is measured.
-
-    Measured is what sensors show, and the state that is given beside outputs where nothing is believed. `judged`: names whose
-    errors are judged beside the controlled ones; None: no other need be there.
-    """
+    """Return the names of the model's coordinates and outputs that what moves must have, and of what is measured."""
     beside = plant.motion[:-1] if sensing.observer is None else ()
     states = [element for signal in beside for element in signal.elements]
     measured = tuple(dict.fromkeys((*states, *sensing.measures(plant))))

@@ -78,10 +78,7 @@ class DeadTime(Checked):
 
 
 def delay_block(name: str, source: Signal, target: Signal, waits: Sequence[Queue]) -> Block:
-    """Block that delays every entry of `source` by its own number of cycles.
-
-    `target`: the delayed signal; its start value fills the queues.
-    """
+    """Block that delays every entry of `source` by its own number of cycles."""
     queue, kept = Queue(tuple(cycles for wait in waits for cycles in every(wait.cycles))), f"{name}_queue"
     memory = queue.memory(kept, source.elements, tuple(map(float, target.start_vector())))
 
@@ -162,12 +159,7 @@ class Queue:
     def driven(
         self, step: ca.Function, state: Expression, queue: Expression, size: int, held: Sequence[Expression]
     ) -> Expression:
-        """Return a state after the values that are on their way, the oldest first; the delay is whole and one for all entries.
-
-        Args:
-            step: Function (state, value, held...) -> state one cycle later.
-            queue: the past values; those that entered less than `cycles` ago are on their way.
-        """
+        """Return a state after the values that are on their way, the oldest first; the delay is whole and one for all entries."""
         assert not isinstance(self.cycles, tuple)
         longest = int(self.cycles)
         if not longest:

@@ -113,12 +113,7 @@ class ExternalPlant(Checked):
         return self
 
     def with_exact(self, exact: np.ndarray) -> ExternalPlant:
-        """Return it with other exact parameters, shape (number of parameters,).
-
-        Raises:
-            InvalidProblem: a value that is not finite or outside its bounds.
-            NotSupported: it has no parameters.
-        """
+        """Return it with other exact parameters, shape (number of parameters,)."""
         require(
             self.parameters,
             "the external plant has no exact parameters that a study could draw; state them, "
@@ -162,11 +157,7 @@ class ExternalPlant(Checked):
         mistakes.raise_if_any()
 
     def first(self, seed: int) -> np.ndarray:
-        """Return the first measurements.
-
-        Raises:
-            InvalidProblem: a bad answer, or no body.
-        """
+        """Return the first measurements."""
         if self.make is not None:
             try:
                 body = self.make({name: one.exact for name, one in self.parameters.items()}, seed)

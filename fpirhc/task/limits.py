@@ -50,14 +50,7 @@ class PathConstraint(Checked):
     unit: str = ""
 
     def named_value(self, name: str, view: object, symbols: Sequence[Expression] = ()) -> Expression:
-        """Return the limited scalar of a stage, checked.
-
-        Args:
-            symbols: those that the view is made of; without them any.
-
-        Raises:
-            InvalidProblem: it fails, or is no scalar of the view.
-        """
+        """Return the limited scalar of a stage, checked."""
         what = f"limits: paths['{name}']"
         return scalar_expression(what, called(what, self.expression, view), symbols=symbols, finite=False)
 
@@ -88,11 +81,7 @@ class Limits(Checked):
     prices: Mapping[str, Positive] = field(default_factory=dict)
 
     def check(self, plant: Plant) -> None:
-        """Raise if a name is unknown or an interval is empty.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
+        """Raise if a name is unknown or an interval is empty."""
         mistakes = Mistakes("limits")
         mistakes.unknown("input", self.inputs, plant.inputs)
         mistakes.unknown("state", self.states, plant.state.elements)

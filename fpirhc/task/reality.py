@@ -57,33 +57,16 @@ class Reality(Checked):
         return self.plant.parameters
 
     def with_exact(self, exact: np.ndarray) -> Reality:
-        """Return the reality with other exact parameters, shape (np,).
-
-        Raises:
-            InvalidProblem: see `with_exact_parameters`.
-        """
+        """Return the reality with other exact parameters, shape (np,)."""
         return replace(self, plant=with_exact_parameters(self.plant, exact))
 
     def over(self, cycle: float) -> Reality:
-        """Return it as a controller with this cycle sees it; see `fpirhc.plant.maps.over`.
-
-        Raises:
-            InvalidValue: the cycle is no whole number of a map's steps.
-        """
+        """Return it as a controller with this cycle sees it; see `fpirhc.plant.maps.over`."""
         plant = over(self.plant, cycle)
         return self if plant is self.plant else replace(self, plant=plant)
 
     def check(self, model: Plant, needed: Collection[str], measured: Collection[str]) -> None:  # noqa: ARG002
-        """Raise if the reality cannot stand for what the model describes.
-
-        Args:
-            model: of the problem.
-            needed: names of the model that it must have. What else it has under the same name has the same unit.
-            measured: names of what the sensing uses, which follows from the coordinates.
-
-        Raises:
-            InvalidProblem: all mistakes together.
-        """
+        """Raise if the reality cannot stand for what the model describes."""
         plant, mistakes = self.plant, Mistakes("reality")
         own, expected = (", ".join(f"{n} in {unit}" for n, unit in one.inputs.items()) for one in (plant, model))
         if own != expected:
@@ -139,21 +122,12 @@ class Reality(Checked):
         return self._own(name, seen=False) in self._units
 
     def function(self, quantities: Sequence[str], *, seen: bool = False) -> ca.Function:
-        """Function (state, input, parameters, forcing) of what moves -> quantities of the model by name: "q1", "q1'", "y".
-
-        Args:
-            quantities: coordinates and outputs of the model, and their derivatives.
-            seen: whether they are the measured ones; else the judged ones.
-        """
+        """Function (state, input, parameters, forcing) of what moves -> quantities of the model by name: "q1", "q1'", "y"."""
         wanted = [(self._own(e.rstrip("'"), seen=seen), e.count("'")) for e in quantities]
         return derivatives_function(self.plant, wanted)
 
     def start_state(self, model: Plant, start: np.ndarray) -> np.ndarray:
-        """Return the first state of the reality, shape (its nx,), from that of the model, shape (nx,).
-
-        Raises:
-            InvalidProblem: a state that neither the model nor `start` says.
-        """
+        """Return the first state of the reality, shape (its nx,), from that of the model, shape (nx,)."""
         elements = self.plant.state.elements
         known: dict[str, float] = {
             self._own(e.rstrip("'"), seen=False) + "'" * e.count("'"): value
@@ -178,17 +152,7 @@ class Reality(Checked):
         return {**self.plant.coordinates, **followed_units(self.plant)}
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
-        """Raise if the reality cannot move from its start, or the integrator cannot follow it there.
-
-        Args:
-            start: first state, shape (nx,).
-            command: inputs before the first cycle, shape (nu,).
-            integrator: of the motion.
-            period: of the control cycle.
-
-        Raises:
-            InvalidProblem: with the fastest pole, and the sub-steps that would do.
-        """
+        """Raise if the reality cannot move from its start, or the integrator cannot follow it there."""
         plant = self.plant
         rates = np.asarray(plant.equations.rate(start, command, plant.exact).full()).ravel()
         if not np.isfinite(rates).all():
@@ -200,11 +164,7 @@ class Reality(Checked):
             raise InvalidProblem(f"reality: {what}; use Reality(..., {remedy})")
 
     def as_model(self, model: Plant) -> Plant:
-        """Return its plant as the model of a controller, with outputs where the model has the same quantities as outputs.
-
-        Raises:
-            NotSupported: with what differs.
-        """
+        """Return its plant as the model of a controller, with outputs where the model has the same quantities as outputs."""
         plant = self.plant
         if plant is model:
             return plant
