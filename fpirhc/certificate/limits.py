@@ -89,7 +89,7 @@ def certify_limits(
     """
     ready = resolved(problem, controller)
     refuse(f"no certificate for {type(ready).__name__}: {reason}" for reason in _against(problem, ready))
-    box, plant = exact_ranges(problem.plant, mismatch), problem.plant
+    box, plant = exact_ranges(problem.plant.parameters, mismatch), problem.plant
     believed = ready.plant_model(problem).parameters(plant)
     functions, chains = Expressions(plant, believed), Chains(plant, problem.period, _gains(problem, ready))
     plans, margins = ready.planner is not None, dict.fromkeys(_hard(problem), 0.0)

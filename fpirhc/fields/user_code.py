@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 import re
 import sys
 import traceback
@@ -19,7 +18,7 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidProblem, nearest
 from fpirhc.fields.kinds import described
-from fpirhc.symbolic.expression import Expression, expression
+from fpirhc.symbolic.expression import Expression, expression, holds_nan
 
 Result = TypeVar("Result")
 
@@ -59,7 +58,9 @@ def scalar_expression(
         raise InvalidProblem(
             f"{what} holds the symbol {strange}, which has no value; use the arguments of the function, or a Parameter"
         )
-    if finite and _holds_nan(made):  # CasADi makes NaN of math.sin(symbol), and says nothing
+    # CasADi makes NaN of math.sin(symbol), and says nothing.
+    checked = ca.SX(made) if finite and not isinstance(made, ca.MX) else ca.SX(0)
+    if holds_nan(ca.Function("fpirhc_result", ca.symvar(checked), [checked])):
         place = f" ({place_of(of)})" if of is not None else ""
         raise InvalidProblem(f"{what} holds NaN{place}: {_OF_CASADI}")
     return made
@@ -113,16 +114,6 @@ def _strangers(made: Expression, symbols: Sequence[Expression]) -> str:
     if not isinstance(made, type(known[0])):
         return ", ".join(one.name() for one in ca.symvar(made))
     return ", ".join(ca.Function("fpirhc_result", known, [made], {"allow_free": True}).get_free())
-
-
-def _holds_nan(made: Expression) -> bool:
-    if made.is_constant():
-        return math.isnan(float(ca.evalf(made)))
-    if not isinstance(made, ca.SX):
-        return False
-    function = ca.Function("fpirhc_result", ca.symvar(made), [made])
-    constants = (k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CONST)
-    return any(math.isnan(function.instruction_constant(k)) for k in constants)
 
 
 _PACKAGE = str(Path(__file__).resolve().parents[1])

@@ -8,7 +8,7 @@ The response of an output of order 0 is the output, and its nominal response the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -29,14 +29,12 @@ from fpirhc.plant.motion import (
     outside_names,
     sampling,
 )
-from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
 
-_FUNCTIONS: Latest[ca.Function] = Latest(8)  # the parts of a loop that is composed ask for the same few
 Symbols = tuple[ca.SX, ca.SX, ca.SX, ca.SX]  # x, u, p, and the forcing w
 
 
@@ -109,12 +107,9 @@ def without_disturbances(plant: Plant) -> Plant:
     return plant if len(kept) == len(plant.believed) else replace(plant, believed=kept)
 
 
-def derivatives_function(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
+@lru_cache(maxsize=8)  # the parts of a loop that is composed ask for the same few
+def derivatives_function(plant: Plant, wanted: tuple[tuple[str, int], ...]) -> ca.Function:
     """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order."""
-    return _FUNCTIONS.of((plant,), tuple(wanted), lambda: _derivatives(plant, wanted))
-
-
-def _derivatives(plant: Plant, wanted: Sequence[tuple[str, int]]) -> ca.Function:
     symbols = *plant.symbols(), ca.SX.sym("w", len(plant.names))
     most = {name: max(k for one, k in wanted if one == name) for name, _ in wanted}
     chains = derivatives(plant, most, symbols)

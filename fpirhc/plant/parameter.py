@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import Annotated, Protocol
+from typing import Annotated
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked, checked_call
@@ -62,24 +62,27 @@ def outside(nominal: float, unit: str, bounds: tuple[float, float] = (-math.inf,
 
 def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -> None:
     """Add every mistake of the parameters to `mistakes`."""
-    for name, parameter in parameters.items():
-        if not isinstance(parameter, Parameter):
-            mistakes.add(f"parameter '{name}' must be Parameter(approximate=..., exact=..., unit=...)")
-            continue
-        numbers = True
-        for which in ("approximate", "exact"):
-            value = getattr(parameter, which)
-            if not finite_number(value):
-                mistakes.add(
-                    f"parameter '{name}': {which} is {value!r}, expected a finite number; look at what computes it (a division by "
-                    "zero, a missing value), or write the number"
-                )
-                numbers = False
-        mistake = (_bounds_mistake(parameter) or _spread_mistake(parameter)) if numbers else ""
-        if mistake:
-            mistakes.add(f"parameter '{name}': {mistake}")
-        if not isinstance(parameter.unit, str) or not parameter.unit:
+    for name, one in parameters.items():
+        values = {which: getattr(one, which) for which in ("approximate", "exact")}
+        odd = [
+            f"{which} is {value!r}, expected a finite number; look at what computes it (a division by zero, a missing value), or "
+            "write the number"
+            for which, value in values.items()
+            if not finite_number(value)
+        ]
+        mistakes.join(f"parameter '{name}': {why}" for why in odd or _range_mistakes(one))
+        if not one.unit:
             mistakes.add(f"parameter '{name}' has no unit; write unit='kg' (or '1' for none)")
+
+
+def _range_mistakes(parameter: Parameter) -> Iterator[str]:
+    (low, high), spread = parameter.bounds, parameter.spread
+    if not low < high:
+        yield f"bounds must be (lowest, highest), got {parameter.bounds!r}"
+    elif outside := [w for w in ("approximate", "exact") if not low <= getattr(parameter, w) <= high]:
+        yield f"{outside[0]} is outside its bounds {parameter.bounds!r}"
+    elif spread is not None and (mistake := spread.mistake(float(parameter.exact))):
+        yield f"spread: it {mistake}"
 
 
 def with_exact_values(parameters: Mapping[str, Parameter], exact: Iterable[float]) -> dict[str, Parameter]:
@@ -95,50 +98,21 @@ def with_exact_values(parameters: Mapping[str, Parameter], exact: Iterable[float
     return others
 
 
-def _bounds_mistake(parameter: Parameter) -> str:
-    try:
-        low, high = map(float, parameter.bounds)
-    except (TypeError, ValueError):
-        return f"bounds must be a pair of numbers (lowest, highest), got {parameter.bounds!r}"
-    if not low < high:
-        return f"bounds must be (lowest, highest), got {parameter.bounds!r}"
-    outside = [w for w in ("approximate", "exact") if not low <= getattr(parameter, w) <= high]
-    return f"{outside[0]} is outside its bounds {parameter.bounds!r}" if outside else ""
-
-
-def _spread_mistake(parameter: Parameter) -> str:
-    spread = parameter.spread
-    if spread is None:
-        return ""
-    if not isinstance(spread, Spread):
-        return f"spread must be Uniform(...), Normal(...) or LogNormal(...), got {spread!r}"
-    mistake = spread.mistake(float(parameter.exact))
-    return f"spread: it {mistake}" if mistake else ""
-
-
-class Parametric(Protocol):
-    """What has exact parameters: a plant, or a body outside."""
-
-    @property
-    def parameters(self) -> Mapping[str, Parameter]:
-        """By name."""
-
-
-def exact_ranges(plant: Parametric, mismatch: float) -> dict[str, tuple[float, float]]:
+def exact_ranges(parameters: Mapping[str, Parameter], mismatch: float) -> dict[str, tuple[float, float]]:
     """Return the least and the largest value of every exact parameter, |p - p_exact| <= P/100 |p_exact| for P percent, P < 100.
 
     p_exact is the value in the problem file: a parameter keeps its sign, and zero stays zero. One with a `spread` lies in P/100 of
     that spread; where all parameters have one, P may be 100 and more.
     """
-    all_spread = bool(plant.parameters) and all(p.spread is not None or p.outside for p in plant.parameters.values())
+    all_spread = bool(parameters) and all(p.spread is not None or p.outside for p in parameters.values())
     if not 0 <= mismatch < (math.inf if all_spread else 100):
         signs = "and less than 100 %, where no parameter changes its sign; a wider range needs a `spread` of every Parameter"
         raise InvalidValue(
             f"mismatch {mismatch:g} %: use at least 0 %{'; 100 % is the whole spread' if all_spread else f' {signs}'}"
         )
-    ranges = {name: _range(parameter, mismatch) for name, parameter in plant.parameters.items()}
+    ranges = {name: _range(parameter, mismatch) for name, parameter in parameters.items()}
     mistakes = Mistakes("mismatch")
-    for name, parameter in plant.parameters.items():
+    for name, parameter in parameters.items():
         (low, high), (least, largest) = parameter.bounds, ranges[name]
         if least < low or largest > high:
             mistakes.add(

@@ -55,11 +55,11 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
             still = " (a static map y = h(u) may have one that stands still)" if static else ""
             mistakes.add(f"{what} are empty; name at least one, with its unit{still}")
         for name, unit in group.items():
-            if not isinstance(unit, str) or not unit:
+            if not unit:
                 mistakes.add(f"{what}: '{name}' has no unit; write {{'{name}': 'm'}} (or '1' for none)")
             if not str(name).isidentifier():
                 mistakes.add(f"{what}: '{name}' is not an identifier; use letters, digits and underscores")
-    if not isinstance(plant.time_unit, str) or not plant.time_unit:
+    if not plant.time_unit:
         mistakes.add(
             f"time_unit is {plant.time_unit!r}; write the unit of time of the equations, such as 's', 'ms' or 'day'"
         )

@@ -121,7 +121,7 @@ class Draws(Variants):
         """Return the variants of a problem."""
         if self.count < 1:
             raise InvalidValue(f"draws {self.count}: expected at least 1")
-        wide = {n for n, (low, high) in exact_ranges(problem.moves, self.percent).items() if high > low}
+        wide = {n for n, (low, high) in exact_ranges(problem.moves.parameters, self.percent).items() if high > low}
         late = bool(self.percent) and _is_late(problem)
         noisy = bool(problem.disturbances) or not problem.sensing.ideal or problem.foreign is not None
         if self.count > 1 and not (wide or late or noisy):

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 _MOST_CYCLES = 1e9  # of a run; a longer one is a mistake in period or duration
 _INSTANTS = 101  # at which signals from outside are tried before a run
 _SHOWN = 200  # instants at which a reference is compared with the ranges of sensors
-_GAINS: Latest[ca.Function] = Latest(4)
 
 
 def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
@@ -187,10 +186,10 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     sets |= {} if problem.reality else {"exact": plant.exact}  # with a reality these values move nothing
     if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
         return
-    gain_of = _GAINS.of((plant.equations,), (), lambda: _gain(plant))
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
     for which, values in sets.items():
-        gain, free = (np.asarray(m.full()) for m in gain_of(problem.start_state, problem.inputs_before, values))
+        at, of_plant = (problem.start_state, problem.inputs_before, values), plant.equations
+        gain, free = (np.asarray(one(*at).full()) for one in (of_plant.input_gain, of_plant.controlled_response))
         if not np.all(np.isfinite(free)):
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
             mistakes.add(
@@ -210,13 +209,6 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
                 f"control what follows from {moved or 'another input'}. In a switch (if_else, floor, sign) it has no slope: write "
                 "its mean"
             )
-
-
-def _gain(plant: Plant) -> ca.Function:
-    """Function (state, inputs, parameters) -> (gain of the response, response)."""
-    x, u, p = plant.symbols()
-    response = plant.equations.controlled_response(x, u, p)
-    return ca.Function("fpirhc_gain", [x, u, p], [ca.densify(ca.jacobian(response, u)), response])
 
 
 def _check_disturbances(problem: Problem) -> None:

@@ -135,10 +135,8 @@ def _rate(name: str, step: float) -> Callable[[OfStage], Value]:
     return lambda view: (view.input[name] - view.input_before[name]) / step
 
 
-def _check_interval(name: str, interval: object, mistakes: Mistakes) -> None:
-    if not isinstance(interval, Sequence) or len(interval) != 2:
-        mistakes.add(f"'{name}' needs two numbers (lower, upper), got {interval!r}")
-    elif interval[0] > interval[1]:
+def _check_interval(name: str, interval: Interval, mistakes: Mistakes) -> None:
+    if interval[0] > interval[1]:
         mistakes.add(f"'{name}' has lower {interval[0]} above upper {interval[1]}; swap them")
     elif interval[0] == math.inf or interval[1] == -math.inf:
         mistakes.add(

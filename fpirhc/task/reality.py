@@ -123,8 +123,8 @@ class Reality(Checked):
 
     def function(self, quantities: Sequence[str], *, seen: bool = False) -> ca.Function:
         """Function (state, input, parameters, forcing) of what moves -> quantities of the model by name: "q1", "q1'", "y"."""
-        wanted = [(self._own(e.rstrip("'"), seen=seen), e.count("'")) for e in quantities]
-        return derivatives_function(self.plant, wanted)
+        wanted = ((self._own(e.rstrip("'"), seen=seen), e.count("'")) for e in quantities)
+        return derivatives_function(self.plant, tuple(wanted))
 
     def start_state(self, model: Plant, start: np.ndarray) -> np.ndarray:
         """Return the first state of the reality, shape (its nx,), from that of the model, shape (nx,)."""

@@ -179,7 +179,7 @@ def _residual(plant: Plant, time: float, period: float) -> ca.Function:
     old, w, f = (
         ca.SX.sym(n, k) for n, k in (("old", len(plant.names)), ("w", len(plant.names)), ("f", len(plant.inputs)))
     )
-    forced = derivatives_function(plant, list(plant.response_orders.items()))(x, u, p, w)
+    forced = derivatives_function(plant, tuple(plant.response_orders.items()))(x, u, p, w)
     effect = ca.substitute(ca.jacobian(forced, w), w, 0 * w)
     missing = f - plant.equations.controlled_response(x, u, p)
     residual_now = ca.mtimes(effect.T, ca.solve(ca.mtimes(effect, effect.T), missing))
