@@ -103,7 +103,6 @@ from .task.dead_time import DeadTime as DeadTime
 from .task.disturbance import ColouredNoise as ColouredNoise
 from .task.disturbance import Formula as Formula
 from .task.disturbance import Noise as Noise
-from .task.disturbance import Pulse as Pulse
 from .task.disturbance import Step as Step
 from .task.exogenous import Known as Known
 from .task.exogenous import Samples as Samples

@@ -69,7 +69,7 @@ problem = fp.Problem(
     period=1e-3,  # s
     duration=15.0,  # s
     limits=fp.Limits(inputs={"torque": (-20.0, 20.0)}),  # N m
-    disturbances={"torque": fp.Pulse(at=8.0, duration=3.0, size=-1.0)},
+    disturbances={"torque": fp.Step(at=8.0, duration=3.0, size=-1.0)},
     measure_from=3.0,  # s
 )
 

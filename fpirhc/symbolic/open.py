@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from types import FunctionType
 from typing import TypeVar, cast
-from weakref import WeakValueDictionary
 
 import casadi as ca
 import numpy as np
@@ -28,7 +27,6 @@ SETTINGS = "settings"  # the signal of all open numbers of a loop
 T = TypeVar("T")
 Value = TypeVar("Value", ca.SX, ca.MX)
 _LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
-_PLAIN: WeakValueDictionary[int, object] = WeakValueDictionary()  # frozen values without open numbers, by address
 _OPEN: dict[int, Opened] = {}  # of every symbol of both kinds
 
 
@@ -117,37 +115,29 @@ def expressed(value: float | ca.SX, beside: Value) -> Value:
 
 def _mapped(value: object, change: Callable[[ca.SX], object]) -> object:
     """The value with `change` applied to its open numbers; the same object where it has none."""
-    return _changed(value, change) if type(value) not in _LEAVES and _has_open(value) else value
-
-
-def _changed(value: object, change: Callable[[ca.SX], object]) -> object:
+    if not _OPEN or type(value) in _LEAVES:
+        return value
     if isinstance(value, ca.SX):
-        return change(value)
+        return change(value) if is_open(value) else value
+    parts: dict[object, object]
     if isinstance(value, Mapping):
-        return {key: _mapped(entry, change) for key, entry in value.items()}
-    if isinstance(value, tuple | list):
-        return type(value)([_mapped(entry, change) for entry in value])
-    contents = {f.name: getattr(value, f.name) for f in fields(value)}  # type: ignore[arg-type]  # a dataclass
-    return copied(value, {name: _mapped(content, change) for name, content in contents.items()})
-
-
-def _has_open(value: object) -> bool:
-    """Whether an open number stands in a value. Frozen ones that have none are remembered: most are searched many times."""
-    if isinstance(value, ca.SX):
-        return is_open(value)
-    parts: Iterable[object] = ()
-    if isinstance(value, Mapping):
-        parts = value.values()
+        parts = dict(value)
     elif isinstance(value, tuple | list):
-        parts = value
-    elif is_dataclass(value) and not isinstance(value, type) and _PLAIN.get(id(value)) is not value:
-        parts = [getattr(value, f.name) for f in fields(value)]
-    for part in parts:
-        if type(part) not in _LEAVES and _PLAIN.get(id(part)) is not part and _has_open(part):
-            return True
-    if is_dataclass(value) and not isinstance(value, type):
-        _PLAIN[id(value)] = value
-    return False
+        parts = dict(enumerate(value))
+    elif is_dataclass(value) and not isinstance(value, type):
+        parts = {f.name: getattr(value, f.name) for f in fields(value)}
+    else:
+        return value
+    changed = {key: _mapped(part, change) for key, part in parts.items()}
+    if all(changed[key] is part for key, part in parts.items()):
+        return value
+    if isinstance(value, Mapping):
+        return changed
+    return (
+        type(value)([*changed.values()])
+        if isinstance(value, tuple | list)
+        else copied(value, cast(dict[str, object], changed))
+    )
 
 
 def numbers(values: Sequence[float | ca.SX], beside: Expression) -> Expression:

@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import NotNegative, Range
+from fpirhc.fields.kinds import AboveZero, NotNegative, Range
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.symbolic.layout import Expression
 
@@ -40,33 +40,17 @@ class Disturbance(Checked, ABC):
 
 @dataclass(frozen=True)
 class Step(Disturbance):
-    """Zero before a time, constant from then on.
+    """Zero before a time, constant from then on, or for a while: a pulse.
 
     Args:
-        at: time of the step, s.
+        at: first time of the step, s.
         size: value from then on.
+        duration: of a pulse, s; infinite: it stays.
     """
 
     at: float
     size: float
-
-    def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
-        return np.where(times >= self.at, self.size, 0.0)
-
-
-@dataclass(frozen=True)
-class Pulse(Disturbance):
-    """Constant for a while, zero otherwise.
-
-    Args:
-        at: first time of the pulse, s.
-        duration: of the pulse, s.
-        size: value during the pulse.
-    """
-
-    at: float
-    duration: float
-    size: float
+    duration: AboveZero = math.inf
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
         return np.where((times >= self.at) & (times < self.at + self.duration), self.size, 0.0)

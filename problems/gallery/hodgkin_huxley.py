@@ -84,7 +84,7 @@ problem = fp.Problem(
     period=5e-3,  # ms
     duration=100.0,  # ms
     limits=fp.Limits(inputs={"I": (-80.0, 80.0)}),  # uA/cm^2; the wave needs -44 to 74
-    disturbances={"I": fp.Pulse(at=2.0, duration=3.0, size=10.0)},  # ms, uA/cm^2
+    disturbances={"I": fp.Step(at=2.0, duration=3.0, size=10.0)},  # ms, uA/cm^2
     horizon=fp.Horizon(stages=50, step=0.1),  # ms
     cost=fp.Quadratic(states={"V": 1.0}, deviation={"I": 1e-5}),
     measure_from=10.0,  # ms

@@ -56,7 +56,7 @@ problem = fp.Problem(
     period=1e-3,  # s
     duration=20.0,  # s
     limits=fp.Limits(inputs={"F": (-60.0, 60.0)}),  # N
-    disturbances={"F": fp.Pulse(at=3.0, duration=0.5, size=-30.0)},  # N
+    disturbances={"F": fp.Step(at=3.0, duration=0.5, size=-30.0)},  # N
     horizon=fp.Horizon(stages=40, step=5e-2),
     cost=fp.Quadratic(states={"q": 1e3, "q'": 1.0}, deviation={"F": 1e-4}),
     measure_from=10.0,  # s

@@ -84,7 +84,7 @@ problem = fp.Problem(
     period=1e-3,  # s
     duration=8.0,  # s
     limits=fp.Limits(inputs={"F": (-2.0, 2.0)}),  # N
-    disturbances={"F": fp.Pulse(at=2.0, duration=1.0, size=1.0)},  # N
+    disturbances={"F": fp.Step(at=2.0, duration=1.0, size=1.0)},  # N
     horizon=fp.Horizon(stages=20, step=1e-2, discretisation=fp.RungeKutta4(substeps=8)),
     cost=fp.Quadratic(states={"x": 1e4, "x'": 1e1}, deviation={"F": 1e-2}),
     integrator=fp.RungeKutta4(substeps=4),

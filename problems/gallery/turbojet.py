@@ -78,7 +78,7 @@ problem = fp.Problem(
     period=1e-2,  # s
     duration=60.0,  # s
     limits=fp.Limits(inputs={"throttle": (0.0, 120.0)}),  # %
-    disturbances={"T": fp.Pulse(at=5.0, duration=3.0, size=-15.0)},  # N/s^2
+    disturbances={"T": fp.Step(at=5.0, duration=3.0, size=-15.0)},  # N/s^2
     horizon=fp.Horizon(stages=30, step=0.1),
     cost=fp.Quadratic(states={"T": 1.0, "T'": 0.1}, deviation={"throttle": 1e-3}),
     measure_from=20.0,  # s

@@ -108,7 +108,7 @@ def test_filter_of_indi_has_the_poles_of_its_transfer_function():
 @pytest.mark.parametrize(("frequency", "gain", "grows"), [(None, 1.9, False), (None, 2.1, True), (50.0, 2.1, False)])
 def test_indi_diverges_beyond_twice_the_gain_of_the_model_unless_it_is_filtered(frequency, gain, grows):
     law = fp.rivals.INDI(fp.Exponential(rate=1.0), frequency)
-    load = {"y": fp.Pulse(at=0.1, duration=0.05, size=1.0)}
+    load = {"y": fp.Step(at=0.1, duration=0.05, size=1.0)}
     responses = run(pushed(linear(gain, 1.0), disturbances=load, duration=3.0), law)
     late = np.abs(responses["realised.y"][-20:] - responses["desired.y"][-21:-1]).max()
     assert late > 1.0 if grows else late < 0.02

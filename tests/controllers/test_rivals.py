@@ -135,7 +135,7 @@ def test_acceleration_feedback_has_the_computed_limit(time_constant):
     for share in (0.9, 1.1):
         law = fp.rivals.AccelerationFeedback(fp.Exponential(0.1, integral=False), 1.0, time_constant)
         law = replace(law, gain=share * law.largest_gain(1e-2))
-        load = {"y": fp.Pulse(at=0.5, duration=0.1, size=1.0)}
+        load = {"y": fp.Step(at=0.5, duration=0.1, size=1.0)}
         run = simulate(resting(chain(2), 0.0, disturbances=load, period=1e-2), law)
         sizes.append(np.abs(np.diff(run["deformed.y"][-5:])).max())
     assert sizes[0] < 1e-3
@@ -183,7 +183,7 @@ def test_force_mrac_is_computed_torque_with_a_deformed_command():
 @pytest.mark.parametrize("rates", [(5.0,), (3.0, 4.0), (3.0, 4.0, 5.0)])
 def test_nested_errors_decay_as_prescribed(rates):
     """After a push V = sum z^2 / 2 falls, at the rate -sum k z^2, for relative orders one to three."""
-    push = {"y": fp.Pulse(at=0.1, duration=0.2, size=5.0)}
+    push = {"y": fp.Step(at=0.1, duration=0.2, size=5.0)}
     problem = resting(chain(len(rates)), disturbances=push, period=1e-3, duration=1.5)
     nested = simulate(problem, fp.rivals.BacksteppingMRAC(2.0, rates, fp.Identity()))["nested"][310:]
     function = 0.5 * np.sum(nested**2, axis=1)
@@ -231,7 +231,7 @@ def test_lyapunov_function_falls_and_the_error_goes_to_zero(gain):
 def test_adaptation_has_the_computed_limit(share, grows):
     """At rest only the bias is adapted, |phi| = 1: stable below gamma |B| period / 2 = rate."""
     law = fp.rivals.LyapunovMRAC(RATE, adaptation=share * 2 * RATE / 1e-2)
-    load = {"y": fp.Pulse(at=0.1, duration=0.1, size=1e-6)}
+    load = {"y": fp.Step(at=0.1, duration=0.1, size=1e-6)}
     speeds = np.abs(simulate(resting(chain(2), 0.0, disturbances=load), law)["state.y'"])
     assert (speeds[200:].max() > speeds[:60].max()) == grows
 

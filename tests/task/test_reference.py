@@ -36,7 +36,7 @@ def _values(disturbance, seed=0):
 def test_step_and_pulse():
     """Edges are where they were asked for."""
     assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
-    assert _values(fp.Pulse(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
+    assert _values(fp.Step(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
 
 
 def test_noise_is_drawn_from_the_seed():
