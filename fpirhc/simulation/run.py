@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import stat
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,9 +11,8 @@ from typing import TYPE_CHECKING, ClassVar, cast
 
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidName, OutputError, nearest
-from fpirhc.fields.checked import ByName, Checked, FoundByName, checked_call
-from fpirhc.fields.kinds import Positive
+from fpirhc.errors import InvalidName, OutputError, nearest
+from fpirhc.fields.checked import ByName, FoundByName, checked_call
 from fpirhc.status import Status
 from fpirhc.summary import in_percent, in_units, line, number, table
 from fpirhc.symbolic.layout import Layout, Signal
@@ -198,9 +194,17 @@ class Run(FoundByName):
         """Write the run to a .npz file (no pickle), at once or not at all.
 
         Raises:
-            OutputError: the file cannot be written, or its place is a symbolic link.
+            OutputError: the file cannot be written.
         """
-        _write(self, Path(path))
+        facts = {name: getattr(self, name) for name in _FACTS}
+        facts |= {"format": FORMAT, "signals": [[s.name, s.elements, s.units] for s in self.layout.signals]}
+        content = io.BytesIO()
+        np.savez_compressed(content, log=self.log, facts=np.array(json.dumps(facts)))
+        write_whole(content.getvalue(), Path(path), "run")
+
+
+FORMAT = 1
+_FACTS = ("problem", "controller", "seed", "period", "stop", "compiled", "settings")
 
 
 _SAME = {"plant_state": "state", "plant_output": "output", "plant_realised": "realised"}
@@ -250,114 +254,19 @@ def _renamed(signal: Signal, name: str) -> Signal:
 
 @checked_call
 def load_run(path: str | Path) -> Run:
-    """Read a run that `Run.save` wrote.
+    """Read a run that `Run.save` wrote: a numpy array and JSON, so that a file of somebody else runs no code.
 
     Raises:
         OutputError: the file is missing, damaged, of another format, or no file of a run.
     """
-    facts, layout, log = _read(Path(path))
-    names = facts.problem, facts.controller, facts.seed, facts.period
-    return Run(*names, layout, log, facts.stop, facts.compiled, facts.settings)
-
-
-FORMAT = 1
-MOST = 2**34  # bytes of an unpacked file; a small file that unpacks to more is no run
-LARGEST_FACTS = 2**26  # bytes of the facts
-
-
-@dataclass(frozen=True, eq=False)
-class Facts(Checked):
-    """What a file says about its run besides the log; the fields are those of `Run`, the signals (name, elements, units)."""
-
-    format: int
-    problem: str
-    controller: str
-    seed: int
-    period: Positive
-    stop: str | None
-    compiled: bool
-    settings: Mapping[str, object]
-    signals: Sequence[tuple[str, Sequence[str], Sequence[str]]]
-
-
-def _write(run: Run, path: Path) -> None:
-    """Write the file beside its place first, then under its name, so that a broken write leaves an earlier file as it was.
-
-    Log and facts are a numpy array and JSON, so that reading a file of somebody else never runs its code.
-    """
-    facts = {
-        "format": FORMAT,
-        "problem": run.problem,
-        "controller": run.controller,
-        "seed": run.seed,
-        "period": run.period,
-        "stop": run.stop,
-        "compiled": run.compiled,
-        "settings": run.settings,
-        "signals": [[s.name, list(s.elements), list(s.units)] for s in run.layout.signals],
-    }
-    content = io.BytesIO()
-    np.savez_compressed(content, log=run.log, facts=np.array(json.dumps(facts)))
-    if path.is_symlink() or (path.exists() and not path.is_file()):
-        raise OutputError(f"cannot write the run to '{path}': it is a link or no ordinary file; give another path")
-    write_whole(content.getvalue(), path, "run")
-
-
-def _read(path: Path) -> tuple[Facts, Layout, np.ndarray]:
-    """Return facts, layout and log of a file, with columns that a file of an older version lacks."""
     try:
-        log, stored = _parts(path)
-        facts = _facts(stored)
-        layout, log = with_common_columns(_layout(facts, log), log)
-    except OutputError as error:
-        raise OutputError(f"cannot read a run from '{path}': {error}") from None
-    except FpirhcError as error:
-        raise OutputError(f"cannot read a run from '{path}': {getattr(error, 'text', error)}") from None
-    except (Exception, MemoryError) as error:  # noqa: BLE001 -- a hostile file can raise anything in the readers of zip and JSON
-        text = str(getattr(error, "strerror", None) or error).partition("\n")[0][:200]
-        raise OutputError(f"cannot read a run from '{path}': {text or type(error).__name__}") from None
-    log.setflags(write=False)
-    return facts, layout, log
-
-
-def _parts(path: Path) -> tuple[np.ndarray, object]:
-    """The log and the facts of a file, every byte of them checked against the sums of the zip."""
-    # A pipe would wait for ever to be opened.
-    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-    with os.fdopen(handle, "rb") as file:
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise OutputError("it is no ordinary file")
-        with zipfile.ZipFile(file) as stored:
-            sizes = {one.filename: one.file_size for one in stored.infolist()}
-            for name, most in (("log.npy", MOST), ("facts.npy", LARGEST_FACTS)):
-                if name not in sizes:
-                    raise OutputError(f"it has no '{name}'")
-                if sizes[name] > most:
-                    raise OutputError(f"'{name}' unpacks to {sizes[name]} bytes")
-            log, facts = (_array(stored.read(name)) for name in ("log.npy", "facts.npy"))
-    if facts.dtype.kind != "U" or facts.ndim != 0:
-        raise OutputError("its facts are no text")
-    return log, json.loads(str(facts))
-
-
-def _array(content: bytes) -> np.ndarray:
-    return np.asarray(np.lib.format.read_array(io.BytesIO(content), allow_pickle=False))
-
-
-def _facts(stored: object) -> Facts:
-    if not isinstance(stored, dict):
-        raise OutputError("its facts are no mapping")
-    if stored.get("format") != FORMAT:
-        raise OutputError(f"it has format {stored.get('format')!r}, this version reads {FORMAT}")
-    return Facts(**stored)
-
-
-def _layout(facts: Facts, log: np.ndarray) -> Layout:
-    layout = Layout(tuple(Signal(name, tuple(elements), tuple(units)) for name, elements, units in facts.signals))
-    if log.dtype != np.float64 or log.ndim != 2 or log.shape[1] != layout.size:
-        raise OutputError(f"its log has shape {log.shape} of {log.dtype}, its signals need {layout.size} columns")
-    if "time" not in layout or layout["time"].size != 1:
-        raise OutputError("it has no signal 'time'")
-    if any(len(s.units) not in (0, 1, s.size) for s in layout.signals):
-        raise OutputError("the elements and the units of a signal differ in number")
-    return layout
+        with Path(path).open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+            log, facts = file["log"], json.loads(str(file["facts"]))
+        layout = Layout(tuple(Signal(n, tuple(elements), tuple(units)) for n, elements, units in facts["signals"]))
+        if facts["format"] != FORMAT or log.dtype != np.float64 or log.shape[1:] != (layout.size,):
+            raise OutputError(f"format {facts['format']!r}, {log.shape} numbers for {layout.size} columns")
+        log.setflags(write=False)
+        return Run(layout=layout, log=log, **{name: facts[name] for name in _FACTS})
+    except Exception as error:  # noqa: BLE001 -- a file that is damaged can raise anything in the readers of zip and JSON
+        said = str(getattr(error, "strerror", None) or error).partition("\n")[0][:200]
+        raise OutputError(f"cannot read a run from '{path}': {said or type(error).__name__}") from None
