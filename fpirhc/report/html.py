@@ -107,7 +107,7 @@ def render_charted(
 ) -> str:
     """Return the text of a page with a figure, where there is one, below a heading, and with the problem's own pictures."""
     chart = Image(figure.address, heading, caption) if figure else None
-    return render_page("scenarios.html", view, chart=chart, own=own)
+    return render_page("page.html", view, chart=chart, own=own)
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:

@@ -24,8 +24,7 @@ from fpirhc.describe import describe
 from fpirhc.errors import require
 from fpirhc.plant.motion import SECONDS
 from fpirhc.plant.plant import Plant
-from fpirhc.simulation.clock import CLOCK, clock_block, clock_status_block
-from fpirhc.simulation.replay import known_samples
+from fpirhc.simulation.replay import CLOCK, clock_block, clock_status_block, known_samples
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite, compose, fed, under_names
 from fpirhc.symbolic.driver import every_finite

@@ -1,4 +1,4 @@
-"""Cycles without a good sample are run afterwards, by whoever calls the step: a block knows nothing of them.
+"""The time of steps, which cycles are missing, and how these are run afterwards by who calls the step: blocks know nothing of it.
 
     a sample is bad, or its cycle was missed   the command stays, and every memory; the gate counts (`fpirhc.controllers.gate`)
     the next good sample, k cycles later       the same step runs k times more, on z_1 ... z_k, and then on this sample
@@ -16,21 +16,79 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Self
 
+import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gate import FAILED, HELD, INNER, MISSING, MOST_MISSING, REPLAYS
+from fpirhc.controllers.gate import AGAIN, FAILED, HELD, INNER, MISSING, MOST_MISSING, REPLAYS
 from fpirhc.controllers.seeing import seeing_blocks
-from fpirhc.simulation.clock import MEMORY as CLOCK
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.expression import FINITE
-from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.expression import FINITE, Signals, nan_where
+from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.problem import Problem
 
+# In the memory: the last time that was believed, or is expected; the last one that was given; and times in a row that are a period
+# apart but do not follow the believed one.
+CLOCK_MEMORY = Signal("clock", ("before", "heard", "regular"), start=(-FINITE, -FINITE, 0.0))
+CLOCK = "_clock"  # signal of the believed time; NaN where it is none, and AGAIN where it repeats
+LONGEST = 1e5  # periods between two steps
+_RESOLVED = 2.0**42  # periods from zero within which a period is resolved to a thousandth
+_PATIENCE = 20
 BRIDGED, BY_DIFFERENCES = 5, 20  # cycles: the longest gap that is replayed as it was; behind differences of positions
 _OBSERVED, _SETTLES = "observed_state", 30  # state of a learner, and the steps in which it follows the samples
 _FORGOTTEN = 1e-7  # of a sample from before a long gap
+
+
+def clock_block(problem: Problem) -> Block:
+    """Return the block (time) -> the time where it may be believed, else NaN; and the memory of the clock."""
+    period = float(problem.period)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        time, (before, heard, regular) = s.time, ca.vertsplit(getattr(s, CLOCK_MEMORY.name))
+        resolved = ca.fabs(time) <= _RESOLVED * period
+        first = ca.logic_not(before > -FINITE / 2)  # also of a memory that is not finite
+        passed = time - before
+        follows = ca.logic_and(passed >= period / 2, passed <= LONGEST * period)
+        apart = ca.fabs(time - heard - period) <= period / 2
+        count = ca.if_else(apart, regular + 1, 0)
+        believed = ca.logic_and(resolved, ca.logic_or(ca.logic_or(first, follows), count > _PATIENCE - 0.5))
+        repeats = ca.fabs(passed) < period / 2
+        again = ca.logic_and(repeats, ca.logic_not(believed))
+        expected = ca.if_else(ca.logic_or(first, repeats), before, before + period)
+        return {
+            CLOCK: ca.if_else(again, AGAIN, time) + nan_where(ca.logic_not(ca.logic_or(believed, again))),
+            f"{CLOCK_MEMORY.name}_next": ca.vertcat(
+                ca.if_else(believed, time, ca.if_else(expected > -FINITE, expected, -FINITE)),
+                ca.if_else(ca.fabs(time) <= FINITE, time, -FINITE),
+                ca.if_else(believed, 0, ca.if_else(count < _PATIENCE, count, 0)),
+            ),
+        }
+
+    return Block("clock", Layout((problem.plant.time,)), Layout((Signal(CLOCK),)), step, Layout((CLOCK_MEMORY,)))
+
+
+def clock_status_block(problem: Problem, before: str, after: str) -> Block:
+    """Return the block (time, believed time, status) -> status: BAD_TIME for a cycle skipped for a finite time."""
+    reads = Layout((problem.plant.time, Signal(CLOCK), scalar(before)))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        refused = ca.logic_and(ca.fabs(s.time) <= FINITE, ca.logic_not(ca.fabs(getattr(s, CLOCK)) <= FINITE))
+        return {after: ca.if_else(refused, int(Status.BAD_TIME), getattr(s, before))}
+
+    return Block("clock_status", reads, Layout((scalar(after),)), step)
+
+
+def missed_cycles(time: float, before: float, period: float) -> int:
+    """Return how many cycles lie between two steps; 0 where the later one is the next cycle, or cannot follow the other.
+
+    The sample of a missed cycle is missing. The command of the last step went on acting in it, as in every cycle that is skipped.
+
+    Args:
+        before: time of the step before it, as the clock remembers it; -FINITE: there was none.
+    """
+    cycles = (time - before) / period
+    return round(cycles) - 1 if before > -FINITE / 2 and 1.5 <= cycles <= LONGEST else 0
 
 
 def known_samples(problem: Problem) -> int:
@@ -112,7 +170,7 @@ class Replay:
         def places(signals: list[Signal]) -> np.ndarray:
             return np.concatenate([every[memory.slice(s.name)] for s in signals])
 
-        moves = gate | (own - acted) | {CLOCK.name}
+        moves = gate | (own - acted) | {CLOCK_MEMORY.name}
         kept = [s for s in memory.signals if s.name not in moves or s.name == HELD]
         stays = [s for s in memory.signals if s in kept or s.name in own - windows - observed]
         good: dict[str, list[np.ndarray]] = {}
@@ -121,7 +179,7 @@ class Replay:
                 good.setdefault(name.removeprefix("good_").partition("@")[0], []).append(every[memory.slice(name)])
         return cls(
             memory.slice(MISSING.name).start,
-            every[memory.slice(CLOCK.name)][:1] if CLOCK.name in memory else every[:0],
+            every[memory.slice(CLOCK_MEMORY.name)][:1] if CLOCK_MEMORY.name in memory else every[:0],
             step.trace.slice("status").start if "status" in step.trace else -1,
             places(kept),
             places(stays),

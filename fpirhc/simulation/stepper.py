@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isnan
-from time import perf_counter
 from typing import NoReturn, Self
 
 import casadi as ca
@@ -18,10 +17,8 @@ from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.errors import ConcurrentUse
 from fpirhc.fields.checked import ByName, Checked
-from fpirhc.simulation.clock import MEMORY as CLOCK
-from fpirhc.simulation.clock import Clock, Deadline, missed_cycles
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, refuse_unbounded
-from fpirhc.simulation.replay import Bound, Replay
+from fpirhc.simulation.replay import CLOCK_MEMORY, Bound, Replay, missed_cycles
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
     NOTHING,
@@ -106,13 +103,10 @@ class Stepper(NumbersNow, Checked):
     BRIDGED; after more than `bridged` cycles for the last ones alone, as many as fill the windows of estimators, with the
     status SETTLING. Cycles that the caller missed, by the times of two steps, are missing too. Before the first good sample
     the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. So
-    does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.clock`). A memory that is not finite is
+    does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.replay`). A memory that is not finite is
     forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status
     RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands
     at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
-
-    A step that takes longer than `Stepper(..., deadline=1e-3)` is late: `stepper.deadline` has the number of late steps, whether
-    the last one was late, the worst one, and the 99.9th percentile, and so has the stepper's text.
 
     One stepper serves one thread. Two threads at the same time are refused; give each a stepper of its own.
 
@@ -141,8 +135,6 @@ class Stepper(NumbersNow, Checked):
         monitor: RunMonitor | None = None,
         bounded: bool = True,
         live: Sequence[str] = (),
-        deadline: float | None = None,
-        clock: Clock = perf_counter,
         bridged: int | None = None,
     ) -> None:
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
@@ -152,14 +144,9 @@ class Stepper(NumbersNow, Checked):
                 they are not looked at.
             monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
-            deadline: longest time of a step, s; longer ones are counted, see `deadline`. None: no step is timed.
-            clock: function that returns the time for that, s.
             bridged: number of missing cycles up to which each of them is run afterwards; None: 5, or 20 behind differences of
                 positions.
         """
-        self.deadline = None if deadline is None else Deadline(deadline, clock)
-        if self.deadline is not None:
-            vars(self)["step"] = self.deadline.timed(self.step)  # a stepper without a deadline pays nothing
         step = ComposedStep.of(
             problem, controller, max_age=max_age, monitor=monitor, bounded=bounded, live=live, bridged=bridged
         )
@@ -170,7 +157,6 @@ class Stepper(NumbersNow, Checked):
     def of(cls, step: ComposedStep, *, compiled: bool) -> Self:
         """Return the stepper of a step that is composed already; its user is not warned of harm."""
         own = cls.__new__(cls)
-        own.deadline = None
         own._bind(step, compiled=compiled)
         return own
 
@@ -203,7 +189,7 @@ class Stepper(NumbersNow, Checked):
         self._memory, self._command = arguments.memory, arguments.command
         self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
         self._more = arguments.ages or bool(arguments.beside)
-        self._before, self._period = self.memory.slice(CLOCK.name).start, float(problem.period)
+        self._before, self._period = self.memory.slice(CLOCK_MEMORY.name).start, float(problem.period)
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._counted = self.signals.slice(SKIPPED).start
         self._late, self.replay, self._missing = 1.5 * self._period, step.replay, step.replay.missing
@@ -214,10 +200,8 @@ class Stepper(NumbersNow, Checked):
         return Layout(tuple(s for s in self.reads.signals if s.name == "parameters"))
 
     def __repr__(self) -> str:
-        """What it is of, how it runs, and how it keeps its deadline."""
         backend = "compiled C" if self.compiled else "virtual machine"
-        facts = [self._title, backend, *([] if self.deadline is None else [str(self.deadline)])]
-        return f"Stepper({', '.join(facts)})"
+        return f"Stepper({self._title}, {backend})"
 
     def step(
         self,

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from itertools import chain
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from helpers.replay import status
 
 import fpirhc as fp
 from fpirhc.conformance import two_masses
-from fpirhc.errors import FpirhcError
 
 PROBLEM = replace(two_masses(), duration=0.4)
 PERIOD = PROBLEM.period
@@ -19,7 +17,6 @@ CONTROLLERS = {
     "computed torque": fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0)),
     "plan": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)),
 }
-LIMIT = 1e-3  # s
 
 
 @cache
@@ -103,44 +100,3 @@ def test_compiled_clock_is_the_same():
     times += [-7.0 + k * PERIOD for k in range(30)]
     assert stepped(times) == stepped(times, compiled=True)
     assert {fp.Status.OK, fp.Status.BAD_TIME} <= set(stepped(times))
-
-
-def timed(durations: list[float] | np.ndarray) -> fp.Stepper:
-    """A stepper with a deadline whose steps took these durations."""
-    clock = chain.from_iterable((0.0, float(d)) for d in durations)
-    law = fp.ComputedTorque(fp.Exponential(rate=6.0))
-    one = fp.Stepper(PROBLEM, law, compiled=False, deadline=LIMIT, clock=lambda: next(clock))
-    memory = one.start()
-    for k in range(len(durations)):
-        _, memory = one.step(k * PERIOD, np.array(PROBLEM.start_state), np.zeros(2), memory)
-    return one
-
-
-def test_late_steps_are_counted_and_told():
-    one = timed([1e-4, 2e-3, 1e-3, 5e-3, 1e-4, 1.1e-3, 9e-4])
-    deadline = one.deadline
-    assert deadline is not None
-    assert (deadline.cycles, deadline.late, deadline.worst, deadline.last) == (7, 3, 5e-3, 9e-4)
-    assert str(deadline) == "deadline 1 ms: 3 of 7 cycles late, worst 5 ms, 99.9 % within 5 ms"
-    assert str(deadline) in repr(one)
-    with pytest.raises(StopIteration):  # a step that is refused has its time too
-        one.step(0.0, np.ones(3), np.zeros(2), one.start())
-
-
-def test_percentiles_are_those_of_all_steps():
-    """To the width of a class above, and never below, numpy's of everything that was measured; an hour is in the last class."""
-    durations = 1e-4 * np.exp(np.random.default_rng(0).standard_normal(2_001))
-    deadline = timed(durations).deadline
-    assert deadline is not None
-    for percent in (50.0, 99.0, 99.9):
-        exact = float(np.percentile(durations, percent, method="inverted_cdf"))
-        assert 1.0 <= deadline.percentile(percent) / exact <= 2 ** (1 / 32) * (1 + 1e-12)
-    hour = timed([0.0, -1.0, 3600.0]).deadline
-    assert hour is not None
-    assert (hour.worst, hour.percentile()) == (3600.0, 3600.0)
-
-
-@pytest.mark.parametrize("limit", [0.0, -1.0, np.nan, np.inf, "1", True])
-def test_a_deadline_is_a_positive_number(limit):
-    with pytest.raises(FpirhcError, match=r"deadline: expected a|expected a positive number of seconds"):
-        fp.Stepper(PROBLEM, CONTROLLERS["computed torque"], compiled=False, deadline=limit)

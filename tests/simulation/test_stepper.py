@@ -60,7 +60,6 @@ def test_it_says_what_it_is():
     assert repr(one) == "Stepper(problem, ComputedTorque, virtual machine)"
     assert one.why_failed == one.why_refused == ""
     assert one.refused == 0
-    assert one.deadline is None
     assert "command" in one.signals
     assert fp.Stepper(SMALL, GAINED).compiled == (COMPILER is not None)
 

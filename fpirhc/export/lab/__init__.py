@@ -216,7 +216,7 @@ def _page(task: Task, file: str, loops: list[LabLoop]) -> str:
         "title": html.escape(task.name),
         "about": html.escape(" ".join(task.title.split())),
         "policy": policy,
-        "styles": asset("uPlot.min.css") + asset("report.css") + template("lab.css", {}, __package__),
+        "styles": asset("uPlot.min.css") + asset("report.css"),
         "scripts": "\n".join(f"<script>{one}</script>" for one in scripts),
     }
     return template("page.html", words, __package__)

@@ -14,8 +14,8 @@ import numpy as np
 
 from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
 from fpirhc.export.device import Device, Target, identifiers, in_comment, literal, recorded
-from fpirhc.simulation.clock import LONGEST, MEMORY
 from fpirhc.simulation.machine import SKIPPED
+from fpirhc.simulation.replay import CLOCK_MEMORY, LONGEST
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
 from fpirhc.symbolic.layout import Layout
@@ -197,7 +197,7 @@ def _controller(device: Device) -> str:
         device,
         "controller.c",
         tables=of_type("\n".join(texts)),
-        before=str(memory.slice(MEMORY.name).start),
+        before=str(memory.slice(CLOCK_MEMORY.name).start),
         held=str(memory.slice(HELD).start),
         skipped=str(memory.slice(f"{SKIPPED}_before").start),
         missing=str(memory.slice(MISSING.name).start),
