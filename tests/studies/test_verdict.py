@@ -183,7 +183,11 @@ def test_what_counts_and_what_comes_first():
     cases = {"A": (Facts(), Facts(0.3, 0.3)), "B": (Facts(), Facts(0.2, 0.2))}
     mine = fp.Metric("mine", lambda problem, run: float(run.controller.startswith("A+")) + 1, better="larger", unit="h")
     own = [*tasks.two_mass.metrics, mine]
-    found = compared(cases, headline=("B", "B+FPI"), metrics=own, headline_metric="mine").findings
+    comparison = compared(cases, headline=("B", "B+FPI"), metrics=own, headline_metric="mine")
+    found, table = comparison.findings, comparison.view.tables[0]
+    assert str(comparison.outcome) == str(found[0].outcome) == "no difference"
+    best = [row.cells[0] for row in table.rows if "rms error y [m]" in {table.columns[k].head for k in row.best}]
+    assert best == ["B+FPI"]  # which is marked
     assert [f.pair[1] for f in found if f.pair] == ["B+FPI", "A+FPI"] * 2
     [share] = [s for f in found for s in re.findall(r"^The smallest rms error is that of B\+FPI: (\S+) % of", f.text)]
     assert float(share) == pytest.approx(100 * math.sqrt(((0.2 / 1.757) ** 2 + (0.2 / 2) ** 2) / 2), rel=0.01)
