@@ -250,7 +250,7 @@ def test_plans_contraction_and_null_tests_raise_flags_and_a_cost_says_what_count
 @pytest.mark.parametrize(
     ("changes", "scale"),
     [
-        ({"reference": fp.Trajectory(lambda t: {"y": 1.5 + 0.1 * ca.sin(t)}), "start": {"y": 1.0}}, 0.5),
+        ({"reference": fp.Trajectory(lambda t: {"y": 1.5 - ca.exp(-1e3 * t)}), "start": {"y": 2.0}}, 1.5),
         ({"start": {"y": 0.5}}, 0.5),
         ({"limits": fp.Limits(states={"y": (0.0, 4.0)}), "start": {"y": 1.0}}, 4.0),
         ({"limits": fp.Limits(states={"y": (0.0, math.inf)}), "start": {"y": 1.0}}, 1.0),
