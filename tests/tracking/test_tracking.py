@@ -1,4 +1,4 @@
-"""Tracking laws: gains, decay and bumpless start; of fractional order Mittag-Leffler decay, weights and memory."""
+"""Tracking laws: gains and integrals; of fractional order Mittag-Leffler decay, weights and memory."""
 
 import math
 
@@ -10,31 +10,11 @@ import fpirhc as fp
 from fpirhc.errors import InvalidValue
 
 
-def _run(order, tracking, *, start, period=1e-3, duration=3.0, limits=None):
-    problem = fp.Problem(
-        plant=chain(order),
-        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
-        start=start,
-        period=period,
-        duration=duration,
-        limits=limits or fp.Limits(),
-    )
-    return fp.simulate(problem, fp.ComputedTorque(tracking), seed=0, compiled=False)
-
-
 @pytest.mark.parametrize(("order", "gains"), [(1, (36, 12)), (2, (216, 108, 18)), (4, (7776, 6480, 2160, 360, 30))])
 def test_gains_are_binomials(order, gains):
     """(d/dt + 6)^(n+1) e_int expanded."""
     assert fp.Exponential(rate=6.0).gains(order) == pytest.approx(gains)
     assert fp.ShiftPolynomial([0.94] * (order + 1), step=0.01).gains(order) == pytest.approx(gains)
-
-
-def test_bumpless_start_asks_for_the_nominal_response():
-    """With a first error of 1 m the first desired acceleration is the nominal one, zero; without, it is 3 rate^2."""
-    bumpless = _run(2, fp.Exponential(6.0), start={"y": -1.0}, duration=0.01)
-    plain = _run(2, fp.Exponential(6.0, bumpless=False), start={"y": -1.0}, duration=0.01)
-    assert bumpless["desired.y"][0] == pytest.approx(0.0, abs=1e-12)
-    assert plain["desired.y"][0] == pytest.approx(108.0)
 
 
 # The tracking law of fractional order: Mittag-Leffler decay, its weights and memory
