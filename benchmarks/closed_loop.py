@@ -8,10 +8,11 @@ the same mathematics with floats and logs the states only, and so is favoured. B
 
 from __future__ import annotations
 
+import os
 import resource
-import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 
@@ -21,19 +22,18 @@ from table import write_table
 
 import fpirhc as fp
 
-REPEATS = 40
 TASK, CONTROLLER = by_hand.TASK, by_hand.CONTROLLER
 CYCLES = TASK.problem.cycles
 
 
-def best(work: Callable[[], object], repeats: int = REPEATS, clock: Callable[[], float] = time.process_time) -> float:
+def best(work: Callable[[], object], repeats: int = 40) -> float:
     """CPU seconds of the fastest repetition; the first, which compiles and warms up, does not count."""
     work()
     taken = []
     for _ in range(repeats):
-        begin = clock()
+        begin = time.process_time()
         work()
-        taken.append(clock() - begin)
+        taken.append(time.process_time() - begin)
     return min(taken)
 
 
@@ -85,22 +85,27 @@ def stepped(compiled: bool) -> Callable[[], object]:
     return work
 
 
-STARTS = {
-    "`import casadi, numpy`": "import casadi, numpy",
-    "`import fpirhc`": "import fpirhc",
-    "`fpirhc list`": "from fpirhc.__main__ import main; main(['list'])",
-    "`fpirhc --help`": "from fpirhc.__main__ import main; main(['--help'])",
-}
+COMMANDS = """compare two_mass -c RHC RHC+FPI
+review two_mass -c RHC RHC+FPI
+study two_mass -c RHC RHC+FPI --draws 50 --mismatch 20
+tune two_mass -c RHC+FPI --trials 50
+probe two_mass -c RHC+FPI"""
 
 
-def begun(code: str) -> float:
-    """User time of a new process that runs this, s: the median of ten."""
-    times = []
-    for _ in range(10):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-        subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=True)
-        times.append(resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before)
-    return statistics.median(times)
+def taken(command: str, cache: str) -> str:
+    """CPU time of a command in an empty folder, with all processes that it starts, compilers too, s."""
+    words, own = [sys.executable, "-m", "fpirhc", *command.split()], {**os.environ, "FPIRHC_CACHE": cache}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run(words, cwd=tempfile.mkdtemp(), env=own, stdout=subprocess.DEVNULL, check=False)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return f"{after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime:.2g}"
+
+
+def commands() -> None:
+    """The table of commands: each with an empty cache, and once more with what is compiled."""
+    caches = {command: tempfile.mkdtemp() for command in COMMANDS.splitlines()}
+    rows = [(f"`fpirhc {command}`", taken(command, at), taken(command, at)) for command, at in caches.items()]
+    write_table("commands", ("command", "s of CPU time, nothing compiled", "again"), rows)
 
 
 def main() -> None:
@@ -116,14 +121,9 @@ def main() -> None:
         "controller alone, stepped by hand, compiled C": best(stepped(True)) / CYCLES,
         "controller alone, stepped by hand, virtual machine": best(stepped(False)) / CYCLES,
     }
-    base = micro["closed loop, compiled C, every signal logged"]
-    rows = [(name, f"{1e6 * value:.2f}", f"{value / base:.1f}") for name, value in micro.items()]
-    heads = "two_mass, CTC with eq (6), 10 s at 1 kHz", "microseconds per cycle", "times the compiled loop"
-    write_table("closed loop", heads, rows)
-    starts = {name: begun(code) for name, code in STARTS.items()}
-    least = next(iter(starts.values()))
-    rows = [(name, f"{value:.2f}", f"{value / least:.1f}") for name, value in starts.items()]
-    write_table("start", ("start of a process", "s of user time", "times that of casadi and numpy"), rows)
+    rows = [(name, f"{1e6 * value:.2f}", f"{value / min(micro.values()):.1f}") for name, value in micro.items()]
+    write_table("closed loop", ("two_mass, CTC with eq (6), 10 s at 1 kHz", "us per cycle", "times the compiled"), rows)
+    commands()
 
 
 if __name__ == "__main__":

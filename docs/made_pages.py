@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 import fpirhc as fp
-from fpirhc.cli import app
+from fpirhc.cli import opt
 from fpirhc.members import FAMILIES, member_classes
 
 DOCS = Path(__file__).resolve().parent
@@ -62,16 +62,16 @@ def _entry(name: str) -> list[str]:
 
 def commands() -> dict[str, Any]:
     """The commands by name."""
-    group: Any = typer.main.get_command(app)
+    group: Any = typer.main.get_command(opt.app)
     return dict(group.commands)
 
 
 def command_line() -> str:
     """The page of all commands with their options."""
-    lines = ["# The command line", "", "Exit codes stand on [comparing and studies](study.md#exit-codes).", ""]
-    for name in commands():
-        text = CliRunner().invoke(app, [name, "--help"], prog_name="fpirhc").output.strip()
-        lines += [f"## fpirhc {name}", "", "```text", text, "```", ""]
+    lines = ["# The command line", ""]
+    for name in ("", *commands()):
+        text = CliRunner().invoke(opt.app, [*name.split(), "--help"], prog_name="fpirhc").output.strip()
+        lines += [f"## fpirhc {name}".strip(), "", "```text", text, "```", ""]
     return "\n".join(lines)
 
 
