@@ -76,11 +76,9 @@ from .simulation.machine import RunMonitor as RunMonitor
 from .simulation.metrics import Metric as Metric
 from .simulation.metrics import figures as figures
 from .simulation.metrics import measure as measure
-from .simulation.pictures.base import Quantity as Quantity
-from .simulation.pictures.heat_map import HeatMap as HeatMap
 from .simulation.pictures.lines import OverTime as OverTime
 from .simulation.pictures.lines import Portrait as Portrait
-from .simulation.pictures.lines import Raster as Raster
+from .simulation.pictures.lines import Quantity as Quantity
 from .simulation.pictures.planar import Planar as Planar
 from .simulation.pictures.planar import Shape as Shape
 from .simulation.run import Run as Run

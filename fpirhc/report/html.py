@@ -122,7 +122,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     from markupsafe import Markup
 
     every = [Markup(script) for script in scripts]
-    styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")] + [Markup(planar.styles())]
+    styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")]
     template = _environment().get_template(name)
     others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome not in IN_FULL)
     said = ", ".join(f"{count} {outcome}" for outcome, count in others.items())

@@ -142,17 +142,9 @@ why = (
     "back; ADRC takes the traffic for an integrator."
 )
 pictures = (
-    fp.HeatMap(
-        "Density along the road",
-        rows=tuple(f"plant_state.rho{i}" for i in range(1, SEGMENTS + 1)),
-        place="segment",
-        quantity="density",
+    fp.OverTime(
+        "Density and speed at the ramp",
+        panels=("plant_state.rho5", "plant_state.v5"),
         caption="The ramp joins the fifth segment.",
-    ),
-    fp.HeatMap(
-        "Speed along the road",
-        rows=tuple(f"plant_state.v{i}" for i in range(1, SEGMENTS + 1)),
-        place="segment",
-        quantity="speed",
     ),
 )

@@ -119,7 +119,6 @@ tuning = {
     "RHC offset-free": {"estimator.drift.V": fp.LogSpan(1.0, 1e5)},  # mV/ms^1.5
 }
 pictures = (
-    fp.Raster("Spikes", signal="state.V", threshold=-20.0, caption="Where V passes -20 mV upwards."),
     fp.OverTime(
         "Voltage and current",
         panels=("state.V", "command.I"),

@@ -88,13 +88,13 @@ def until(page: Any, condition: str) -> None:
 
 @pytest.fixture(scope="session")
 def drawn(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report with a mechanism that moves and a picture over place and time."""
+    """A report with a mechanism that moves and a portrait."""
     del browser
     shipped = fp.load_problem("ball_on_plate")
     both = {name: shipped.controllers[name] for name in ("RHC", "RHC+FPI")}
-    heat = fp.HeatMap("Place", rows=("plant_state.x", "plant_state.y"), place="axis", quantity="place")
+    plane = fp.Portrait("Place", x="plant_state.x", y="plant_state.y")
     short = replace(shipped.problem, duration=2.0, measure_from=0.0)
-    pictures = (*shipped.pictures, heat)
+    pictures = (*shipped.pictures, plane)
     task = replace(shipped, problem=short, controllers=both, tuning={}, pictures=pictures)
     path = tmp_path_factory.mktemp("drawn") / "drawn.html"
     fp.write_report(fp.compare(task, seed=0, compiled=False), path)

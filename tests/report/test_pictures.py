@@ -84,16 +84,6 @@ def test_a_portrait_has_a_panel_for_each_run(runs):
     assert figure.axes[0].get_ylabel() == "q' [m/s]"
 
 
-def test_a_raster_counts_passages_upwards(runs):
-    """Two sines pass half their height twice upwards; a signal that begins above has not passed."""
-    figure = Figure()
-    fp.Raster("r", signal="reference.q", threshold=0.5).draw(figure, runs)
-    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["slow (2)", "quick (2)"]
-    above, figure = made_run(np.array([2.0, 0, 2, 2, 1, 3])), Figure()
-    fp.Raster("r", signal="state.q", threshold=1.0).draw(figure, {"above": above})
-    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["above (2)"]
-
-
 FILE = line_text("period=5e-3, duration=0.1", more="pictures = (%s,)\n")
 
 
@@ -109,39 +99,6 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path):
     assert "bad is not drawn" in own
     fp.write_report(replace(comparison, pictures=()), page)
     assert "Pictures of this problem" not in page.read_text(encoding="utf-8")
-
-
-def test_a_heat_map_has_one_scale_for_all_runs(runs):
-    """A row for each signal from the bottom up, and the extremes of all panels as the ends of the colours."""
-    figure = Figure()
-    fp.HeatMap("h", rows=("error.q", "reference.q"), place="rod", quantity="position").draw(figure, runs)
-    slow, quick, scale = figure.axes
-    values = [np.array([run["error.q"], run["reference.q"]]) for run in runs.values()]
-    for axis, own in zip((slow, quick), values, strict=True):
-        [mesh] = axis.collections
-        np.testing.assert_array_equal(mesh.get_array(), own)
-        assert mesh.get_clim() == (np.min(values), np.max(values))
-    assert [axis.get_title() for axis in (slow, quick)] == ["slow", "quick"]
-    assert (slow.get_ylabel(), quick.get_xlabel(), scale.get_ylabel()) == ("rod", "time [s]", "position [m]")
-
-
-def test_many_cycles_of_a_heat_map_are_averaged():
-    """A column is the mean of its interval, so the mean of the whole is kept."""
-    values, figure = np.random.default_rng(3).normal(size=20_000), Figure()
-    fp.HeatMap("h", rows=("state.q",)).draw(figure, {"made": made_run(values)})
-    [row] = np.asarray(figure.axes[0].collections[0].get_array())
-    assert row.size < 5000
-    assert row.mean() == pytest.approx(values.mean())
-    assert row[0] == pytest.approx(values[: 20_000 // row.size].mean())
-
-
-def test_a_heat_map_has_rows_of_one_unit(runs):
-    """The scale has one unit; without a row there is nothing to draw."""
-    mixed = fp.HeatMap("h", rows=("state.q", "state.q'"))
-    with pytest.raises(InvalidValue, match=r"one scale of colours shows one unit, and rows have m, m/s"):
-        mixed.draw(Figure(), runs)
-    with pytest.raises(InvalidValue, match=r"expected at least one signal, such as 'state.q'"):
-        fp.HeatMap("h", rows=())
 
 
 def cart(q, p):

@@ -329,10 +329,6 @@ COMMAND = np.where(np.arange(CYCLES) < 50, 10.0, np.where(np.arange(CYCLES) % 2,
         (figures.Overshoot("y"), 0.0, "m", "smaller"),
         (figures.Largest("command.u"), 4.0, "N", "smaller"),
         (figures.Nadir("command.u"), -4.0, "N", "larger"),
-        (figures.Energy("command.u"), 62.5, "(N)^2 s", "smaller"),
-        (figures.Norm(["command.u"]), math.sqrt(62.5), "", "smaller"),
-        (figures.Norm(["command.u", "command.u"], power=1.0), 35.0, "", "smaller"),
-        (figures.Norm(["command.u"], power=math.inf), 4.0, "N", "smaller"),
         (figures.Largest(fp.Quantity("half", "kN", lambda r: r["command.u"] / 2)), 2.0, "kN", "smaller"),
     ],
 )
@@ -368,8 +364,6 @@ def test_the_first_direction_is_that_from_the_start_to_the_reference():
     [
         (lambda: figures.InBand("command.u", 3.0, 2.0), "low is 3 and high is 2; expected low < high"),
         (lambda: figures.InBand("command.u", 3.0, 3.0), "low is 3 and high is 3; expected low < high"),
-        (lambda: figures.Norm([]), "power is 2 of 0 signals; expected at least 1 of at least one signal"),
-        (lambda: figures.Norm(["command.u"], power=0.5), "power is 0.5 of 1 signals"),
     ],
 )
 def test_figures_that_mean_nothing_are_refused(wrong, message):

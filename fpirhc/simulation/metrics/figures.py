@@ -6,7 +6,7 @@ has NaN. Two figures of one kind in a problem need names of their own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -15,11 +15,11 @@ from fpirhc.errors import InvalidValue, without
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.metrics.base import Better, Metric, measured_cycles
-from fpirhc.simulation.pictures.base import Quantity, numbers
+from fpirhc.simulation.pictures.lines import Quantity, numbers
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem
 
-__all__ = ["Energy", "InBand", "Largest", "Nadir", "Norm", "Overshoot", "TimeOver", "Total"]
+__all__ = ["InBand", "Largest", "Nadir", "Overshoot", "TimeOver", "Total"]
 __getattr__ = without("fpirhc.figures", __all__)
 What = str | Quantity
 
@@ -90,41 +90,6 @@ def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) ->
 
     unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
     return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True)
-
-
-@checked_call
-def Energy(what: What, *, name: str = "energy", headline: bool = True) -> Metric:
-    """Return the integral of s^2 over time; the energy of a current through 1 Ohm; arguments as in `InBand`."""
-    return _figure(
-        name, what, lambda s, period: np.sum(s**2) * period, lambda unit, time: f"({unit})^2 {time}", headline
-    )
-
-
-@checked_call
-def Norm(whats: Sequence[str], *, power: float = 2.0, name: str = "norm", headline: bool = True) -> Metric:
-    """Return the L_p norm of several signals of one unit, (integral of sum |s_i|^p dt)^(1/p); for p = inf the largest |s_i|.
-
-    Args:
-        whats: signals of the run.
-        power: p, at least 1; math.inf is allowed.
-        name: of the metric.
-        headline: whether it stands in short tables.
-
-    Raises:
-        InvalidValue: p is below 1, or there is no signal.
-    """
-    if not power >= 1 or not whats:
-        raise InvalidValue(
-            f"Norm: power is {power:g} of {len(whats)} signals; expected at least 1 of at least one signal"
-        )
-
-    def norm(problem: Problem, run: Run) -> float:
-        late = measured_cycles(problem, run)
-        values = np.stack([run[what][late] for what in whats])
-        return float(np.linalg.norm(values.ravel(), power) * problem.period ** (1 / power))
-
-    unit = (lambda problem, _: _unit(problem, whats[0])) if np.isinf(power) else ""
-    return Metric(name, partial(_of_whole_runs, norm), unit=unit, headline=headline, finite=True)
 
 
 def _figure(

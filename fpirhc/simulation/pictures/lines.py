@@ -1,19 +1,94 @@
-"""Lines and events of runs: signals over time, one signal against another, times at which a signal passes a threshold."""
+"""The contract of pictures of a report, a title, a caption and a way to draw runs; lines over time, and one signal against another.
+
+A problem file names its pictures: `pictures = (fp.Portrait(...), fp.OverTime(...))`. A picture draws into an existing figure, so
+this module imports no plotting library.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fpirhc.fields.checked import Checked
 from fpirhc.simulation import drawing
-from fpirhc.simulation.pictures.base import Picture, Quantity, extremes, label, numbers
 from fpirhc.simulation.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+INTERVALS = 2000  # of a line over time, each drawn by its two extremes
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """A quantity that a run does not log but that follows from its signals.
+
+    Args:
+        name: on the axis.
+        unit: on the axis.
+        values: function of a Run that returns one number per cycle, shape (cycles,).
+    """
+
+    name: str
+    unit: str
+    values: Callable[[Run], np.ndarray]
+
+
+class Picture(Checked, ABC):
+    """Contract of a picture.
+
+    Every picture has the attributes `title`, `caption` and `controllers`, the names of the controllers that it shows (empty: all).
+    """
+
+    title: str
+    caption: str
+    controllers: tuple[str, ...]
+
+    @abstractmethod
+    def size(self, count: int) -> tuple[float, float]:
+        """Return width and height in inches for `count` controllers."""
+
+    @abstractmethod
+    def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
+        """Draw the runs, by name of their controller, into an empty figure.
+
+        Raises:
+            InvalidName: a run does not have a signal; the message names the nearest one.
+        """
+
+    def motion(self, runs: Mapping[str, Run]) -> Mapping[str, object]:  # noqa: ARG002
+        """Return what a page needs to play the runs, by name of their controller; nothing where the picture stands still."""
+        return {}
+
+
+def numbers(run: Run, what: str | Quantity) -> np.ndarray:
+    """Return the values of a signal or a quantity, shape (cycles,)."""
+    return run[what] if isinstance(what, str) else np.asarray(what.values(run), dtype=float)
+
+
+def label(run: Run, what: str | Quantity) -> str:
+    """Return the axis label 'name [unit]' of a signal or a quantity."""
+    name, unit = (what.partition(".")[2] or what, run.unit(what)) if isinstance(what, str) else (what.name, what.unit)
+    return drawing.literal(f"{name} [{unit}]")
+
+
+def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values of the extremes of equal intervals in their order; a short series as it is.
+
+    Every n-th value alone would show a command that alternates from cycle to cycle as a smooth line.
+    """
+    if values.size <= 2 * INTERVALS:
+        return times, values
+    edges = np.linspace(0, values.size, INTERVALS + 1).astype(int)
+    parts = [(a, values[a:b]) for a, b in pairwise(edges)]
+    places = np.array([sorted((a + int(np.argmin(v)), a + int(np.argmax(v)))) for a, v in parts]).ravel()
+    return times[places], values[places]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,46 +172,3 @@ class Portrait(Picture):
             axis.plot(numbers(run, self.x)[late], numbers(run, self.y)[late], lw=0.8)
             axis.set_title(name, fontsize=10)
             drawing.caption_axes(axis, label(run, self.x), label(run, self.y))
-
-
-@dataclass(frozen=True, eq=False)
-class Raster(Picture):
-    """A row of ticks for each controller, one tick where the signal passes the threshold upwards.
-
-    Args:
-        title: of the picture.
-        signal: the name of a signal ("state.V"), or a Quantity.
-        threshold: in the unit of the signal.
-        caption: of the picture.
-        controllers: names of those shown; empty: all.
-    """
-
-    title: str
-    signal: str | Quantity
-    threshold: float
-    caption: str = ""
-    controllers: tuple[str, ...] = ()
-
-    def size(self, count: int) -> tuple[float, float]:
-        return 11.0, 0.33 * count + 1.1
-
-    def draw(self, figure: Figure, runs: Mapping[str, Run]) -> None:
-        """Draw the rows, the first controller on top.
-
-        Raises:
-            InvalidName: a run does not have the signal.
-        """
-        axis = figure.subplots()
-        events = [passages(run.time, numbers(run, self.signal), self.threshold) for run in runs.values()]
-        axis.eventplot(events, lineoffsets=[float(k) for k in range(len(runs))], linelengths=0.7, colors="#222222")
-        counts = [f"{name} ({len(times)})" for name, times in zip(runs, events, strict=True)]
-        axis.set_yticks(np.arange(len(runs)), counts, fontsize=8)
-        axis.set_ylim(len(runs) - 0.5, -0.5)
-        axis.set_xlim(0, max(float(run.time[-1]) for run in runs.values()))
-        drawing.caption_axes(axis, drawing.time_label(next(iter(runs.values()))), "")
-
-
-def passages(times: np.ndarray, values: np.ndarray, threshold: float) -> np.ndarray:
-    """Return the first times at which the values are above the threshold, after values at or below it."""
-    above = values > threshold
-    return times[1:][above[1:] & ~above[:-1]]

@@ -16,7 +16,7 @@ from fpirhc.fields.user_code import called
 from fpirhc.plant.motion import by_name
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation import drawing
-from fpirhc.simulation.pictures.base import Picture
+from fpirhc.simulation.pictures.lines import Picture
 from fpirhc.simulation.run import Run
 from fpirhc.symbolic.layout import Layout
 
@@ -243,8 +243,3 @@ class Planar(Picture):
 def script() -> str:
     """Return the script that plays pictures: `play(box, data)`."""
     return files(__package__).joinpath("planar.js").read_text(encoding="utf-8")
-
-
-def styles() -> str:
-    """Return the styles of the player."""
-    return files(__package__).joinpath("planar.css").read_text(encoding="utf-8")
