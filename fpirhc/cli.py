@@ -212,7 +212,7 @@ def study(
             variants = Grid.parsed(over, seed) if over else named
             facts["processes"] = processes or (None if cluster else -1)
             result = run_study(task, variants, headline=headline, folder=folder, **facts)
-            page = render_charted(result.view, figure_of(result), "Every run", "")
+            page = render_charted(result.view, figure_of(result))
     write_csv(result.table, folder / "study.csv")
     _publish(result.view, page, folder, json, verbose)
 

@@ -102,12 +102,9 @@ def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, An
     return images, motions
 
 
-def render_charted(
-    view: View, figure: Drawing | None = None, heading: str = "", caption: str = "", own: Sequence[Image] = ()
-) -> str:
-    """Return the text of a page with a figure, where there is one, below a heading, and with the problem's own pictures."""
-    chart = Image(figure.address, heading, caption) if figure else None
-    return render_page("page.html", view, chart=chart, own=own)
+def render_charted(view: View, figure: Drawing | None = None) -> str:
+    """Return the text of a page, with a figure of every run where there is one."""
+    return render_page("page.html", view, chart=Image(figure.address, "Every run") if figure else None)
 
 
 def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: Any) -> str:
