@@ -185,19 +185,19 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     assert problem.cost is not None
     optimiser, restarts = controller.optimiser, controller.tracking is None
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
-    preview = problem.reference.preview(plant, horizon.nodes)
+    preview, corrected = problem.reference.preview(plant, horizon.nodes), controller.planner.feeds_back(plant)
     data_of = ocp.data_of(previewed=preview is not None)
     memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))
     solve = built(optimiser, ocp, optimiser.step)
     low, high = problem.limits.input_ends(plant)
-    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
 
     def step(s: Signals) -> dict[str, Value]:
         own = [getattr(s, one.name) for one in problem.own_signals]
         motion = () if preview is None else preview(s.time, *own)
-        data = data_of(s.time, *motion, s.parameters, *_open_rows(problem, ocp, s))
+        rows = [expression(ca.vertcat(*(expressed(one, s.parameters) for one in ocp.settings)))] if ocp.settings else []
+        data = data_of(s.time, *motion, s.parameters, *rows)
         for seen in plant.beside if restarts else ():  # outputs that are given beside the state
-            shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=controller.planner.feeds_back(plant))
+            shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=corrected)
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
         if horizon.measured:
             data = offset_limits(plant, horizon, ocp.data)(data, s._plan_state, s.state)
@@ -225,6 +225,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         }
 
     own = memory + Layout((scalar("plan_begun"),))
+    writes = (like(plant.input, "planned"), Signal("solve", _SOLVE), scalar("_solve_status"))
     return Block("plan", _plan_reads(problem, room), Layout(writes), step, own, opaque=True)
 
 
@@ -238,14 +239,6 @@ def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
     return Layout((plant.time, start, *outputs, plant.parameter, *last, *own))
-
-
-def _open_rows(problem: Problem, ocp: OptimalControl, s: Signals) -> list[Expression]:
-    """The open settings at the end of a stage's data; nothing without any."""
-    if not ocp.settings:
-        return []
-    numbers = open_numbers(problem.cost, problem.limits)
-    return [expression(ca.vertcat(*(expressed(numbers[path], s.parameters) for path in ocp.settings)))]
 
 
 def _minus(ends: Sequence[float], shift: Expression) -> Expression:

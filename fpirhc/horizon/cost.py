@@ -6,23 +6,22 @@ terminal cost.
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import FpirhcError, InvalidProblem, Mistakes
+from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.fields.user_code import called
 from fpirhc.plant.motion import outside_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.expression import Value, stays, total
+from fpirhc.symbolic.expression import stays, total
 from fpirhc.symbolic.layout import Expression, Named, Signal
 
 
@@ -83,22 +82,18 @@ def view_of_symbols(plant: Plant) -> View:
     return view_of(plant, x, u, p, ca.SX.sym("t"), **others)
 
 
-def read_by(plant: Plant, values: Callable[[View], Iterable[Value]]) -> frozenset[str]:
-    """Return which of `input_before` and `feedforward` expressions of a view read; what is wrong with them is said elsewhere."""
-    view = view_of_symbols(plant)
-    with contextlib.suppress(FpirhcError, AttributeError, NotImplementedError, TypeError):
-        column = ca.vertcat(*(ca.vec(ca.SX(value)) for value in values(view)))
-        entries = {"input_before": view.input_before, "feedforward": view.feedforward}
-        return frozenset(name for name, entry in entries.items() if ca.depends_on(column, entry.vector))
-    return frozenset()
+def reads_feedforward(plant: Plant, cost: Cost) -> bool:
+    """Return whether a term of a cost reads the feedforward."""
+
+    def read() -> bool:
+        view = view_of_symbols(plant)
+        column = ca.vertcat(*(ca.vec(ca.SX(value)) for value in cost.stage(view).values()))
+        return bool(ca.depends_on(column, view.feedforward.vector))
+
+    return _READ.of((plant.equations, cost), (), read)
 
 
-def read_by_cost(plant: Plant, cost: Cost) -> frozenset[str]:
-    """Return which of `input_before` and `feedforward` the terms of a cost read."""
-    return _READ.of((plant.equations, cost), (), lambda: read_by(plant, lambda view: cost.stage(view).values()))
-
-
-_READ: Latest[frozenset[str]] = Latest(16)
+_READ: Latest[bool] = Latest(16)
 
 
 @dataclass(frozen=True, eq=False)

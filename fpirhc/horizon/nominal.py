@@ -66,8 +66,8 @@ def nominal_motion(
     """Return states (nx, m) and inputs (nu, m) of the model on its outputs' reference; errors decay as (d/dt + rate)^r e = 0."""
     x, outputs, r = (ca.MX.sym(n, size) for n, size in _sizes(plant).items())
     at, p = plant.equations.state_of(outputs, x), ca.MX(ca.DM(plant.approximate))
-    wanted = nominal_responses(plant, outputs, r)
-    needed = plant.equations.inverse(at, wanted + output_feedback(plant, at, outputs, p, rate), p)
+    feedback = output_feedback(plant, at, outputs, p, rate)
+    needed = plant.equations.inverse(at, nominal_responses(plant, outputs, r) + feedback, p)
     command = ca.fmin(ca.fmax(needed, ca.DM(bounds[0])), ca.DM(bounds[1]))
     step = ca.Function("fpirhc_nominal", [x, outputs, r], [advance(at, command, p), at, command])
     outputs_at, responses_at = reference.function(plant).map(times.size)(times[None, :])

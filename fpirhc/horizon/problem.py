@@ -53,7 +53,7 @@ class OptimalControl:
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
-        settings: paths of the open settings, whose numbers are among the data.
+        settings: the open settings, whose numbers are among the data.
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
@@ -82,7 +82,7 @@ class OptimalControl:
     state_price: np.ndarray
     node_times: np.ndarray
     shares: np.ndarray
-    settings: tuple[str, ...] = ()
+    settings: tuple[ca.SX, ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
 

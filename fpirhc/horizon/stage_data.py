@@ -8,7 +8,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.cost import Cost, read_by_cost
+from fpirhc.horizon.cost import Cost, reads_feedforward
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.plant import Plant
@@ -67,7 +67,7 @@ def stage_data(
     motion = [matrix.sym("x", plant.output.size), matrix.sym("r", len(plant.chains))] if previewed else []
     state, response = motion or reference.function(plant)(t)
     zero = matrix.zeros(plant.input.size)
-    needed = feedforward(plant, state, response, p) if "feedforward" in read_by_cost(plant, cost) else zero
+    needed = feedforward(plant, state, response, p) if reads_feedforward(plant, cost) else zero
     one = ca.Function("fpirhc_stage_data", [t, half, of_cycle, *motion], [ca.densify(ca.vertcat(t, state, needed, p))])
     start, parameters, count = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size), horizon.stages + 1
     columns = dict(zip(("states", "responses"), motion, strict=False))

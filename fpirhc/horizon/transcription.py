@@ -10,28 +10,20 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
-from fpirhc.fields.user_code import scalar_expression
-from fpirhc.horizon.constraint_states import (
-    ConstraintState,
-    check_names,
-    inside,
-    limited,
-    measured,
-    read_before,
-    state_prices,
-)
-from fpirhc.horizon.cost import Cost, Linearisation, View, outputs_of, read_by_cost, view_of
+from fpirhc.horizon.constraint_states import ConstraintState, as_measured, check_names, entries_of, state_prices
+from fpirhc.horizon.cost import Cost, Linearisation, View, outputs_of, reads_feedforward, view_of
 from fpirhc.horizon.horizon import Horizon
-from fpirhc.horizon.nominal import feedforward, nominal_motion, reference_state
+from fpirhc.horizon.nominal import nominal_motion, reference_state
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data
+from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.open import number_of, open_in, open_numbers
+from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.open import number_of, open_in
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import Reference
 
@@ -75,8 +67,7 @@ def _transcribed(
     stage = _STAGES.of(same, (horizon,), lambda: _stage(plant, reference, horizon, cost, limits))
     binding, free = stage.binding, stage.before
     data_of = partial(stage_data, plant, reference, horizon, cost, len(stage.settings), signals)
-    numbers = {path: number_of(number) for path, number in open_numbers(cost, limits).items()}
-    settings = [[numbers[path] for path in stage.settings]] if stage.settings else []
+    settings = [list(map(number_of, stage.settings))] if stage.settings else []
     table = np.asarray(data_of()(0.0, plant.approximate, *settings).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     bounds = limits.input_bounds(plant)
@@ -93,7 +84,7 @@ def _transcribed(
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant, horizon) + setting_rows(stage.settings),
+        data=data_layout(plant, horizon) + setting_rows(tuple(one.name() for one in stage.settings)),
         data_of=data_of,
         dynamics=stage.dynamics,
         stage_cost=stage.cost,
@@ -127,7 +118,7 @@ class _Stage:
     terminal_cost: ca.Function
     terms: tuple[str, ...]
     binding: list[ConstraintState]
-    settings: tuple[str, ...]
+    settings: tuple[ca.SX, ...]  # open numbers
     before: int  # entries of the input before in the state; 0 unless it is a part of it
 
 
@@ -136,9 +127,7 @@ _STAGES: Latest[_Stage] = Latest(8)  # whatever signals they meet
 
 def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, limits: Limits) -> _Stage:
     layout = data_layout(plant, horizon)
-    read = read_by_cost(plant, cost)
-    keeps_input = "input_before" in read or bool(horizon.blocks) or read_before(limits, plant, horizon.step)
-    x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size * keeps_input)
+    x, before = ca.SX.sym("x", plant.state.size), ca.SX.sym("before", plant.input.size)
     u, theta = ca.SX.sym("u", plant.input.size), ca.SX.sym("theta", layout.size)
     data = layout.split(theta)
     applied = data["free"] * u + (1 - data["free"]) * before if horizon.blocks else u
@@ -148,12 +137,12 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
         applied,
         data["parameters"],
         data["time"],
-        before=before if keeps_input else None,
+        before=before,
         reference=data["reference"],
-        feedforward=data["feedforward"] if "feedforward" in read else None,
+        feedforward=data["feedforward"] if reads_feedforward(plant, cost) else None,
     )
     length = data["length"] if horizon.lengths else 1.0
-    if hastened(horizon) and keeps_input:
+    if hastened(horizon):
         # A rate is limited as such; its square costs for as long as the change takes, which leaves the root of the haste.
         limited_view, view = (_hastened(view, factor) for factor in (data["haste"], ca.sqrt(data["haste"] / length)))
     try:
@@ -163,8 +152,8 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
             x_next = stretched(x, applied, view.parameters.vector, length)
         else:
             x_next = advance(x, applied, view.parameters.vector)
-        written = _written(plant, horizon, limits, limited_view, x_next, data)
-        terms = _scalar_terms(cost.stage(view))
+        written = _written(plant, horizon, limits, limited_view, x_next, data, before)
+        terms = {name: ca.SX(value) for name, value in cost.stage(view).items()}
         if horizon.blocks:
             if "held" in terms:
                 raise InvalidProblem(
@@ -172,11 +161,16 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
                 )
             # Inputs that have no effect are drawn to those that are held, so that a plan states what is applied.
             terms["held"] = (1 - data["free"]) * ca.sumsqr((u - before) / _reach(limits, plant))
+        used = ca.vertcat(*terms.values(), *(w.expression for w in written))
+        keeps_input = bool(horizon.blocks) or ca.depends_on(used, before)
+        before = before if keeps_input else ca.SX(0, 1)
         end = _end_view(plant, view, x, before if keeps_input else ca.SX.nan(plant.input.size))
-        terminal = cost.terminal_cost(end, plant, lambda: _linearise(plant, reference, horizon, advance), horizon.last)
-        final = _scalar_terms({"terminal": terminal})["terminal"]
+        linearise = lambda: _linearise(plant, reference, horizon, advance)  # noqa: E731
+        final = ca.SX(cost.terminal_cost(end, plant, linearise, horizon.last))
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
+    if final.numel() != 1:
+        raise InvalidProblem(f"cost: term 'terminal' must be one scalar, got shape {final.shape}")
     _check_entries(plant, keeps_input, written)
     settings = open_in(x_next, *terms.values(), final, *(w.expression for w in written))
     theta, s = ca.vertcat(theta, *settings), ca.vertcat(x, before, ca.SX.sym("z", len(written)))
@@ -188,7 +182,7 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
         ca.Function("fpirhc_terminal_cost", [s, theta], [ca.densify(final)]),
         tuple(terms),
         written,
-        tuple(one.name() for one in settings),
+        tuple(settings),
         before.numel(),
     )
 
@@ -225,18 +219,24 @@ def _start(plant: Plant, free: int, written: int) -> ca.Function:
 
 
 def _written(
-    plant: Plant, horizon: Horizon, limits: Limits, view: View, x_next: Expression, data: Mapping[str, Expression]
+    plant: Plant,
+    horizon: Horizon,
+    limits: Limits,
+    view: View,
+    x_next: Expression,
+    data: Mapping[str, Expression],
+    before: ca.SX,
 ) -> list[ConstraintState]:
-    entries = limited(limits, plant, view, horizon.step)
-    for entry in entries:
-        if ca.SX(entry.expression).numel() != 1:
-            raise InvalidProblem(f"limits: path '{entry.name}' must be one scalar, got {entry.expression.shape}")
+    boxes, written = limits.boxes(plant), limits.written(plant, horizon.step)
+    entries = entries_of(written, view)
     for k, earlier in enumerate(_steps_inside(plant, horizon, limits, view, data), 1):
-        state = Named(plant.state.elements, _seen(plant, horizon, earlier.state.vector, data), "state")
-        entries += inside(limits, plant, earlier, state, k)
-    seen_next = _seen(plant, horizon, x_next, data)
-    entries += measured(horizon.measured, limits, plant, seen_next)
-    return entries
+        seen = replace(earlier, state=view.state.of(_seen(plant, horizon, earlier.state.vector, data)))
+        paths = (w for w in entries_of(limits.paths, earlier) if not ca.depends_on(w.expression, before))
+        hard = (w for w in (*entries_of(boxes, seen), *paths) if w.name not in limits.prices)
+        entries += [replace(w, name=f"{w.name}, step {k}") for w in hard]
+    seen = replace(view, state=view.state.of(_seen(plant, horizon, x_next, data)))
+    own = entries_of({name: boxes[name] for name in horizon.measured}, seen)
+    return [*entries, *(replace(w, name=as_measured(w.name)) for w in own)]
 
 
 def _steps_inside(
@@ -250,9 +250,8 @@ def _steps_inside(
     for k in range(1, steps_in(plant, horizon.longest)):
         later = one.equations.next(x, u, p, ca.SX.zeros(len(plant.names)))
         x = later if k < per_stage else ca.if_else(k < per_stage * data["length"], later, x)
-        state = Named(plant.state.elements, x, "state")
-        output = Named(plant.output.elements, outputs_of(plant, x, u, p), plant.output.name)
-        views.append(replace(view, state=state, output=output, time=view.time + k * sampling(one)))
+        output = view.output.of(outputs_of(plant, x, u, p))
+        views.append(replace(view, state=view.state.of(x), output=output, time=view.time + k * sampling(one)))
     return views
 
 
@@ -264,15 +263,15 @@ def _seen(plant: Plant, horizon: Horizon, x: Expression, data: Mapping[str, Expr
 
 def _end_view(plant: Plant, view: View, x: Expression, before: Expression) -> View:
     """The view of the end of the horizon, whose input is NaN, because there is none; the one before is that of the last stage."""
-    inputs, none = tuple(view.input), ca.SX.nan(plant.input.size)
-    output = Named(plant.output.elements, outputs_of(plant, x, none, view.parameters.vector), plant.output.name)
-    return replace(view, output=output, input=Named(inputs, none, "input"), input_before=Named(inputs, before, "input"))
+    none = ca.SX.nan(plant.input.size)
+    output = view.output.of(outputs_of(plant, x, none, view.parameters.vector))
+    return replace(view, output=output, input=view.input.of(none), input_before=view.input.of(before))
 
 
 def _hastened(view: View, factor: Expression) -> View:
     """The view with so many times the change of the input."""
-    u, before = view.input, view.input_before
-    return replace(view, input_before=Named(tuple(before), u.vector - factor * (u.vector - before.vector), "input"))
+    u, before = view.input.vector, view.input_before.vector
+    return replace(view, input_before=view.input.of(u - factor * (u - before)))
 
 
 def _advance(plant: Plant, horizon: Horizon) -> ca.Function:
@@ -287,25 +286,9 @@ def _linearise(plant: Plant, reference: Reference, horizon: Horizon, advance: ca
     x_next = advance(x, u, p)
     jacobians = ca.Function("fpirhc_linear", [x, u, p], [ca.jacobian(x_next, x), ca.jacobian(x_next, u)])
     state, response = reference.function(plant)(0.0)
-    needed = feedforward(plant, state, response, ca.DM(plant.approximate))
-    state = reference_state(plant, state)
-    a, b = jacobians(state, needed, plant.approximate)
+    wanted, state = nominal_responses(plant, state, response), reference_state(plant, state)
+    a, b = jacobians(state, plant.equations.inverse(state, wanted, plant.approximate), plant.approximate)
     return Linearisation(np.asarray(a.full()), np.asarray(b.full()), horizon.step)
-
-
-def _scalar_terms(expressions: Mapping[str, Expression]) -> dict[str, Expression]:
-    mistakes = Mistakes("cost")
-    if not isinstance(expressions, Mapping) or not expressions:
-        mistakes.add(f"the terms must be {{name: expression}} with at least one entry, got {expressions!r}")
-        mistakes.raise_if_any()
-    terms = {}
-    for name, value in expressions.items():
-        try:
-            terms[str(name)] = scalar_expression(f"term '{name}'", value, finite=False)
-        except InvalidProblem as error:
-            mistakes.add(f"{error}{'; sum its entries with ca.sum1' if 'shape' in str(error) else ''}")
-    mistakes.raise_if_any()
-    return terms
 
 
 def _nodes(

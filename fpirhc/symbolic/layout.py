@@ -107,6 +107,10 @@ class Named:
     def __iter__(self) -> Iterator[str]:
         return iter(self._elements)
 
+    def of(self, column: Expression) -> Named:
+        """Return another vector with these names."""
+        return Named(self._elements, column, self._what)
+
 
 @dataclass(frozen=True, eq=False)
 class Layout:
