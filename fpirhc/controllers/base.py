@@ -47,13 +47,11 @@ def closing_blocks(
     built: Built, deformation: Deformation, judged: Sequence[Signal] = ()
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks deform, invert, limit, judge and running with what they remember; `judged` are solver statuses."""
-    plant = built.plant
+    plant, path = built.plant, built.path(deformation)
     closing, delays = commanding_blocks(built, judged)
     deform = deform_block(plant, deformation, built.warm_up, built.largest)
     last = plant.response_signal(_REQUEST)
-    before, remembered = (
-        ([], [Delay(last, "deformed")]) if last.name in deform.reads else ([model_block(built.path(deformation))], [])
-    )
+    before, remembered = ([], [Delay(last, "deformed")]) if last.name in deform.reads else ([model_block(path)], [])
     return [*before, deform, invert_block(plant), *closing], [*delays, *remembered]
 
 
@@ -100,7 +98,10 @@ def deform_block(
         remembered = {m: getattr(s, m) for m in memory.names}
         deformed, next_memory = deformation.step(getattr(s, request_before), s.realised, s.desired, remembered)
         valid = s.warm_up > warm_up_cycles - 0.5
-        sane = _sane(s.realised - s.desired, largest) if memory.names else None
+        errors = zip(ca.vertsplit(s.realised - s.desired), largest, strict=True) if largest and memory.names else ()
+        # NaN is not absurd, because it has to show.
+        absurd = [ca.fabs(one) > _ABSURD * size for one, size in errors if math.isfinite(size)]
+        sane = ca.logic_not(reduce(ca.logic_or, absurd)) if absurd else None
         learns = valid if sane is None else ca.logic_and(valid, sane)
         next_values = {f"{m}_next": ca.if_else(learns, next_memory[m], remembered[m]) for m in memory.names}
         if sane is not None and request_before == _REQUEST:
@@ -111,15 +112,6 @@ def deform_block(
 
     written = [plant.response_signal(name) for name in ("_deformed_unclipped", "_deformation")]
     return Block("deform", Layout(reads), Layout(tuple(written)), step, memory)
-
-
-def _sane(error: Expression, largest: Sequence[float]) -> Expression | None:
-    """Whether no response error is absurd; NaN is not, because it has to show. None where there are no limits."""
-    sizes = zip(ca.vertsplit(error), largest, strict=True) if largest else ()
-    absurd = [ca.fabs(one) > _ABSURD * size for one, size in sizes if math.isfinite(size)]
-    if not absurd:
-        return None
-    return ca.logic_not(reduce(ca.logic_or, absurd))
 
 
 def invert_block(plant: Plant) -> Block:

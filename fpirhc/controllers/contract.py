@@ -20,7 +20,7 @@ from fpirhc.errors import require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.horizon.cost import Cost
-from fpirhc.plant.chain import require_derivatives, without_disturbances
+from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
@@ -78,7 +78,7 @@ class Planner:
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
-        return self.adapts or without_disturbances(plant) is not plant
+        return self.adapts or plant.believes_responses
 
     def feeds_back(self, plant: Plant) -> bool:
         """Return whether a law or a correction of the response takes back what outputs of order 0 are away from a plan."""

@@ -104,7 +104,7 @@ def _reached(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX
 def without_disturbances(plant: Plant) -> Plant:
     """Return the plant without believed disturbances of its outputs' responses; itself where there are none."""
     kept = {name: parameter for name, parameter in plant.believed.items() if "'" not in name}
-    return plant if len(kept) == len(plant.believed) else replace(plant, believed=kept)
+    return replace(plant, believed=kept) if plant.believes_responses else plant
 
 
 @lru_cache(maxsize=8)  # the parts of a loop that is composed ask for the same few

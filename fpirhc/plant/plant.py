@@ -255,6 +255,11 @@ class Plant(Checked):
         """Of every controlled quantity over how many cycles its response is a difference: its order on a map, else none."""
         return {name: self.response_age * order for name, order in self.response_orders.items()}
 
+    @property
+    def believes_responses(self) -> bool:
+        """Whether it believes something to add to the response of an output, of which plans are made without."""
+        return any("'" in name for name in self.believed)
+
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
         return Signal(name, self.controlled_names, self._controlled_units)

@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import casadi as ca
@@ -151,9 +151,8 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
         period: of the control cycle, s.
         useful: what the integral of every controlled coordinate may ask for; empty: anything.
     """
-    writes = Layout((integral_signal(plant, "integral"),))
-    cut_off, held = plant.response_signal("_cut_off"), scalar("_held")
-    reads = (error_signal(plant), cut_off, held, integral_signal(plant, "_integral_used"))
+    cut_off, held, integral = plant.response_signal("_cut_off"), scalar("_held"), integral_signal(plant, "integral")
+    reads = (error_signal(plant), cut_off, held, replace(integral, name="_integral_used"))
 
     def step(s: Signals) -> dict[str, Expression]:
         counts = ca.logic_and(s._target_error * s._cut_off <= 0, ca.logic_not(s._held))
@@ -163,7 +162,7 @@ def integral_update(plant: Plant, period: float, useful: Sequence[Useful] = ()) 
         columns = zip(useful, ca.vertsplit(s._integral_used), ca.vertsplit(error), strict=True)
         return {"integral": ca.vertcat(*(one.next(i, e, period) for one, i, e in columns))}
 
-    return Block("tracking_update", Layout(reads), writes, step)
+    return Block("tracking_update", Layout(reads), Layout((integral,)), step)
 
 
 def integral_delay(plant: Plant) -> tuple[Delay, ...]:
