@@ -148,11 +148,6 @@ class Sensing(Checked):
         states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
         if self.measured is not None and not measured:
             yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
-        elif believes and self.measured is None and not (plant.response_age or plant.outputs):
-            yield (
-                f"observer: everything that {own} needs is measured; name what sensors show: "
-                f"Sensing(measured={list(measured)!r}, ...)"
-            )
         elif missing and not believes:
             yield (
                 f"measured: {own} also needs {', '.join(missing)}; measure it, or estimate it by "
