@@ -87,9 +87,7 @@ class Named:
         self.vector = column
 
     def __getattr__(self, name: str) -> Expression:
-        if (
-            name not in self._elements
-        ):  # Python reads identifiers in NFKC (PEP 3131): of the micro sign it makes the letter mu
+        if name not in self._elements:  # Python reads identifiers in NFKC: of the micro sign it makes the letter mu
             name = next((e for e in self._elements if normalize("NFKC", e) == name), name)
         return self[name]
 
