@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction.spectrum import Array, jacobians_along, linear_limit
-from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
+from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.evaluate import Latest
@@ -140,6 +140,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     if gain == 0:
         return
     what, (name, value) = with_its_gain(deformation), own_gain(deformation)
+    pairs = not any(against_wrappers(Paired(deformation, cycles=1.0)))  # whether it may be paired
     remembers = deformation.memory(problem.plant.controlled_names).size > 0
     jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian_at_start(problem.of_equations))
     weighted = deformation.form.weighted(jacobian)
@@ -157,8 +158,8 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     largest = largest_gain(right, jacobian, weights) if judged else abs(limit)
     interval = f"0 < |{name}| < {abs((largest or limit) / gain * value):.3g}"
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
-    pairs = (Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0)
-    usable = (one for one in pairs if not deformation.form.pairs and converges(one, jacobian, weights))
+    paired = (Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0 and pairs)
+    usable = (one for one in paired if converges(one, jacobian, weights))
     if wrong:
         turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
         why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""

@@ -122,6 +122,13 @@ def test_a_model_referenced_form_passes_the_null_test_on_believed_states():
     np.testing.assert_allclose(first["state"], second["state"], atol=1e-9)
 
 
+def test_a_filter_of_what_is_measured_calms_the_command() -> None:
+    noisy = {n: fp.Sensor(noise=fp.Noise(2e-3)) for n in ("angle", "angle'")}
+    filters = None, fp.KalmanFilter(dict.fromkeys(noisy, 2e-3), {"angle": 0.05})
+    runs = [run(swing(ANGLE, sensing=fp.Sensing(noisy, observer=one)), TRACK)["command"] for one in filters]
+    assert np.abs(np.diff(runs[1], 2, axis=0)).mean() < 0.2 * np.abs(np.diff(runs[0], 2, axis=0)).mean()
+
+
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():
     """From the load's speed nobody knows the angles: a turn of the whole servo shows nowhere and stays."""
     observer = fp.KalmanFilter(measured={"load'": 0.1}, noise={"motor": 1.0})
