@@ -16,8 +16,9 @@ import numpy as np
 from fpirhc.adapters.names import adapter, counterparts, derivatives, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.fields.kinds import NotNegative
+from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
-from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.task.external_plant import ExternalPlant
 
 _STEP, _PULL, _COORDINATES = 1e-3, 2.0, ("x", "y", "heading")  # s; 1/s of the speed's error; in the order of `_moved`
 

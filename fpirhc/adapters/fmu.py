@@ -13,8 +13,9 @@ from typing import Any
 
 from fpirhc.adapters.names import adapter, counterparts, other_types, require
 from fpirhc.errors import Mistakes, package
+from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
-from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.task.external_plant import ExternalPlant
 
 
 @adapter

@@ -15,8 +15,9 @@ import numpy as np
 
 from fpirhc.adapters.names import adapter, counterparts, derivatives, from_path_or_text, require, steps_per_cycle
 from fpirhc.errors import Mistakes, package
+from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
-from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.task.external_plant import ExternalPlant
 
 _UNSTABLE = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC", "mjWARN_BADCTRL")
 _Values = Mapping[str, float]

@@ -18,8 +18,9 @@ import numpy as np
 from fpirhc.adapters.names import adapter, finite_numbers, require_seconds
 from fpirhc.errors import Mistakes, package
 from fpirhc.fields.kinds import NotNegative
+from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
-from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.tracking.base import Tracking
 from fpirhc.tracking.linear_law import LinearLaw
 

@@ -36,7 +36,8 @@ def called(what: str, function: Callable[..., Result], *arguments: object) -> Re
             warnings.filterwarnings("ignore", message=r"\s*casadi: a numpy function", category=FutureWarning)
             return function(*arguments)
     except Exception as error:  # noqa: BLE001 -- whatever a user's function raises is a mistake in it
-        place = place_in_users_code(error).partition(": ")[0]
+        frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_users(f.filename)]
+        place = f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}" if frames else ""
         raise InvalidProblem(f"{what}{f' ({place})' if place else ''}: {explained(error)}") from None
 
 
@@ -92,12 +93,6 @@ def explained(error: BaseException) -> str:
     symbols = re.search(r"\b(SX|MX|to_double|to_int|new_SX|new_MX)\b", text) is not None
     first = text.strip().partition("\n")[0]
     return f"{type(error).__name__}: {first}{f'; {_OF_CASADI}' if symbols else ''}"
-
-
-def place_in_users_code(error: BaseException) -> str:
-    """Return "file.py, line 12: source" of the innermost line of a user's file; empty where there is none."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if _is_users(f.filename)]
-    return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
 
 
 def place_of(function: Callable[..., object]) -> str:

@@ -14,11 +14,12 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
+from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.disturbed import disturbance_name, disturbed
 from fpirhc.plant.integrators import USUAL
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import quantities, require_named, response_names, values_of
+from fpirhc.sensing.base import require_named, values_of
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal

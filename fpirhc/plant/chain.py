@@ -122,6 +122,13 @@ def response_names(plant: Plant) -> tuple[str, ...]:
     return tuple(name + "'" * order for name, order in plant.response_orders.items())
 
 
+def quantities(plant: Plant) -> dict[str, str]:
+    """Return the unit of all that a sensor may show: states, outputs and their derivatives, and controlled responses."""
+    signals = (plant.state, plant.output)
+    shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
+    return shown | dict(zip(response_names(plant), plant.response_signal("realised").entry_units, strict=True))
+
+
 def response_units(plant: Plant) -> tuple[str, ...]:
     """Return the units of the derivatives that end the chains of all outputs, or coordinates."""
     units, time = followed_units(plant), plant.time_unit

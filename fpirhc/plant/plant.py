@@ -262,12 +262,9 @@ class Plant(Checked):
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
-        return Signal(name, self.controlled_names, self._controlled_units)
-
-    @cached_property
-    def _controlled_units(self) -> tuple[str, ...]:
         units, time = followed_units(self), self.time_unit
-        return tuple([derivative_unit(units[n], order, time) for n, order in self.response_orders.items()])
+        own = tuple([derivative_unit(units[n], order, time) for n, order in self.response_orders.items()])
+        return Signal(name, self.controlled_names, own)
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:

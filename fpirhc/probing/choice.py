@@ -24,13 +24,12 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.deformation.wrappers.filtered import Filtered
 from fpirhc.errors import FpirhcError, require
-from fpirhc.plant.chain import require_rates
+from fpirhc.plant.chain import require_rates, response_names
 from fpirhc.plant.parameter import outside
 from fpirhc.plant.plant import Plant
 from fpirhc.probing.identification import Estimates
 from fpirhc.review.experiments import Bench, Case
 from fpirhc.review.questions import Verdict, gain_by_run
-from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensor
 from fpirhc.simulation.model_as_plant import behind_actuators, shortened
 from fpirhc.simulation.run import Run

@@ -16,8 +16,8 @@ from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Identity
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
+from fpirhc.plant.chain import response_names
 from fpirhc.probing.identification import require_cycles
-from fpirhc.sensing.base import response_names
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.layout import Expression, Layout, scalar

@@ -16,8 +16,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.chain import require_derivatives
-from fpirhc.plant.chain import response_names as response_names
+from fpirhc.plant.chain import require_derivatives, response_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
@@ -58,11 +57,6 @@ class DerivativeEstimator(Checked, ABC):
     def check(self, plant: Plant) -> None:
         """Raise if the estimator cannot serve the plant; by default it estimates derivatives."""
         require_derivatives(plant, type(self).__name__, of_time=self.of_time, instead="leave the estimator out")
-
-
-def quantities(plant: Plant) -> tuple[str, ...]:
-    """Names of all that a sensor may show: states, outputs and their derivatives, and the highest ones of controlled quantities."""
-    return tuple(dict.fromkeys((*plant.state.elements, *plant.output.elements, *response_names(plant))))
 
 
 def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:

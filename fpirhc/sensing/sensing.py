@@ -17,9 +17,9 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
-from fpirhc.plant.chain import response_units
+from fpirhc.plant.chain import quantities, response_names, response_units
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver, quantities, response_names
+from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector

@@ -16,10 +16,10 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import PlantModel
+from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import response_names
 from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
 from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal, logged_signal
 from fpirhc.symbolic.block import Block, Delay
@@ -27,7 +27,7 @@ from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.exogenous import model_values, real_values
-from fpirhc.task.external_plant import ExternalPlant, quantities
+from fpirhc.task.external_plant import ExternalPlant
 from fpirhc.task.problem import Problem
 
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates

@@ -11,8 +11,9 @@ import numpy as np
 
 from fpirhc.controllers.gate import LOST
 from fpirhc.controllers.seeing import sensor_ranges
+from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import followed_units
-from fpirhc.sensing.base import backward_difference, combine, response_names
+from fpirhc.sensing.base import backward_difference, combine
 from fpirhc.simulation.path import HELD, Mover, moving, real_signals
 from fpirhc.symbolic.block import Block, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -29,13 +30,14 @@ def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
     """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
     problem, plant = mover.problem, mover.problem.plant
     response = plant.response_signal("realised")
-    if problem.sees_plant:
+    at_once = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    if at_once and not problem.truth.seen:
         sense = [mover.sense(plant.motion, response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(mover, response)
     if predicts and not mover.shows_truth and all(map(problem.moves.shows, problem.judged_names)):
         true = [*true, _truth_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
-    if problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued:
+    if at_once:
         return true  # with coordinates measured in place of others
     return [*true, *_late_blocks(problem, shown)]
 

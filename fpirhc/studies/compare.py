@@ -17,11 +17,11 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
+from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
-from fpirhc.sensing.base import response_names
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened

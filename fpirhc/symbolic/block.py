@@ -139,7 +139,13 @@ class Composite:
     @cached_property
     def function(self) -> ca.Function:
         """The step; scalar code where every block is."""
-        return self.graph if self.opaque else scalar_code(self.graph)
+        if self.opaque:
+            return self.graph
+        # All calls are written out, and common parts of blocks computed once.
+        graph = self.graph
+        inputs = [ca.SX.sym(graph.name_in(k), graph.size1_in(k)) for k in range(graph.n_in())]
+        shared = ca.cse([ca.SX(v) for v in graph.call(inputs)])
+        return ca.Function(graph.name(), inputs, shared, graph.name_in(), graph.name_out())
 
     @property
     def settings(self) -> Layout:
@@ -188,13 +194,6 @@ def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delay
     for delay in delays:
         if sizes.get(delay.source) != memory.sizes[delay.now.name]:
             _refuse_size(f"delay '{delay.now.name}'", delay.now, delay.source, sizes)
-
-
-def scalar_code(function: ca.Function) -> ca.Function:
-    """Write all calls out as scalar expressions and compute common parts of blocks once."""
-    inputs = [ca.SX.sym(function.name_in(k), function.size1_in(k)) for k in range(function.n_in())]
-    shared = ca.cse([ca.SX(v) for v in function.call(inputs)])
-    return ca.Function(function.name(), inputs, shared, function.name_in(), function.name_out())
 
 
 def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix]) -> None:
@@ -266,7 +265,8 @@ def every(block: Block, cycles: int) -> Block:
         choice = ca.Function.if_else(f"{PREFIX}{block.name}_every", run, hold)
         due = getattr(signals, phase.name) < 0.5
         column = choice(due, *arguments)
-        values = dict(zip(block._results, ca.vertsplit(column, _ends(block)), strict=True))
+        ends = [0, *accumulate(signal.size for signal in block._results.values())]
+        values = dict(zip(block._results, ca.vertsplit(column, ends), strict=True))
         values |= {f"{h}_next": values[s] for h, s in zip(held.names, block.writes.names, strict=True)}
         next_phase = getattr(signals, phase.name) + 1
         values[f"{phase.name}_next"] = ca.if_else(next_phase > cycles - 0.5, 0, next_phase)
@@ -278,10 +278,6 @@ def every(block: Block, cycles: int) -> Block:
 
 def _settings(signals: Iterable[Signal]) -> Layout:
     return Layout(tuple({s.name: s for s in signals if s.name == SETTINGS}.values()))
-
-
-def _ends(block: Block) -> list[int]:
-    return [0, *accumulate(signal.size for signal in block._results.values())]
 
 
 def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:

@@ -147,12 +147,6 @@ def _equal(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
         return False
 
 
-def words_of(error: BaseException) -> str:
-    """Return class and first line of an error: "LinAlgError: Array must not contain infs or NaNs"."""
-    first = f"{error}".strip().partition("\n")[0]
-    return f"{type(error).__name__}: {first}" if first else type(error).__name__
-
-
 def attempted(what: str, compute: Callable[..., T], *arguments: object, broken: list[str], **named: object) -> T | None:
     """Return what a function returns; None where it raises, with a sentence about it added to `broken`."""
     try:
@@ -162,5 +156,6 @@ def attempted(what: str, compute: Callable[..., T], *arguments: object, broken: 
         interruption = unwrapped(error)
         if not isinstance(interruption, Exception):
             raise interruption from None
-        broken.append(f"{what} could not be computed ({words_of(error)}); the rest does not depend on it")
+        first = f"{type(error).__name__}: {f'{error}'.strip().partition(chr(10))[0]}".removesuffix(": ")
+        broken.append(f"{what} could not be computed ({first}); the rest does not depend on it")
         return None

@@ -83,7 +83,9 @@ def check_problem(problem: Problem) -> None:
     mistakes.raise_if_any()
     check_maps(plant, problem.real_plant, mistakes)
     mistakes.raise_if_any()
-    _check_stage(plant, problem.cost, problem.limits, mistakes)
+    # Problems share what they share.
+    parts = plant, problem.cost, problem.limits
+    mistakes.join(_STAGES.of(parts, (), lambda: _of_stage(*parts)))
     _check_inverse(problem, mistakes)
     smooth = not_held(problem.signals, differentiated_signals(plant))
     if smooth:
@@ -214,7 +216,10 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
 def _check_disturbances(problem: Problem) -> None:
     """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
     mistakes, instants = Mistakes("disturbances"), np.array([0.0, problem.period])
-    mistakes.unknown("input, coordinate or output", problem.disturbances, problem.disturbable)
+    others = (
+        () if problem.foreign else (*problem.real_plant.coordinates, *problem.plant.outputs)
+    )  # nothing reaches into a body
+    mistakes.unknown("input, coordinate or output", problem.disturbances, (*problem.plant.inputs, *others))
     for name, one in problem.disturbances.items():
         with mistakes.caught(f"'{name}': "):
             one.values(instants, np.random.default_rng(0))
@@ -240,11 +245,6 @@ def needed_names(
         return frozenset((*plant.coordinates, *followed_units(plant))), measured
     shown = (name.rstrip("'") for name in measured)
     return frozenset((*shown, *(judged or ()), *plant.controlled_names, *plant.outputs)), measured
-
-
-def _check_stage(plant: Plant, cost: Cost | None, limits: Limits, mistakes: Mistakes) -> None:
-    """Add every mistake in the cost's names and weights, and in the user's functions of a stage; problems share what they share."""
-    mistakes.join(_STAGES.of((plant, cost, limits), (), lambda: _of_stage(plant, cost, limits)))
 
 
 _STAGES: Latest[Mistakes] = Latest(8)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Finite, NotNegative, Positive
+from fpirhc.plant.chain import quantities
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
@@ -231,12 +232,3 @@ class ExternalPlant(Checked):
 
 def _words(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":")
-
-
-def quantities(model: Plant) -> dict[str, str]:
-    """Return the unit of every quantity of a model that can be measured: state elements, outputs, and controlled responses."""
-    signals, orders = (model.state, model.output), model.response_orders
-    shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
-    units = model.response_signal("realised").entry_units
-    responses = {name + "'" * order: unit for (name, order), unit in zip(orders.items(), units, strict=True)}
-    return {**shown, **responses}

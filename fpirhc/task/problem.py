@@ -16,16 +16,16 @@ from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.cost import Cost
 from fpirhc.horizon.horizon import Horizon
 from fpirhc.horizon.nominal import nominal_run
+from fpirhc.plant.chain import response_names
 from fpirhc.plant.integrators import USUAL, Integrator, own_steps
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
-from fpirhc.sensing.base import response_names
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.open import nominal
 from fpirhc.task.checks import check_problem, settled_maps
-from fpirhc.task.dead_time import MEASUREMENT, DeadTime
+from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.exogenous import Exogenous, real_values, rows_of, signals_of
 from fpirhc.task.external_plant import ExternalPlant
@@ -119,11 +119,6 @@ class Problem(Checked):
         return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self.moves.shows(n)))
 
     @property
-    def sees_plant(self) -> bool:
-        """Whether a controller receives the plant's own state and response, unchanged and without delay."""
-        return MEASUREMENT not in self.dead_time.queued and self.sensing.ideal and not self.truth.seen
-
-    @property
     def foreign(self) -> ExternalPlant | None:
         """The reality where it is an object outside."""
         return self.reality.foreign if self.reality is not None else None
@@ -207,12 +202,6 @@ class Problem(Checked):
         plant = self.real_plant
         middle = self.period / 2 / self.signal_steps
         return rows_of(real_values(plant, self.signals), np.array([middle]), plant.exact)[0]
-
-    @property
-    def disturbable(self) -> tuple[str, ...]:
-        """Names that disturbances may have: of the inputs in the plant's order, then of what else moves."""
-        # Nothing reaches into an object outside.
-        return (*self.plant.inputs, *(() if self.foreign else (*self.real_plant.coordinates, *self.plant.outputs)))
 
     @cached_property
     def start_state(self) -> np.ndarray:

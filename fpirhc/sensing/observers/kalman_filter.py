@@ -13,18 +13,9 @@ import numpy as np
 
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import Deviation
+from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
-from fpirhc.sensing.base import (
-    Correct,
-    Evidence,
-    Model,
-    Predict,
-    Remembered,
-    StateObserver,
-    quantities,
-    require_named,
-    values_of,
-)
+from fpirhc.sensing.base import Correct, Evidence, Model, Predict, Remembered, StateObserver, require_named, values_of
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _STATE, _COVARIANCE = "observer_state", "observer_covariance"
