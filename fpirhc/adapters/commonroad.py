@@ -43,8 +43,7 @@ def commonroad_body(
     Raises:
         NotSupported: commonroad-vehicle-models is not installed.
         InvalidField: a speed below zero.
-        InvalidProblem: a name that the car or the model does not have, a number of no vehicle, or a period that is no
-            whole number of ms.
+        InvalidProblem: a name that the car or the model does not have, no such vehicle, or a period that is no whole ms.
     """
     units, mistakes, counterpart = quantities(model), Mistakes("commonroad_body"), names or {}
     parts = derivatives(mistakes, units)

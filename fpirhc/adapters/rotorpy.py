@@ -72,8 +72,9 @@ def rotorpy_body(
     loaded = {**deepcopy(parameters), "mass": parameters["mass"] + payload}
     multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
     flown = multirotor(loaded, initial_state=first, control_abstraction="cmd_acc", aero=True)
-    order = [list(model.inputs).index(name) for name in _SENT]
-    body = _Quadrotor(flown, first, period, order, parameters["mass"] / loaded["mass"])
+    body = _Quadrotor(
+        flown, first, period, [*map(list(model.inputs).index, _SENT)], parameters["mass"] / loaded["mass"]
+    )
     return ExternalPlant(body, measures={name: quantities(model)[name] for name in _SEEN}, period=period)
 
 
