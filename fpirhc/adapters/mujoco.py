@@ -67,10 +67,7 @@ def mujoco_body(
 
 
 class _Body:
-    """Joints and motors at their places in MuJoCo's vectors.
-
-    `places`: quantity -> (order of the derivative, place). `start`: quantity -> value.
-    """
+    """Joints and motors at their places in MuJoCo's vectors; `places`: quantity -> (order of the derivative, place)."""
 
     def __init__(self, mujoco: Any, model: Any, steps: int, motors: list[int], places: _Places, start: _Values) -> None:
         self._mujoco, self._model, self._data = mujoco, model, mujoco.MjData(model)
