@@ -39,7 +39,7 @@ FAMILIES: Mapping[str, Family] = {
     "deformations": Family("fpirhc.deformation.base:Deformation", ("fpirhc.deformation",)),
     "tracking laws": Family("fpirhc.tracking.base:Tracking", ("fpirhc.tracking",)),
     "derivative estimators": Family("fpirhc.sensing.base:DerivativeEstimator", ("fpirhc.sensing",)),
-    "observers": Family("fpirhc.sensing.base:StateObserver", ("fpirhc.sensing.observers",)),
+    "observers": Family("fpirhc.sensing.base:StateObserver", ("fpirhc.sensing",)),
     "optimisers": Family("fpirhc.optimisers.base:Optimiser", ("fpirhc.optimisers",)),
     "controllers": Family("fpirhc.controllers.base:Controller", ("fpirhc.controllers",)),
     "estimators": Family("fpirhc.learning.estimators:ParameterEstimator", ("fpirhc.learning",)),

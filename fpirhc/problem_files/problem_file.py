@@ -31,7 +31,7 @@ from fpirhc.problem_files.settings import (
 )
 from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
-from fpirhc.simulation.pictures.lines import Picture
+from fpirhc.simulation.pictures import Picture
 from fpirhc.summary import line, table
 from fpirhc.task.cases import Cases, as_declared
 from fpirhc.task.problem import Problem, problem_facts

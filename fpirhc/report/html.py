@@ -24,7 +24,7 @@ from fpirhc.errors import FpirhcError
 from fpirhc.report.figures import colours_of, contraction_figures
 from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
-from fpirhc.simulation.pictures import planar
+from fpirhc.simulation.pictures import player
 from fpirhc.studies.verdict import IN_FULL, Outcome
 from fpirhc.whole_file import write_whole
 
@@ -61,7 +61,7 @@ def render(comparison: Comparison) -> str:
     begin = [*(comparison.findings[0].pair or ())]
     series = {**chart_data(comparison), "bands": BANDS, "begin": begin, "motions": motions}
     data = json.dumps(series, separators=(",", ":")).replace("<", "\\u003c")  # no text ends the script
-    scripts = asset("uPlot.iife.min.js"), asset("axes.js"), *([planar.script()] if motions else [])
+    scripts = asset("uPlot.iife.min.js"), asset("axes.js"), *([player()] if motions else [])
     slots: dict[tuple[str, ...], list[str]] = {}  # names of controllers by their time slots
     for e in comparison.entries:
         if e.run.spans():

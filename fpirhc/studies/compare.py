@@ -25,7 +25,7 @@ from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.contraction import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
-from fpirhc.simulation.pictures.lines import Picture
+from fpirhc.simulation.pictures import Picture
 from fpirhc.simulation.ranges import Followed, limits_left
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator

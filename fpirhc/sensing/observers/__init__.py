@@ -1,1 +1,0 @@
-"""Observers: one file per way to know states that no sensor shows."""
