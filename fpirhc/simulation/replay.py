@@ -189,11 +189,6 @@ class Replay:
             max(_forgets(problem) if windows else 0, _SETTLES if observed else 0),
         )
 
-    @property
-    def evaluations(self) -> int:
-        """Most evaluations of one step: a trial, the missing cycles, and the one of now."""
-        return max(self.bridged, self.fills) + 2
-
     def after(self, a: Bound, evaluate: Callable[[], str]) -> str:
         """Run what is missing before a step that has been evaluated as a trial, and the step again, where it had a good sample.
 

@@ -99,13 +99,6 @@ class Simulator:
         """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
 
-    def first_memory(
-        self, variant: Problem | None = None, settings: Numbers | None = None
-    ) -> tuple[Problem, np.ndarray]:
-        """Return the problem of a run and the first memory of its loop; arguments as in `run`."""
-        force = self.in_force(variant, settings)
-        return force.problem, start_memory(self.loop, force.problem, force.controller, force.numbers)
-
     def in_force(self, variant: Problem | None = None, settings: Numbers | None = None) -> InForce:
         """Return problem and controller of a run; arguments as in `run`."""
         return in_force(self.live, self.loop, variant or self.problem, settings or {}, {})

@@ -19,8 +19,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, package, require
-from fpirhc.export.binaries import web_module
-from fpirhc.export.device import c_of, literal
+from fpirhc.export.device import c_of, literal, web_module
 from fpirhc.export.targets.c import template
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting

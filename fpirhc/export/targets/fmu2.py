@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.errors import package
-from fpirhc.export.binaries import shared_library
-from fpirhc.export.device import Device, Target
+from fpirhc.export.device import Device, Target, shared_library
 from fpirhc.export.targets.c import data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
 

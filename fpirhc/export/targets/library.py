@@ -6,8 +6,7 @@ import json
 from collections.abc import Mapping
 
 from fpirhc.errors import NotInstalled
-from fpirhc.export.binaries import shared_library
-from fpirhc.export.device import Device, Target
+from fpirhc.export.device import Device, Target, shared_library
 from fpirhc.export.targets.c import filled, layout_of, sources
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import why_no_compiler

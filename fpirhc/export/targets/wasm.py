@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 
-from fpirhc.export.binaries import web_module
-from fpirhc.export.device import Device, Target, recorded
+from fpirhc.export.device import Device, Target, recorded, web_module
 from fpirhc.export.targets.c import data_of, filled, layout_of, sources
 
 

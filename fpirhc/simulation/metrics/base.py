@@ -28,16 +28,11 @@ from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
 Better = Literal["smaller", "larger", "neither"]
-Compared = Literal["banded", "tight", "exact", "not"]
 Function = Callable[[Problem, Run], float | Mapping[str, float] | None]
 
 RELATIVE_ERROR = "relative error"  # by which controllers are compared where no metric is named
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
-
-
-def _no_step(period: float, cycles: int) -> float:  # noqa: ARG001
-    return 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,16 +54,13 @@ class Metric(Checked):
         headline: whether the metric stands in short tables; its best value is marked in the report.
         report: whether the metric stands in the report's table.
         shown: the elements that stand in the report's table; None: all.
-        compared: how baselines compare it: 'banded' (inside a computed band), 'tight' (to 1e-6), 'exact', 'not'.
-        finite: whether a run that finished must have a finite number.
         floor: size of a difference up to which two numbers count as equal.
-        step: (period, number of cycles) -> the smallest step of a number that counts cycles; zero for every other number.
         order: place among the columns, smallest first; metrics of one place stand as they are listed.
         always: whether every run of a study has it; False: only where it is judged by, because it takes longer than the run.
 
     Raises:
         InvalidName: a name that cannot be a key.
-        InvalidValue: an unknown direction or comparison.
+        InvalidValue: an unknown direction.
     """
 
     name: str
@@ -82,10 +74,7 @@ class Metric(Checked):
     headline: bool = False
     report: bool = True
     shown: tuple[str, ...] | None = None
-    compared: Compared = "banded"
-    finite: bool = False
     floor: float = 1e-12
-    step: Callable[[float, int], float] = _no_step
     order: float = 100.0
     always: bool = True
 

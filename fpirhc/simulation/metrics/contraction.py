@@ -97,14 +97,6 @@ METRICS = (
         order=85,
         always=False,
     ),
-    Metric(
-        "contraction.growing",
-        growing,
-        title="contraction above 1",
-        text=in_percent,
-        compared="not",
-        order=85,
-        always=False,
-    ),
+    Metric("contraction.growing", growing, title="contraction above 1", text=in_percent, order=85, always=False),
     Metric("contraction.measured", measured, floor=1e-4, order=85, always=False),
 )

@@ -97,4 +97,4 @@ def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shi
     return ca.Function("fpirhc_costs", [*tables, p], [costs])
 
 
-METRICS = (Metric("cost", cost, by="term", shown=("total",), finite=True, order=70, always=False),)
+METRICS = (Metric("cost", cost, by="term", shown=("total",), order=70, always=False),)

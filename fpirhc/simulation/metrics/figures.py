@@ -89,7 +89,7 @@ def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) ->
         return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
 
     unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
-    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline, finite=True)
+    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline)
 
 
 def _figure(
@@ -112,9 +112,7 @@ def _figure(
         return float(figure(values[measured_cycles(problem, run)], problem.period))
 
     whole = partial(_of_whole_runs, function)
-    return Metric(
-        name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, finite=True, better=better
-    )
+    return Metric(name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, better=better)
 
 
 def _times(unit: str, time: str) -> str:
