@@ -14,8 +14,7 @@ import numpy as np
 from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
-from fpirhc.plant.chain import quantities, response_names
-from fpirhc.plant.disturbed import disturbance_name, disturbed
+from fpirhc.plant.chain import disturbance_name, disturbed, quantities, response_names
 from fpirhc.plant.integrators import USUAL
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant

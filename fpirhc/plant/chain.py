@@ -8,7 +8,7 @@ The response of an output of order 0 is the output, and its nominal response the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported, refuse
+from fpirhc.errors import Mistakes, NotSupported, refuse
 from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import (
@@ -26,9 +26,11 @@ from fpirhc.plant.motion import (
     controlled_places,
     derivative_unit,
     followed_units,
+    forcing_units,
     outside_names,
     sampling,
 )
+from fpirhc.plant.parameter import Parameter
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression
 
@@ -99,6 +101,43 @@ def _reached(plant: Plant, value: Expression, symbols: tuple[ca.SX, ca.SX, ca.SX
     for _ in range(x.numel()):
         seen = seen | (seen @ on_state)
     return bool((seen @ on_input).any())
+
+
+def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
+    """Return the plant with disturbances of coordinates' responses, of outputs and of their responses as parameters of value 0."""
+    mistakes = Mistakes("drift: disturbances of the model")
+    responses = dict(zip(response_names(plant), plant.controlled_names, strict=True)) if plant.outputs else {}
+    what = "coordinate, output or response of an output" if plant.outputs else "coordinate"
+    mistakes.unknown(what, names, list(dict.fromkeys([*plant.names, *plant.chains, *responses])))
+    if not names:
+        mistakes.add("name at least one coordinate whose response is disturbed")
+    for name in (disturbance_name(c) for c in names):
+        if name in plant.parameters:
+            mistakes.add(f"the plant has a parameter '{name}' already; rename it")
+    mistakes.raise_if_any()
+    units = dict(followed_units(plant)) | dict(zip(plant.names, forcing_units(plant), strict=True))
+    if responses:
+        units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
+    added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
+    believed = {**plant.believed, **{n: disturbance_name(n) for n in names}}
+    made = replace(plant, parameters={**plant.parameters, **added}, believed=believed)
+    return replace(made, inverse=None) if plant.inverse is not None and _mixed(made) else made
+
+
+def _mixed(plant: Plant) -> bool:
+    """Whether a coordinate's disturbance is in the response of another quantity, so that a user's inverse does not know it."""
+    x, u, p = plant.symbols()
+    of = {parameter: name for name, parameter in plant.believed.items() if name in plant.coordinates}
+    pattern = ca.jacobian_sparsity(plant.equations.controlled_response(x, u, p), p)
+    parameters, controlled = plant.parameter.elements, plant.controlled_names
+    pairs = zip(*pattern.get_triplet(), strict=True)
+    return any(of.get(parameters[k], controlled[i]) != controlled[i] for i, k in pairs)
+
+
+def disturbance_name(name: str) -> str:
+    """Name of the parameter that disturbs a coordinate's response, an output (w_y), or an output's response (w_y_2 of y'')."""
+    order = name.count("'")
+    return f"w_{name.rstrip(chr(39))}_{order}" if order else f"w_{name}"
 
 
 def without_disturbances(plant: Plant) -> Plant:

@@ -61,10 +61,7 @@ class Equations:
 
     @cached_property
     def next(self) -> ca.Function:
-        """Function (state, input, parameters, forcing) -> state of a map one control cycle later.
-
-        In each of the cycle's steps x+ = f(x, u, p) + step * forcing: a forcing adds to the divided differences.
-        """
+        """Function (state, input, parameters, forcing) -> state of a map one cycle later; a forcing adds to the differences."""
         assert self.plant.step is not None
         x, u, p, w = self._forced()
         one, after = ca.Function("fpirhc_step", [x, u, p], [self._of_user(self.plant.step, x, u, p)]), x

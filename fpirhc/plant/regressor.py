@@ -27,20 +27,10 @@ _SPREAD = 0.3  # relative range of random parameters
 
 @dataclass(frozen=True, eq=False)
 class Regressor:
-    """Q = Y theta + Q0 of a plant for the parameters theta.
+    """Q = Y theta + Q0 of a plant for the parameters theta."""
 
-    Args:
-        plant: as many inputs as coordinates, all of them controlled, with an inverse response made of symbols.
-        names: parameters of the plant that are theta; all others keep the model's approximate values.
-
-    Raises:
-        NotSupported: the plant is not fully actuated, or its inverse response needs a root finder.
-        InvalidName: a name that is no parameter.
-        InvalidValue: the inverse dynamics is not linear in theta; the message names the parameters and a remedy.
-    """
-
-    plant: Plant
-    names: Sequence[str]
+    plant: Plant  # as many inputs as coordinates, all of them controlled, with an inverse response made of symbols
+    names: Sequence[str]  # parameters that are theta; all others keep the model's approximate values
 
     def __post_init__(self) -> None:
         _check_plant(self.plant)

@@ -48,10 +48,7 @@ class Evaluator:
 
     @property
     def failed(self) -> bool:
-        """Whether the last evaluation failed; `results` then still hold the values from before it.
-
-        In the virtual machine a failure raises as well; a failure of compiled code shows only here.
-        """
+        """Whether the last evaluation failed; one of compiled code shows only here."""
         return bool(self._buffer.ret() != 0)
 
     def failure(self) -> str:
@@ -120,10 +117,7 @@ T = TypeVar("T")
 
 
 class Latest(threading.local, Generic[T]):
-    """The latest results of a function of values, of every thread its own: an evaluator among them has numbers of its last call.
-
-    `most`: number of results that are kept, with their arguments; what is built of one problem follows each other, so a few do.
-    """
+    """The latest few results of a function, of every thread its own: an evaluator among them has numbers of its last call."""
 
     def __init__(self, most: int) -> None:
         self._known: deque[tuple[tuple[object, ...], tuple[object, ...], T]] = deque(maxlen=most)

@@ -5,7 +5,6 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import hashlib
 import os
@@ -89,11 +88,7 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
 
 @contextlib.contextmanager
 def compiling_ahead() -> Iterator[Callable[..., None]]:
-    """Yield a function that starts the compiler for what `native` will be asked later with the same arguments, and does not wait.
-
-    `native` waits for a compiler that has been started, so several are at work side by side while Python goes on. What fails here
-    fails again there, with its message.
-    """
+    """Yield a function that starts the compiler for what `native` will be asked later, which waits for it, and has its errors."""
     pool, begun = ThreadPoolExecutor(os.cpu_count()), list[Path]()
 
     def begin(function: ca.Function, flags: Sequence[str] = (), *, calls: int = 0) -> None:
@@ -131,24 +126,16 @@ def cache_folder() -> Path:
         base.mkdir(mode=0o700, parents=True, exist_ok=True)
         facts = base.lstat()  # of a link itself: one of a stranger leads to what is not meant
         if posix and (facts.st_uid != os.geteuid() or not stat.S_ISDIR(facts.st_mode) or facts.st_mode & 0o022):
-            return _temporary_folder()
+            return Path(_temporary_folder().name)
         with tempfile.TemporaryFile(dir=base):
             return base
     except (OSError, RuntimeError):  # RuntimeError: there is no home folder
-        return _temporary_folder()
+        return Path(_temporary_folder().name)
 
 
 @cache
-def _temporary_folder() -> Path:
-    """A folder for this process, removed when it ends, and not when a process that was forked from it ends."""
-    folder, owner = Path(tempfile.mkdtemp(prefix="fpirhc-")), os.getpid()
-
-    def remove() -> None:
-        if os.getpid() == owner:
-            shutil.rmtree(folder, ignore_errors=True)
-
-    atexit.register(remove)
-    return folder
+def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="fpirhc-")  # removed with this process
 
 
 def why_no_compiler() -> str:
@@ -212,14 +199,7 @@ def _writer() -> str:
 
 
 class _Library:
-    """The library of so many calls of a Function, which is found without writing its C.
-
-    Its key is a hash of the Function, in which the names of drivers have a hash of their text, and of all else that decides it:
-    compiler, flags, machine, CasADi, and the code that writes C.
-
-    Raises:
-        NoCode: a Function that cannot be written as C.
-    """
+    """The library of so many calls of a Function, found by a hash of it, in which names of drivers have one of their text."""
 
     def __init__(self, function: ca.Function, compiler: str, flags: Sequence[str], calls: int) -> None:
         flags = *flags, *shlex.split(os.environ.get("FPIRHC_CFLAGS", ""))
