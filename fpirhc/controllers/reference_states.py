@@ -19,6 +19,7 @@ from fpirhc.errors import InvalidValue
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.problem import Problem
+from fpirhc.task.reference import pairs
 from fpirhc.tracking.base import Tracking, one_rate
 
 _TURNS = {"rad": 2 * np.pi, "deg": 360.0, "°": 360.0}  # a whole turn by unit
@@ -160,9 +161,12 @@ def request_along_reference(problem: Problem, law: Tracking | None = None) -> Re
     """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
     t = ca.MX.sym("t")
     responses = nominal_motion(problem)(t)[1]
-    response_of, jump = ca.Function("r", [t], [responses]), problem.reference.largest_jump(problem.plant)
-    smooth = problem.period * _slew(response_of, problem.duration)
-    change = max(jump, _largest_change(response_of, problem)) if jump else smooth
+    response_of, steps = ca.Function("r", [t], [responses]), problem.reference.set_points.items()
+    change = problem.period * _slew(response_of, problem.duration)
+    if jumps := sorted(
+        {time for name, one in steps for time, _ in pairs(name, one) if time > 0}
+    ):  # no derivative shows them
+        change = _largest_change(response_of, problem, np.array(jumps) - problem.period)
     return RequestChange(change, sudden=False, recovery=_recovery(problem, law))
 
 
@@ -212,10 +216,10 @@ def _largest_error(problem: Problem) -> float:
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 
-def _largest_change(function: ca.Function, problem: Problem) -> float:
-    """Largest change of a Function of time over one cycle of the run, sampled."""
-    times = np.linspace(0.0, problem.duration - problem.period, _INSTANTS)
-    before, after = (np.asarray(function.map(_INSTANTS)(t[None, :]).full()) for t in (times, times + problem.period))
+def _largest_change(function: ca.Function, problem: Problem, begins: np.ndarray) -> float:
+    """Largest change of a Function of time over one cycle of the run, sampled, and in cycles that begin at some times."""
+    times = np.concatenate([np.linspace(0.0, problem.duration - problem.period, _INSTANTS), begins])
+    before, after = (np.asarray(function.map(times.size)(t[None, :]).full()) for t in (times, times + problem.period))
     return float(np.max(np.linalg.norm(after - before, axis=0)))
 
 

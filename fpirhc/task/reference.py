@@ -99,10 +99,6 @@ class Reference(Checked, ABC):
         """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from t on; None without own signals."""
         return None
 
-    def largest_jump(self, plant: Plant) -> float:  # noqa: ARG002
-        """Largest known jump of the controlled responses from one cycle to the next, which no derivative shows."""
-        return 0.0
-
 
 @dataclass(frozen=True, eq=False)
 class Trajectory(Reference):
@@ -210,16 +206,6 @@ class Setpoint(Reference):
         tables = [ca.horzcat(*parts) for parts in zip(*columns, strict=True)]
         arguments, names = [ca.SX.sym("t"), own], ["t", "own"]
         return ca.Function("fpirhc_reference_preview", arguments, tables, names, ["states", "responses"])
-
-    def largest_jump(self, plant: Plant) -> float:
-        jumps: dict[float, list[float]] = {}
-        for name in plant.controlled_names:
-            order = plant.chains[name]
-            if self._orders(plant)[name] == order:
-                by_one = float(ca.evalf(self._chain(plant, ca.SX.zeros(order), ca.SX(1.0))[-1]))
-                for time, change in self._changes(name):
-                    jumps.setdefault(time, []).append(by_one * change)
-        return max((float(np.linalg.norm(together)) for together in jumps.values()), default=0.0)
 
     def _symbols(self, plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX]:
         """The own signal, and of it the state of all filters and the set-points."""

@@ -74,9 +74,6 @@ class Shifted(Reference):
         shifted = states + ca.repmat(_places(plant) @ shift, 1, len(nodes))
         return ca.Function("fpirhc_target_preview", [t, *own, shift], [shifted, responses])
 
-    def largest_jump(self, plant: Plant) -> float:
-        return self.reference.largest_jump(plant)
-
     def _symbols(self, plant: Plant) -> tuple[Expression, list[Expression], Expression]:
         """Time, the own signals of the reference, and the shift."""
         *own, shift = (ca.SX.sym(signal.name, signal.size) for signal in self.own(plant))
