@@ -132,7 +132,7 @@ def run(
     chosen, folder = select(task, [controller])[controller], opt.folder_of(out, task.name)
     from fpirhc.controllers.contract import resolved
     from fpirhc.report.figures import save_figure
-    from fpirhc.report.terminal import announce_backend, progress_bars, show_run
+    from fpirhc.report.terminal import announce_backend, progress_bars, say, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
     from fpirhc.studies.variants import Draws
@@ -149,7 +149,8 @@ def run(
     found.save(files[0])
     save_figure(found.plot(), files[1])
     announce_backend([found])
-    harm = harm_of_adaptation(task.problem, controller, chosen)
+    harm, since = harm_of_adaptation(task.problem, controller, chosen), task.problem.measure_from
+    say(task.title, "bold", f" {controller}: errors from t = {since:g} {task.problem.time_unit} on, seed {seed}.")
     show_run(found, measure(task.problem, found, task.metrics), harm, files)
     raise typer.Exit(0 if found.stop is None else 4)
 
@@ -400,6 +401,7 @@ def export(
     task = _task(problem)
     from fpirhc.errors import InvalidName, nearest
     from fpirhc.export.device import device_of, targets, write
+    from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.compare import select
 
     chosen, folder = select(task, [controller])[controller], out or Path("results", task.name, to)
@@ -415,7 +417,9 @@ def export(
         return
     if to not in targets():
         raise InvalidName(f"the target '{to}' is unknown.{nearest(to, [*targets(), 'lab'])}")
-    device = device_of(task.problem, chosen, controller, name=name, live=live or [])
+    with progress_bars() as progress:
+        progress(controller, 0, 1)  # bounds of many live settings take a minute
+        device = device_of(task.problem, chosen, controller, name=name, live=live or [])
     for file in write(device, targets()[to], folder):
         print(f"wrote {file}")
 

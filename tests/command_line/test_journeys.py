@@ -82,6 +82,10 @@ HARMS = lambda: (GENTLE(), LONG())  # noqa: E731 -- by what the first thousand c
 WRONG_SIGN = edited("gain=-0.5", "gain=0.5, scale=1.0")
 WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.0}})\ncontrollers = {')
 MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
+RUN = "A mass on a line with a wrong gain."
+HARMED = (
+    "CTC+FPI: errors from t = 0.5 s on, seed 0.\n- CTC+FPI, t = 0.5 to 2 s: with the wrong model the rms error of y is"
+)
 # What is done before, the words, the exit code, and what the first line says. Those of a row follow one another.
 JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     "help": [(None, "", 0, "Usage: fpirhc"), (None, "help run", 0, "Usage: fpirhc run"), (None, "--version", 0, "fpirhc 0.")],
@@ -113,11 +117,11 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "compare line.py --optimisers fixed-point --no-compile -c RHC+FPI", 0, MASS),
     ],
     "run": [
-        (None, "run line.py CTC --no-compile --out kept", 0, ""),
+        (None, "run line.py CTC --no-compile --out kept", 0, f"{RUN} CTC: errors from t = 0.5 s on, seed 0.\nrms"),
         (None, "run line.py", 2, "fpirhc: Missing argument 'CONTROLLER': one of CTC, CTC+FPI"),
         (None, "run lime.py", 2, "fpirhc: no file at 'lime.py'. Did you mean 'line.py'?"),
         (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
-        (HARMS, "run line.py CTC+FPI --no-compile", 0, "- CTC+FPI, t = 0.5 to 2 s: with the wrong model the rms error of y is"),
+        (HARMS, "run line.py CTC+FPI --no-compile", 0, f"{RUN} {HARMED}"),
         (DIVERGING, "run line.py CTC --no-compile", 4, ""),
         (None, "compare line.py --no-compile -c CTC CTC+FPI", 0, MASS),  # a comparison tells it as a result
     ],
