@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -56,6 +57,10 @@ class Command(TyperCommand):
             words.append(word)
         return super().parse_args(ctx, words)
 
+    def get_help(self, ctx: Any) -> str:
+        """The help with names of arguments as they are written here, and ranges in words."""
+        return re.sub(r"\{(\w+)\}| <(?:str|list\[str\])>", r"\1", super().get_help(ctx)).replace("x>=", "at least ")
+
     def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         formatter.write(f"\nExamples:\n{self.epilog}\n")
 
@@ -80,7 +85,7 @@ def given(metavar: str | None, text: str, *names: str, **more: Any) -> Any:
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
-Problem = Annotated[str, typer.Argument(metavar="PROBLEM", help="name of a shipped problem, or path of a problem file")]
+Problem = Annotated[str, typer.Argument(metavar="PROBLEM", help="name of a shipped problem, or path of a file")]
 Controller = Annotated[str, typer.Argument(metavar="CONTROLLER", help="name of a controller of the problem")]
 Controllers = Annotated[
     list[str] | None, given("NAME ...", "only these controllers of the file", "--controllers", "-c")
