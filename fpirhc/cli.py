@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 import fpirhc.options as opt
+from fpirhc import __version__
 from fpirhc.options import command, given
 
 
@@ -278,17 +279,16 @@ def tune(
     """Search better settings, at equal cost for every controller. The problem file says what is searched: tuning = {...}."""
     task = _task(problem)
     from fpirhc.report.terminal import progress_bars, show_harm
-    from fpirhc.studies.tune import tune as search
+    from fpirhc.studies.tune import tune as ask
     from fpirhc.studies.variants import CasesOf, Draws
 
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     drawn = Draws(draws, mismatch, seed + 10**6) if draws else None  # never the plants of a comparison
     variants = CasesOf(tuple(cases), seed) if cases else drawn
-    folder = opt.folder_of(out, task.name, "tuning")
     facts: dict[str, Any] = {"trials": trials, "seed": seed, "controllers": controllers, "metric": metric}
     with progress_bars() as progress:
-        found = search(task, variants=variants, folder=folder, progress=progress, **facts)
+        found = ask(task, variants=variants, folder=opt.folder_of(out, task.name, "tuning"), progress=progress, **facts)
     for sentences in found.harm.values():
         show_harm(sentences)
     table = found.table
@@ -408,9 +408,8 @@ def export(
     if to == "lab":
         from fpirhc.export.lab import write_lab
 
-        sliders = "a lab has sliders of parameters, gains and limits of inputs, and no others"
         if live:
-            raise typer.BadParameter(f"--live: {sliders}")
+            raise typer.BadParameter("--live: a lab has sliders of parameters, gains and limits of inputs, no others")
         page = opt.folder_of(folder) / f"{task.name}-lab.html"
         write_lab(task, problem, {controller: chosen}, page)
         print(f"wrote {page}")
@@ -431,6 +430,4 @@ def about(
 ) -> None:  # fmt: skip
     """What stands before a command."""
     if version:
-        from importlib.metadata import version as version_of
-
-        print(f"fpirhc {version_of('fpirhc')}")
+        print(f"fpirhc {__version__}")

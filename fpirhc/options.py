@@ -58,7 +58,6 @@ class Command(TyperCommand):
         return super().parse_args(ctx, words)
 
     def get_help(self, ctx: Any) -> str:
-        """The help with names of arguments as they are written here, and ranges in words."""
         return re.sub(r"\{(\w+)\}| <(?:str|list\[str\])>", r"\1", super().get_help(ctx)).replace("x>=", "at least ")
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002

@@ -31,8 +31,7 @@ def create_problem(name: str, folder: Path) -> tuple[Path, Path]:
             path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise not_writable(folder, error, "--dir") from None
-    problem, test = texts
-    return problem, test
+    return folder / f"{name}.py", folder / f"test_{name}.py"
 
 
 def check_name(name: str) -> None:

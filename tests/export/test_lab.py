@@ -109,7 +109,7 @@ def test_what_has_no_lab(tmp_path, monkeypatch, capsys):
     Path("lossy.py").write_text(PROBLEM + lossy)
     refused = {
         "lossy.py RHC": "without the driver that runs missing cycles afterwards",
-        "own.py RHC --live deformation.gain": "a lab has sliders of parameters, gains and limits of inputs, and no others",
+        "own.py RHC --live deformation.gain": "a lab has sliders of parameters, gains and limits of inputs, no others",
         "far.py RHC": "a plant outside Python's equations has none",
     }
     for words, said in refused.items():
