@@ -75,15 +75,6 @@ def nan_where(failed: Expression) -> Expression:
     return ca.asin(2 * failed)
 
 
-def entry_at(values: Expression, place: Expression) -> Expression:
-    """Return the entry of a column at a place that is known at run time; zero beyond its ends.
-
-    Every entry is looked at. CasADi's scalar code has no table, and an entry that is not taken does not spoil the sum.
-    """
-    entries = ca.vertsplit(values)
-    return cast(Expression, sum(ca.if_else(place == k, one, 0) for k, one in enumerate(entries)))
-
-
 def total(terms: Iterable[Expression]) -> Expression:
     """Return the sum of the terms; the number 0 where there are none."""
     return cast(Expression, sum(terms))

@@ -16,7 +16,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, entry_at, total
+from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 MEASUREMENT = "measurement"  # the name beside those of the inputs
@@ -150,11 +150,6 @@ class Queue:
             total(share * queue[size * k + j] for k, share in shares.items()) for j, shares in enumerate(channels)
         )
         return ca.vertcat(*entries)
-
-    def at(self, queue: Expression, size: int, cycles: Expression) -> Expression:
-        """Return what was pushed the nearest whole number of cycles ago, all entries alike; the number is known at run time."""
-        place = ca.floor(cycles + 0.5 - WHOLE)
-        return ca.vertcat(*(entry_at(queue[j::size], place) for j in range(size)))
 
     def driven(
         self, step: ca.Function, state: Expression, queue: Expression, size: int, held: Sequence[Expression]

@@ -264,6 +264,7 @@ def crossed():
     )
 
 
+AIMED = replace(task(), dead_time=fp.DeadTime(measurement=0.01), reference=fp.Setpoint({"q": 0.5}, rate=2.0))
 REFUSED = {
     "bounds that admit an indefinite mass matrix": (
         book((3.2, 1.2, 0.7, 0.7)),
@@ -271,6 +272,7 @@ REFUSED = {
         InvalidValue,
         "not positive definite.*at a1 = ",
     ),
+    "set-points before a dead time": (AIMED, AID, NotSupported, "knows of set-points; use rule=Projection"),
     "infinite bounds where M is inverted": (
         task(),
         replace(AID, bounds=BOX | {"m": FREE}),

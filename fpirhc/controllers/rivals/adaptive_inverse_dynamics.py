@@ -15,12 +15,12 @@ from fpirhc.controllers.path import measured
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
+from fpirhc.errors import require
 from fpirhc.learning.rules import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Layout, Signal, like
-from fpirhc.task.dead_time import Queue
+from fpirhc.symbolic.layout import Expression, Signal, like
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
@@ -62,7 +62,12 @@ class AdaptiveInverseDynamics(Controller):
     learns = True
 
     def check(self, problem: Problem) -> None:
-        """Raise if plant, bounds or rule do not fit, as `Learning.check` does."""
+        """Raise if plant, bounds or rule do not fit, as `Learning.check` does, or an error of the past would have to be known."""
+        require(
+            self.rule.reads_response or not (problem.dead_time.queued and problem.given_signals),
+            "AdaptiveInverseDynamics learns by this rule from the error when the response was realised, which behind dead time "
+            "nobody knows of set-points; use rule=Projection(...), or a Trajectory",
+        )
         self._learning.check(problem, inverts=True)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
@@ -71,7 +76,6 @@ class AdaptiveInverseDynamics(Controller):
         believed = like(plant.parameter, "_believed")
         blocks = [
             *desired_blocks(built, self.tracking),
-            *([_earlier_targets(built)] if self._remembers(built) else []),
             self._learn_block(built),
             *(fed(block, "parameters", believed) for block in closing),
             self.tracking.within(built.largest).update(plant, built.period),
@@ -106,7 +110,7 @@ class AdaptiveInverseDynamics(Controller):
         """The reference when the response was realised, and what it reads; no sample is older than the start."""
         plant, pairs = built.plant, built.pairs
         if not _late(built) or built.given:
-            target = like(plant.output, _EARLIER if self._remembers(built) else "_target")
+            target = like(plant.output, "_target")
             return lambda s: getattr(s, target.name), (target,)
         reference = built.motion
 
@@ -115,36 +119,12 @@ class AdaptiveInverseDynamics(Controller):
 
         return then, (measured(plant.time), *built.own)
 
-    def _remembers(self, built: Built) -> bool:
-        """Whether it learns from errors of an earlier instant, to set-points, which only a memory knows."""
-        return bool(_late(built) and built.given and not self.rule.reads_response)
-
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
         gains = self.tracking.gains(2)
         size = len(gains)
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
         return np.asarray(solve_continuous_lyapunov(companion(gains).T, -weights)[-1])
-
-
-_EARLIER = "_target_earlier"
-
-
-def _earlier_targets(built: Built) -> Block:
-    """Block (target, time, measured time) -> the target that the measured state was led to; before the run the first one."""
-    plant, period, pairs = built.plant, built.period, built.pairs
-    queue = Queue(2 * built.pairs.dead_time.longest / period + built.problem.sensing.delay(plant, period))
-    target, time = like(plant.output, "_target"), plant.time
-    first = np.asarray(built.problem.reference.function(plant)(0.0)[0].full()).ravel()
-    memory = queue.memory("targets", target.elements, tuple(map(float, first)))
-
-    def step(s: Signals) -> dict[str, Expression]:
-        column, remembered = queue.column(s, "targets", s._target)
-        ahead = s.time - s._measured_time  # of a prediction
-        return {_EARLIER: queue.at(column, target.size, (ahead + pairs.late) / period), **remembered}
-
-    reads = Layout((target, time, measured(time)))
-    return Block("earlier_targets", reads, Layout((like(target, _EARLIER),)), step, Layout(memory))
 
 
 def _late(built: Built) -> bool:
