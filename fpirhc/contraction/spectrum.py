@@ -5,7 +5,6 @@ J is that of the equations, of a cycle of a reality differentiated through its i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TypeAlias
@@ -23,7 +22,6 @@ from fpirhc.task.problem import Problem
 
 Array: TypeAlias = np.ndarray
 
-LARGEST_SAMPLE = 2000  # cycles of a run whose eigenvalues are computed; longer runs are thinned evenly
 _NO_SIGN = 1e-9  # real parts below this share of the largest eigenvalue have no sign
 
 
@@ -162,28 +160,6 @@ def _response(
         values[count] = shown(state, *held) / problem.period**count
         state = advance(state, *held)
     return ca.vertcat(*(values[count][k] for k, count in enumerate(counts.values())))
-
-
-def factors_along(cycles: int, jacobians_at: Callable[[Array], Array], effective_gain: float) -> Array:
-    """Return the predicted factor max|1 - a lambda| of every cycle of a run, shape (cycles,); every entry is a number.
-
-    Long runs are evaluated at `LARGEST_SAMPLE` cycles, and in between the last value holds. Where J is singular or not
-    finite nothing contracts, and the factor is 1.
-
-    Args:
-        jacobians_at: function of the numbers of some cycles -> their Jacobians, shape (cycles, n, n).
-    """
-    rows = _thinned(cycles)
-    jacobians = jacobians_at(rows)
-    finite = np.isfinite(jacobians).all(axis=(1, 2))
-    factors = np.ones(len(rows))
-    factors[finite] = np.abs(1 - effective_gain * np.linalg.eigvals(jacobians[finite])).max(axis=1)
-    return factors[np.searchsorted(rows, np.arange(cycles), side="right") - 1]
-
-
-def _thinned(cycles: int) -> Array:
-    """Numbers of at most `LARGEST_SAMPLE` cycles, evenly chosen, with the first and the last."""
-    return np.unique(np.linspace(0, cycles - 1, min(cycles, LARGEST_SAMPLE)).astype(int))
 
 
 def predicted_factor(eigenvalues: Array, effective_gain: float) -> float:

@@ -22,7 +22,6 @@ import numpy as np
 
 from fpirhc.errors import FpirhcError
 from fpirhc.report.figures import colours_of, contraction_figures
-from fpirhc.report.terminal import settings_in_force
 from fpirhc.simulation.drawing import BANDS, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import player
 from fpirhc.studies.verdict import IN_FULL, Outcome
@@ -66,7 +65,6 @@ def render(comparison: Comparison) -> str:
     for e in comparison.entries:
         if e.run.spans():
             slots.setdefault(e.run.layout["desired"].elements, []).append(e.name)
-    changed = [f"{e.name}: {text}" for e in comparison.entries for text in settings_in_force(e.run)]
     return render_page(
         "comparison.html",
         comparison.view,
@@ -79,7 +77,6 @@ def render(comparison: Comparison) -> str:
             Image(one.address, f"{one.axes[0].get_title()}: {one.axes[0].get_ylabel()}")
             for one in contraction_figures(comparison)
         ],
-        in_force=changed,
     )
 
 
@@ -217,7 +214,6 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
                 "name": e.name,
                 "color": colours[e.name],
                 "slots": [[*_round(span[:2]), span[2]] for span in spans] if len(spans) <= INTERVALS else [],
-                "changes": _round([time for time, _ in e.run.in_force[1:]]),
                 "ended": bool(e.run.stop),
             }
             for e in entries

@@ -226,7 +226,7 @@ def announce_backend(runs: Iterable[Run]) -> None:
 def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Path]) -> None:
     """Print what speaks against its adaptation, one run's metrics and the paths of its files."""
     show_harm(harm)
-    for text in (*settings_in_force(run), *set_points_in_force(run)):
+    for text in set_points_in_force(run):
         say(text)
     for column in columns([metrics]):
         say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
@@ -235,12 +235,6 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Pa
     for text in (*metrics.broken.values(), *run.remarks):
         say(text)
     say(f"saved: {', '.join(map(str, saved))}", wrap=False)
-
-
-def settings_in_force(run: Run) -> list[str]:
-    """Return one line per time from which other live settings were in force."""
-    lines = [(time, ", ".join(f"{path} = {value:g}" for path, value in own.items())) for time, own in run.in_force]
-    return [f"settings from {time:g} {run.time_unit}: {text}" for time, text in lines]
 
 
 def set_points_in_force(run: Run) -> list[str]:

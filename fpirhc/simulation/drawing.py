@@ -74,15 +74,11 @@ def draw_bands(axis: Axes, run: Run) -> None:
         axis.axvspan(start, end, color=BANDS[slot % len(BANDS)], alpha=0.12, lw=0, label=f"slot {name}")
 
 
-def thinned(values: np.ndarray, points: int = _POINTS) -> np.ndarray:
-    """Return every n-th row, about `points` in all."""
-    return values[:: max(1, values.shape[0] // points)]
-
-
 def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
     name = literal(f"{label} [{run.unit(column)}]")
-    axis.plot(thinned(run.time), thinned(run[column]), style, color=color, lw=1, label=name)
+    every = slice(None, None, max(1, run.cycles // _POINTS))
+    axis.plot(run.time[every], run[column][every], style, color=color, lw=1, label=name)
     axis.grid(visible=True, alpha=0.25)
 
 

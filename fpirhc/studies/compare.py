@@ -31,7 +31,6 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
-from fpirhc.simulation.tables import Changes
 from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
 from fpirhc.studies.objective import objective
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings
@@ -182,7 +181,6 @@ def compare(
     compiled: bool | None = True,
     command: str = "",
     progress: Progress | None = None,
-    changes: Mapping[str, Changes] | None = None,
 ) -> Comparison:
     """Run the task's controllers with the same disturbances and return their results.
 
@@ -193,12 +191,8 @@ def compare(
         compiled: whether loops run as compiled C; None: where runs are long.
         command: that reproduces the comparison.
         progress: called with (controller, cycles done, cycles in all).
-        changes: of live settings by controller and time.
     """
-    begin, selected, changes = time.perf_counter(), select(task, controllers), changes or {}
-    mistakes = Mistakes("changes")
-    mistakes.unknown("controller", changes, selected)
-    mistakes.raise_if_any()
+    begin, selected = time.perf_counter(), select(task, controllers)
     check_gains(task, selected)
     problem, skipped = task.problem, dict[str, str]()
     aim = objective(task.headline_metric, task.metrics, problem)
@@ -206,12 +200,12 @@ def compare(
     with compiling_ahead() as compiling:
         for name in selected:
             try:
-                rows.compose(name, changes.get(name, {}), compiling)
+                rows.compose(name, compiling)
             except FpirhcError as error:
                 skipped[name] = str(error)
         for name in rows.composed:
             try:
-                entries.append(rows.entry(name, changes.get(name, {}), progress and partial(progress, name)))
+                entries.append(rows.entry(name, progress and partial(progress, name)))
             except FpirhcError as error:
                 skipped[name] = str(error)
             except KeyboardInterrupt:
@@ -242,11 +236,10 @@ class _Rows:
         adaptive = [n for n, one in controllers.items() if one.deformation.adapts and pair_of(controllers, n)]
         self._asked = task.headline[1] if task.headline and task.headline[1] in adaptive else next(iter(adaptive), None)
 
-    def compose(self, name: str, changes: Changes, compiling: Callable[..., None]) -> None:
+    def compose(self, name: str, compiling: Callable[..., None]) -> None:
         """Compose a loop, and its step by hand, and start the compiler for them."""
         problem = self._task.problem
-        live = tuple(dict.fromkeys(path for numbers in changes.values() for path in numbers))
-        loop = ComposedLoop.of(problem, resolved(problem, self._controllers[name]), live)
+        loop = ComposedLoop.of(problem, resolved(problem, self._controllers[name]))
         facts: dict[str, Any] = {"bounded": False, "broken": []}
         step = attempted("the time of a cycle", ComposedStep.of, problem, loop.live.controller, **facts)
         self.composed[name] = loop, step
@@ -261,11 +254,11 @@ class _Rows:
             ready = self._loops[name] = self.composed[name][0].simulator(self._compiled)
         return ready
 
-    def entry(self, name: str, changes: Changes, progress: Callable[[int, int], None] | None) -> Entry:
+    def entry(self, name: str, progress: Callable[[int, int], None] | None) -> Entry:
         """Run a controller; a part that breaks is told, and loses no run."""
         problem, broken = self._task.problem, list[str]()
         part, loop = partial(attempted, broken=broken), self._loop(name)
-        run = loop.run(seed=self._seed, name=name, progress=progress, changes=changes)
+        run = loop.run(seed=self._seed, name=name, progress=progress)
         ready, metrics = loop.controller, measure(problem, run, self._task.metrics)
         pair = pair_of(self._controllers, name) if ready.deformation.adapts else None
         pair = pair if pair in self.composed else None
@@ -273,8 +266,7 @@ class _Rows:
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
         cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-        asked = name == self._asked and not changes
-        noise = part("the run with noise", cost_of_noise, problem, ready, run) if asked else None
+        noise = part("the run with noise", cost_of_noise, problem, ready, run) if name == self._asked else None
         left = limits_left(problem, run)
         told = [one.sentence for one in left]
         notes = (*told, *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())

@@ -90,13 +90,8 @@ class Certificate:
 
 
 @checked_call
-def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
-    """Return what is known about a plan.
-
-    Args:
-        plan: a solved horizon.
-        gain: effective gain of the iteration; 1: full Gauss-Newton steps.
-    """
+def certify(plan: Plan) -> Certificate:
+    """Return what is known about a plan, a solved horizon, for full Gauss-Newton steps."""
     _, stationarity, feasibility = plan.verify()
     slope, hessian = _second_order(plan, plan.inputs)
     free, held = _free(plan, plan.inputs, slope), _active_limits(plan)
@@ -108,25 +103,21 @@ def certify(plan: Plan, *, gain: float = 1.0) -> Certificate:
     root = np.linalg.cholesky(model + _ROUNDING * np.trace(model) * np.eye(model.shape[0]))
     move = np.linalg.solve(model, pull)
     values = _relative_eigenvalues(root, basis.T @ hessian @ basis)
-    further = (plan.inputs.ravel(order="F") - gain * basis @ move).reshape(plan.inputs.shape, order="F")
+    further = (plan.inputs.ravel(order="F") - basis @ move).reshape(plan.inputs.shape, order="F")
     inputs = np.clip(further, *(b[:, None] for b in plan.bounds))
     slope_there, hessian_there = _second_order(plan, inputs)
     same = bool(np.all(_free(plan, inputs, slope_there) == free))
     beyond = _relative_eigenvalues(root, basis.T @ hessian_there @ basis)
-    factor, unit = (_over_both(a, values, beyond) if same else float("inf") for a in (gain, 1.0))
+    here, there = (float(np.abs(1 - v).max()) for v in (values, beyond))
+    factor = max(here, there) + abs(here - there) if same else float("inf")
     length = float(np.sqrt(max(pull @ move, 0.0)))
-    error = gain * length / (1 - factor) if factor < 1 else float("nan")
+    error = length / (1 - factor) if factor < 1 else float("nan")
     spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
-    suboptimality = length**2 / (2 * (1 - unit)) + held.complementarity * held.count if unit < 1 else float("nan")
+    suboptimality = length**2 / (2 * (1 - factor)) + held.complementarity * held.count if factor < 1 else float("nan")
     least, back = float(values.min()), _largest_return(held, free)
     return Certificate(
         *(stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least), *about
     )
-
-
-def _over_both(gain: float, here: np.ndarray, there: np.ndarray) -> float:
-    one, other = (float(np.abs(1 - gain * v).max()) for v in (here, there))
-    return max(one, other) + abs(one - other)
 
 
 def _relative_eigenvalues(root: np.ndarray, hessian: np.ndarray) -> np.ndarray:

@@ -41,28 +41,6 @@ function bands(chart, spec) {
 // Whether a run that a chart shows ended early.
 const ended = (spec) => DATA.controllers.some((c) => c.ended && (spec.only ? c.name === spec.only : shown.has(c.name)));
 
-// Times at which live settings changed, in the colour of their controller.
-function changes(chart, spec) {
-  const { ctx, bbox } = chart;
-  ctx.save();
-  ctx.beginPath();
-  ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  ctx.clip();
-  ctx.setLineDash([3 * devicePixelRatio, 3 * devicePixelRatio]);
-  ctx.lineWidth = devicePixelRatio;
-  for (const c of DATA.controllers)
-    if (spec.only ? c.name === spec.only : shown.has(c.name))
-      for (const time of c.changes) {
-        const x = chart.valToPos(time, "x", true);
-        ctx.strokeStyle = colors[c.name];
-        ctx.beginPath();
-        ctx.moveTo(x, bbox.top);
-        ctx.lineTo(x, bbox.top + bbox.height);
-        ctx.stroke();
-      }
-  ctx.restore();
-}
-
 // Moving pictures show the time of the charts' cursor, and the charts' cursor is at the time that they show.
 const players = [];
 function follow(chart) {
@@ -104,7 +82,7 @@ function draw({ box, spec }) {
     axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: { sync: { key: sync.key } },
     legend: { markers: { dash: (_, k) => (series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
-    hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => changes(chart, spec)] },
+    hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });

@@ -25,7 +25,7 @@ What = str | Quantity
 
 
 @checked_call
-def InBand(what: What, low: float, high: float, *, name: str = "in_band", headline: bool = True) -> Metric:
+def InBand(what: What, low: float, high: float, *, name: str = "in_band") -> Metric:
     """Return the share of the time in which low <= s <= high, from 0 to 1; larger is better.
 
     Args:
@@ -33,44 +33,41 @@ def InBand(what: What, low: float, high: float, *, name: str = "in_band", headli
         low: smallest value of the band, in the signal's unit.
         high: largest value of the band.
         name: of the metric.
-        headline: whether it stands in short tables.
 
     Raises:
         InvalidValue: `low` is not below `high`.
     """
     if not low < high:
         raise InvalidValue(f"InBand({what!r}): low is {low:g} and high is {high:g}; expected low < high")
-    return _figure(
-        name, what, lambda s, _: np.mean((s >= low) & (s <= high)), lambda *_: "1", headline, better="larger"
-    )
+    return _figure(name, what, lambda s, _: np.mean((s >= low) & (s <= high)), lambda *_: "1", better="larger")
 
 
 @checked_call
-def TimeOver(what: What, level: float, *, name: str = "time_over", headline: bool = True) -> Metric:
+def TimeOver(what: What, level: float, *, name: str = "time_over") -> Metric:
     """Return the time during which s > level, in the problem's unit of time; arguments as in `InBand`."""
-    return _figure(name, what, lambda s, period: np.sum(s > level) * period, lambda _, time: time, headline)
+    return _figure(name, what, lambda s, period: np.sum(s > level) * period, lambda _, time: time)
 
 
 @checked_call
-def Total(what: What, *, name: str = "total", headline: bool = True) -> Metric:
+def Total(what: What, *, name: str = "total") -> Metric:
     """Return the integral of s over time, its sum over the cycles times the period: EUR for s in EUR/h; see `InBand`."""
-    return _figure(name, what, lambda s, period: np.sum(s) * period, _times, headline)
+    return _figure(name, what, lambda s, period: np.sum(s) * period, _times)
 
 
 @checked_call
-def Largest(what: What, *, name: str = "largest", headline: bool = True) -> Metric:
+def Largest(what: What, *, name: str = "largest") -> Metric:
     """Return the largest |s|; arguments as in `InBand`."""
-    return _figure(name, what, lambda s, _: np.max(np.abs(s)), lambda unit, _: unit, headline)
+    return _figure(name, what, lambda s, _: np.max(np.abs(s)), lambda unit, _: unit)
 
 
 @checked_call
-def Nadir(what: What, *, name: str = "nadir", headline: bool = True) -> Metric:
+def Nadir(what: What, *, name: str = "nadir") -> Metric:
     """Return the lowest s; larger is better, as of the frequency of a grid; arguments as in `InBand`."""
-    return _figure(name, what, lambda s, _: np.min(s), lambda unit, _: unit, headline, better="larger")
+    return _figure(name, what, lambda s, _: np.min(s), lambda unit, _: unit, better="larger")
 
 
 @checked_call
-def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) -> Metric:
+def Overshoot(judged: str, *, name: str = "overshoot") -> Metric:
     """Return how far a judged quantity y goes beyond its reference r, in the direction in which the reference last changed.
 
     It is max(sign_k (y_k - r_k), 0) over the cycles; sign_k is that of the last change of r, at first that of r_0 - y_0.
@@ -78,7 +75,6 @@ def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) ->
     Args:
         judged: coordinate or output, by name.
         name: of the metric.
-        headline: whether it stands in short tables.
     """
 
     def beyond(problem: Problem, run: Run) -> float:
@@ -89,7 +85,7 @@ def Overshoot(judged: str, *, name: str = "overshoot", headline: bool = True) ->
         return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
 
     unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
-    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=headline)
+    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=True)
 
 
 def _figure(
@@ -97,7 +93,6 @@ def _figure(
     what: What,
     figure: Callable[[np.ndarray, float], float | np.floating],
     unit: Callable[[str, str], str],
-    headline: bool,
     better: Better = "smaller",
 ) -> Metric:
     """The metric of one signal: `figure` of its values and the period, `unit` of its unit and that of time."""
@@ -112,7 +107,7 @@ def _figure(
         return float(figure(values[measured_cycles(problem, run)], problem.period))
 
     whole = partial(_of_whole_runs, function)
-    return Metric(name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=headline, better=better)
+    return Metric(name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=True, better=better)
 
 
 def _times(unit: str, time: str) -> str:
