@@ -89,6 +89,7 @@ def test_learning_ends_the_tracking_error(name, motion):
     """Without learning 0.15 to 0.17 m for ever; with it less than a tenth of that in the last 5 s, excited or not."""
     assert largest(ran("CT", motion), 15, 20) > 0.14
     assert largest(ran(name, motion), 15, 20) < 0.01
+    assert (CONTROLLERS[name].learns, CONTROLLERS["CT"].learns) == (True, False)
 
 
 @pytest.mark.parametrize("name", ["Slotine-Li", "NLMS", "NLMS+FPI"])

@@ -188,6 +188,7 @@ def test_what_counts_and_what_comes_first():
     assert str(comparison.outcome) == str(found[0].outcome) == "no difference"
     best = [row.cells[0] for row in table.rows if "rms error y [m]" in {table.columns[k].head for k in row.best}]
     assert best == ["B+FPI"]  # which is marked
+    assert [text.partition(":")[0] for text in comparison.view.lists["Flags"]] == ["B+FPI", "A+FPI"]
     assert [f.pair[1] for f in found if f.pair] == ["B+FPI", "A+FPI"] * 2
     [share] = [s for f in found for s in re.findall(r"^The smallest rms error is that of B\+FPI: (\S+) % of", f.text)]
     assert float(share) == pytest.approx(100 * math.sqrt(((0.2 / 1.757) ** 2 + (0.2 / 2) ** 2) / 2), rel=0.01)
@@ -267,6 +268,22 @@ def test_errors_are_measured_against_the_motion_that_is_wanted(changes, scale):
     assert 100 * found["law"].errors["y"] / share == pytest.approx(scale, rel=1e-2)
 
 
+def test_a_controller_that_has_the_exact_model_is_a_bound_and_wins_nothing():
+    """Where the others' is wrong, and it neither adapts nor is beaten: a faster law has a smaller error, and that is said."""
+    law, fast = (fp.ComputedTorque(fp.Exponential(rate=rate)) for rate in (2.0, 20.0))
+    laws = {"law": law, "exact": fp.ExactModel(law), "fast": fast}
+    laws["exact+FPI"] = fp.ExactModel(law.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.4))))
+    one = tank(start={"y": 0.5})
+    found = fp.compare(tasks.made(one, laws), seed=0, compiled=False)
+    assert [e.name for e in found.entries if e.exact] == ["exact"]
+    said, table = " ".join(found.verdict), found.view.tables[0]
+    assert "The smallest rms error of those with the wrong model is that of fast" in said
+    assert "exact is no bound here; smaller errors: fast. Its cost or its rate is another." in said
+    assert {row.cells[0] for row in table.rows if row.best} <= {"fast", "law"}
+    right = fp.compare(tasks.made(one.with_exact(one.plant.approximate), laws), seed=0, compiled=False)
+    assert not any(e.exact for e in right.entries)
+
+
 @pytest.mark.parametrize(
     ("name", "judged"), [("cart_pole", ("cart", "angle")), ("chain_of_masses", ("xe", "ye", "ze")), ("two_mass", None)]
 )
@@ -315,7 +332,8 @@ def test_a_hard_limit_that_is_left_is_red_for_every_controller(tmp_path, monkeyp
     found = fp.compare(task, seed=0, compiled=False)
     left = [name for name in task.controllers if np.abs(found[name].run["plant_state.x'"]).max() > 1.5 * 1.002]
     assert left == ["law", "law+FPI"]
-    assert [row.style for row in found.view.tables[0].rows] == ["red", "red", ""]
+    rows = [(row.style, "leaves x'" in row.cells[-1]) for row in found.view.tables[0].rows]
+    assert rows == [("red", True), ("red", True), ("", False)]
     first, speeds = found.findings[0], found["law"].run["plant_state.x'"]
     assert (str(first.outcome), first.ratios["x"] < 0.1) == ("hard limit left", True)
     assert first.text.startswith(f"law leaves a limit: x' reaches {speeds[np.abs(speeds).argmax()]:.4g} m/s, beyond")
