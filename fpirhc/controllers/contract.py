@@ -65,7 +65,6 @@ class Planner:
 
     optimiser: Optimiser  # that finds the plan
     cost: Cost | None  # of the plan; None: the problem's
-    restarts: bool  # whether every plan starts from the measured state
     # the law that keeps the plant on the planned motion between plans; None: the plan's first response is the desired one
     tracking: Tracking | None
     # whether a plan on outputs starts at the state at which the model has the measured ones; None: where the response is
@@ -75,6 +74,11 @@ class Planner:
     # whether a change of the model's parameters changes the command in every cycle, also between plans
     follows_model: bool = False
     independent: bool = False  # whether a plan depends on the plans before it alone, whatever the plant does
+
+    @property
+    def restarts(self) -> bool:
+        """Whether every plan starts from the measured state."""
+        return self.tracking is None
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""

@@ -77,9 +77,9 @@ class RecedingHorizon(Controller):
 
     @property
     def planner(self) -> Planner:
-        restarts, law = self.tracking is None, self.tracking
-        facts = (not restarts or self.consistent, self.deformation.adapts, self.follows_model, self.room is not None)
-        return Planner(self.optimiser, self.cost, restarts, law, *facts)
+        law = self.tracking
+        facts = (law is not None or self.consistent, self.deformation.adapts, self.follows_model, self.room is not None)
+        return Planner(self.optimiser, self.cost, law, *facts)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         sensing, planner = problem.sensing, self.planner
