@@ -47,14 +47,6 @@ def test_a_run_with_lost_samples_is_its_replay_through_a_stepper(kind):
     assert 0.1 < lost.mean() < 0.5
 
 
-def test_lost_samples_cost_what_they_cost_a_machine():
-    """Half of the samples lost: who believes the last value for a new one is metres away (6.6 m), and this controller is not."""
-    sensing = fp.Sensing({"q1": LOSES, "q2": LOSES}, fp.PositionDifference())
-    run = fp.simulate(replace(TASK.problem, duration=4.0, sensing=sensing), ADAPTIVE, seed=0)
-    assert run.stop is None
-    assert np.abs(run["true_error"][2000:]).max() < 0.01
-
-
 @pytest.mark.parametrize("estimator", [fp.Measured(), fp.PositionDifference()])
 def test_a_sample_out_of_range_is_skipped_for_as_long_as_it_is_outside(estimator):
     """A sensor at its rail for 200 cycles: the command is held, every cycle says so, and afterwards it goes on."""
