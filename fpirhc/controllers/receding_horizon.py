@@ -77,9 +77,13 @@ class RecedingHorizon(Controller):
 
     @property
     def planner(self) -> Planner:
-        law = self.tracking
-        facts = (law is not None or self.consistent, self.deformation.adapts, self.follows_model, self.room is not None)
-        return Planner(self.optimiser, self.cost, law, *facts)
+        facts = (
+            self.tracking is not None or self.consistent,
+            self.deformation.adapts,
+            self.follows_model,
+            self.room is not None,
+        )
+        return Planner(self.optimiser, self.cost, self.tracking, *facts)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         sensing, planner = problem.sensing, self.planner

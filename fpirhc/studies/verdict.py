@@ -97,9 +97,7 @@ class Yardstick:
 
     scales: Mapping[str, float]  # the ranges
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
-    resting: Mapping[
-        str, float
-    ]  # of what rests the set-point's size, or that of the movement left alone under disturbances
+    resting: Mapping[str, float]  # the set-point's size of what rests; under disturbances, of the movement left alone
     span: str  # of time in which errors count
 
     @staticmethod
@@ -143,10 +141,6 @@ def _growth(pair: Pair) -> float:
 
 def _unsolved(pair: Pair) -> float:
     return pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles
-
-
-def _saturates(pair: Pair) -> float:
-    return pair.adaptive.metrics["at_limit"][""]
 
 
 def _moved(pair: Pair) -> dict[str, float]:
@@ -193,7 +187,7 @@ FLAGS = (
     Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
     Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
-    Flag(_saturates, 0.2, "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
+    Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], 0.2, "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
     Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation: it chatters", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),

@@ -79,8 +79,7 @@ def unknown_rms(true: int, deformation: Deformation, predicted: float = 0.025) -
 COVERING = fp.Increment.within(FASTEST, 50)
 
 
-def test_within_is_in_the_middle():
-    """Of all dead times up to the longest one, by half of it wrong either way."""
+def test_within_is_in_the_middle_of_all_dead_times_up_to_the_longest():
     assert fp.Increment.within(FASTEST, 7) == fp.Increment(FASTEST, cycles=3.5, uncertainty=4)
 
 

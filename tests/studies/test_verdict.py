@@ -123,8 +123,7 @@ def test_outcomes_and_ratios():
     """Ratios of the errors that count, the largest first; an outcome is what they say, and a run that ends loses."""
     found = findings(compared({name: row[:2] for name, row in OUTCOMES.items()}))
     said = {name: (str(one.outcome), list(one.ratios)) for name, one in found.items()}
-    wanted = {name: (row[2], list(row[3]) if row[3] is not None else said[name][1]) for name, row in OUTCOMES.items()}
-    assert said == wanted
+    assert said == {n: (row[2], list(row[3]) if row[3] is not None else said[n][1]) for n, row in OUTCOMES.items()}
     for name, (*_, ratios) in OUTCOMES.items():
         assert ratios is None or dict(found[name].ratios) == pytest.approx(ratios, rel=1e-3)
 
