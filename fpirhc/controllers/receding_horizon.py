@@ -77,13 +77,9 @@ class RecedingHorizon(Controller):
 
     @property
     def planner(self) -> Planner:
-        facts = (
-            self.tracking is not None or self.consistent,
-            self.deformation.adapts,
-            self.follows_model,
-            self.room is not None,
-        )
-        return Planner(self.optimiser, self.cost, self.tracking, *facts)
+        law, consistent = self.tracking, self.tracking is not None or self.consistent
+        facts = consistent, self.deformation.adapts, self.follows_model, self.room is not None
+        return Planner(self.optimiser, self.cost, law, *facts)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         sensing, planner = problem.sensing, self.planner
