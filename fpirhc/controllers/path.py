@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.plant.integrators import Integrator, RungeKutta4
+from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Evidence, Model, values_of
 from fpirhc.symbolic.block import Block
@@ -302,16 +302,12 @@ def believe_block(problem: Problem, raw: Signal, shown: np.ndarray) -> Block:
 
 def observed_model(problem: Problem) -> Model:
     """Return what the observer is built from: the model over a cycle, or at rest where a sample still shows the start."""
-    plant, integrator = problem.plant, believed_integrator(problem)
+    plant, integrator = problem.plant, problem.integrator
+    integrator = RungeKutta4() if integrator.opaque else integrator  # an opaque step is a call without a Jacobian
     (x, u, p), w, moves = plant.symbols(), ca.SX.sym("w", len(plant.names)), ca.SX.sym("moves")
     later = ca.if_else(moves, integrator.step(plant, problem.period)(x, u, p, w), x)
     move = ca.Function("fpirhc_move", [x, u, p, w, moves], [later])
     return Model(plant, move, problem.start_state, problem.sensing.measures(plant))
-
-
-def believed_integrator(problem: Problem) -> Integrator:
-    """Return the integrator of the model: the problem's, or a Runge-Kutta step where that is a call without Jacobian."""
-    return RungeKutta4() if problem.integrator.opaque else problem.integrator
 
 
 @dataclass(frozen=True, eq=False)

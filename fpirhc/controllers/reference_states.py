@@ -107,11 +107,8 @@ def largest_response(problem: Problem) -> tuple[float, ...]:
     """
     free = (float("inf"),) * len(problem.plant.controlled_names)
     largest = free if problem.plant.equations.hidden else _largest_response(problem)
-    return tuple(_rounded_up(value) if 0 < value < math.inf else value for value in largest)
-
-
-def _rounded_up(value: float) -> float:
-    return float(2.0 ** (math.ceil(_STEPS * math.log2(value)) / _STEPS))
+    rounded = (2.0 ** (math.ceil(_STEPS * math.log2(v)) / _STEPS) if 0 < v < math.inf else v for v in largest)
+    return tuple(map(float, rounded))
 
 
 _STEPS = 8  # per doubling

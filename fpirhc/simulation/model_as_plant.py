@@ -34,7 +34,8 @@ def with_believed_way(problem: Problem, deformation: Deformation) -> Problem:
     that the problem states is a fact, and stays. A lag before a map is left out.
     """
     form = deformation.form
-    return _with_lag(_with_dead_time(problem, form), form) if form.modelled else problem
+    lags = _each(form.lag, len(problem.plant.inputs))
+    return _behind(_with_dead_time(problem, form), lags) if form.modelled else problem
 
 
 def _with_dead_time(problem: Problem, form: Form) -> Problem:
@@ -52,10 +53,6 @@ def behind_stated_lag(problem: Problem) -> Problem:
     if not any(lag.values()):
         return problem
     return _behind(problem.of_model, tuple(lag.get(name, 0.0) for name in problem.plant.inputs))
-
-
-def _with_lag(problem: Problem, form: Form) -> Problem:
-    return _behind(problem, _each(form.lag, len(problem.plant.inputs)))
 
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:

@@ -183,7 +183,7 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
         enough = getattr(s, _FULL)
         values[response.name] = ca.vertcat(
             *(
-                ca.if_else(enough > order - 0.5, _difference(samples[c], order) / period**order, 0)
+                ca.if_else(enough > order - 0.5, combine(backward_difference(order), samples[c]) / period**order, 0)
                 for c, order in orders.items()
             )
         )
@@ -192,7 +192,3 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
         return values
 
     return replace(sense, step=step, memory=sense.memory + Layout((past, known)))
-
-
-def _difference(samples: Sequence[Expression], order: int) -> Expression:
-    return combine(backward_difference(order), samples)
