@@ -247,8 +247,8 @@ class Plant(Checked):
 
     @property
     def response_age(self) -> int:
-        """How many cycles before a measured response its state was: at one instant, or one step earlier on a map."""
-        return 0 if self.step is None else 1
+        """How many cycles before a measured response its state was: one where it is a difference of a map, else none."""
+        return 0 if self.step is None or self.at_once else 1
 
     @cached_property
     def differences(self) -> dict[str, int]:

@@ -224,7 +224,7 @@ def _check_disturbances(problem: Problem) -> None:
         with mistakes.caught(f"'{name}': "):
             one.values(instants, np.random.default_rng(0))
     for name, order in problem.disturbed_outputs.items():
-        if problem.plant.response_age * order > 1:
+        if order > 1 and problem.plant.step is not None:
             mistakes.add(
                 f"the output '{name}' of a map has relative order {order}, and its differences look ahead to unknown "
                 "disturbances; disturb a state or an input, or an output of order 1"

@@ -28,15 +28,8 @@ def grown(x: Any, u: Any, p: Any) -> dict[str, Any]:
 
 def fishery(**changes: Any) -> fp.Plant:
     """The stock as a map with steps of 10 s."""
-    arguments = {
-        "states": {"stock": "1"},
-        "inputs": {"catch": "1/s"},
-        "parameters": FISH,
-        "next": grown,
-        "step": T,
-        "ranges": {"stock": (0.0, 2.0)},
-    }
-    return fp.Plant.discrete(**{**arguments, **changes})
+    given = {"states": {"stock": "1"}, "inputs": {"catch": "1/s"}, "parameters": FISH, "next": grown, "step": T}
+    return fp.Plant.discrete(**{**given, "ranges": {"stock": (0.0, 2.0)}, **changes})
 
 
 def task(plant: fp.Plant | None = None, **changes: Any) -> fp.Problem:
@@ -98,6 +91,15 @@ def test_a_run_is_the_loop_by_hand(steps: int, gain: float) -> None:
     tolerance = 1e-13 if steps == 1 else 1e-9  # Newton's method of both sides
     assert np.abs(run["state"][:, 0] - states).max() <= tolerance
     assert np.abs(run["command"][:, 0] - commands).max() <= tolerance
+
+
+def test_a_right_map_that_answers_at_once_leaves_nothing_to_adapt() -> None:
+    right = {name: fp.Parameter(p.exact, p.exact, "1") for name, p in FISH.items()}
+    plant = fishery(parameters=right, outputs={"y": fp.Output("1", lambda x, u, p: x.stock + u.catch)})
+    problem = task(plant, reference=fp.Trajectory(lambda t: {"y": 0.5 + 0.1 * ca.sin(2e-3 * t)}))
+    forms = fp.Identity(), fp.ModelReferenced(fp.Affine(gain=-0.5))
+    runs = [simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), one)) for one in forms]
+    assert np.abs(runs[1]["command"] - runs[0]["command"]).max() <= 1e-12
 
 
 def chain(order: int) -> fp.Plant:
