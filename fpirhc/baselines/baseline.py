@@ -246,5 +246,5 @@ def problems_here(folder: Path) -> list[Path]:
         files = [one for one in sorted(inner.glob("*.py")) if one.stem not in unchecked]
         found += [f for f in files if "controllers = " in f.read_text(encoding="utf-8") and not missing(f)]
     if not found:
-        raise BaselineError(f"no problem to check in '{place}'")
+        raise BaselineError(f"no problem to check in '{place}'; name one, as in fpirhc check two_mass")
     return found

@@ -90,7 +90,8 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
         for text in texts:
             say(f"- {text}")
     notes = sum(map(len, view.lists.values()))
-    more = "" if verbose else f" ({notes} notes there, or by --verbose)" if notes else " (more by --verbose)"
+    told = f"{notes} note{'s' * (notes > 1)} there, or by --verbose" if notes else "more by --verbose"
+    more = "" if verbose else f" ({told})"
     say(f"report: {report}", more=more, wrap=False)
 
 
