@@ -247,8 +247,8 @@ def probe(
     """Measure an unknown plant and propose an adaptation. Exit code 1 where none is proposed."""
     task = _task(problem)
     from fpirhc.errors import NotSupported, require
-    from fpirhc.probing.probe import probe as ask
-    from fpirhc.report.terminal import show_probe
+    from fpirhc.probing import probe as probing
+    from fpirhc.report.terminal import progress_bars, show_probe
     from fpirhc.studies.compare import select
     from fpirhc.studies.view import to_json
 
@@ -260,7 +260,9 @@ def probe(
     require(able, "probe needs a controller with a deformation: choose another one by --controller")
     name, one = able[0], task.controllers[able[0]]
     settings: dict[str, Any] = {"cycles": cycles, "amplitude": amplitude, "recording": recording, "chatter": chatter}
-    answer = ask(task.problem, one, trials=trials, seed=seed, **settings)
+    print(f"fpirhc: {probing.runs_made(task.problem, trials=trials, **settings)}", file=sys.stderr)
+    with progress_bars() as progress:
+        answer = probing.probe(task.problem, one, trials=trials, seed=seed, progress=progress, **settings)
     print(to_json(answer.plain)) if json else show_probe(f"{task.name}: probe with {name}", answer)
     raise typer.Exit(0 if answer.deformation is not None else 1)
 

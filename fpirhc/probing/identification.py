@@ -16,14 +16,13 @@ import numpy as np
 from scipy.signal import lfilter
 
 from fpirhc.errors import InvalidValue
+from fpirhc.sensing.base import spline_weights
 
-_ENOUGH = 5.0  # difference of 2 log L, with which a dead time or a lag is still in its interval
-_WIDER = 1.5  # factor of all intervals: no body is exactly of this form
-_MOST_DEAD = 10  # cycles that are searched first
-_SETTLED = 5  # cycles after the longest dead time that count
-_COARSE_LAGS, _FINE_LAGS = 12, 25
-_NOISES = ((1, 0), (2, 0), (1, 1), (2, 1))  # integrations of the drift, differences of the noise
-_COARSE, _FINE = np.arange(-8, 3.1, 1.0), np.arange(-8, 3.1, 0.5)  # log10 of the drift's share
+# Difference of 2 log L with which a dead time or a lag is in its interval; factor of all: no body is exactly of this form.
+_ENOUGH, _WIDER = 5.0, 1.5
+_MOST_DEAD, _LAGS = 10, 50  # cycles that are searched first; lags from a part of a cycle to a fifth of the record
+_SETTLED, _DRIFTS = 5, (1, 2)  # cycles after the longest dead time that do not count; integrations
+_SHARES = np.arange(-8, 3.1, 0.5)  # log10 of the drift's share
 
 
 @dataclass(frozen=True)
@@ -42,11 +41,11 @@ class Channel:
     gains: tuple[Interval, ...]  # lambda_ij of every model response j
     dead_time: Interval  # d, cycles
     lag: Interval  # tau, in the problem's unit of time
-    noise: float  # rms of what is no response of the plant
+    noise: float  # rms of what is no response of the plant, in the unit of what is measured
     drift: np.ndarray  # what is, and the model does not have: w by cycle
-    drifting: float = 0.0  # rms change of w per square root of the unit of time
-    edge: str = ""  # what the record is too short to bound: "dead time", "lag", or nothing
-    ends: tuple[Fit, ...] = ()  # the best, and the likeliest at the ends of dead time and lag
+    drifting: float  # rms change of w per square root of the unit of time
+    edge: str  # what the record is too short to bound: "dead time", "lag", or nothing
+    ends: tuple[Fit, ...]  # the best, and the likeliest at the ends of dead time and lag
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,35 +62,33 @@ class Fit:
     innovation: float
 
 
-def identify(measured: np.ndarray, modelled: np.ndarray, period: float, usable: np.ndarray) -> tuple[Channel, ...]:
-    """Return what every response f, shape (cycles, n), is made of, from m of the same cycles, and which of them count."""
-    return tuple(_channel(f, modelled, period, usable) for f in measured.T)
+def identify(
+    measured: np.ndarray, modelled: np.ndarray, period: float, usable: np.ndarray, differences: Sequence[int],
+) -> tuple[Channel, ...]:  # fmt: skip
+    """Return what every response f, shape (cycles, n), is made of, from m of the same cycles, and which of them count.
+
+    `differences`: how often each is a difference of what is measured, with noise that is one too; m is averaged alike.
+    """
+    averages = (lfilter(spline_weights(c), 1.0, modelled - modelled[0], axis=0) + modelled[0] for c in differences)
+    pairs = zip(measured.T, averages, differences, strict=True)
+    return tuple(_channel(f, m, period, usable, c) for f, m, c in pairs)
 
 
 def require_cycles(cycles: int) -> None:
     """Raise if these are too few."""
     if cycles < 40:
-        raise InvalidValue(
-            f"probe: {cycles} cycles are too few to tell a gain from noise; expected at least 40, 300 are usual"
-        )
+        few = f"probe: {cycles} cycles are too few to tell a gain from noise"
+        raise InvalidValue(f"{few}; expected at least 40, 300 are usual")
 
 
-def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> Channel:
-    cycles, most = len(f), _MOST_DEAD
+def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray, differences: int) -> Channel:
+    cycles, most, noises = len(f), _MOST_DEAD, [(p, c) for c in (0, max(differences, 1)) for p in _DRIFTS]
+    lags = np.r_[0.0, 0.1 * period, np.geomspace(0.2 * period, 0.2 * cycles * period, _LAGS)]
     while True:  # an estimate at the edge of the search widens it
-        lags = np.r_[0.0, np.geomspace(0.4 * period, 0.2 * cycles * period, _COARSE_LAGS)]
-        fits = _profile(f, m, period, good, range(most + 1), lags, _COARSE)
-        best = _likeliest(fits)
-        if best.dead < most - 1 or 2 * most > cycles // 4:
+        fits = _profile(f, m, period, good, noises, range(most + 1), lags)
+        if _likeliest(fits).dead < most - 1 or 2 * most > cycles // 4:
             break
         most *= 2
-    near = _near(fits, 40.0)
-    deads = range(max(min(one.dead for one in near) - 1, 0), min(max(one.dead for one in near) + 2, most + 1))
-    low = max((tau for tau in lags if tau < min(one.lag for one in near)), default=0.0)
-    high = min((tau for tau in lags if tau > max(one.lag for one in near)), default=float(lags[-1]))
-    fine = np.linspace(low, high, _FINE_LAGS) if low < 0.4 * period else np.geomspace(low, high, _FINE_LAGS)
-    fits += _profile(f, m, period, good, list(deads)[:_MOST_DEAD], fine, _FINE)
-
     best, near, nearest = _likeliest(fits), _near(fits, _ENOUGH * _WIDER**2), _near(fits, _ENOUGH)
     beside = [_likeliest(one for one in fits if one.lag == tau) for tau in _around(fits, nearest)]
     within = np.array([one.gains for one in (*nearest, *beside)])
@@ -100,12 +97,15 @@ def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray) -> C
     dead = Interval(best.dead, min(one.dead for one in near), max(one.dead for one in near))
     lag = Interval(best.lag, *_around(fits, near))
     root = abs(_whitener(sum(best.noise), best.ratio)[-1])
-    noise = math.sqrt(best.innovation * root * (2 if best.noise[1] else 1))
-    drift = _smoothed(f - delayed(m, best.dead, best.lag, period) @ best.gains, *best.noise, 10.0**best.ratio)
+    size, rest = math.sqrt(best.innovation * root), f - delayed(m, best.dead, best.lag, period) @ best.gains
+    drift = _smoothed(rest, *best.noise, 10.0**best.ratio)
     moved = float(np.sqrt(np.mean(np.diff(drift[_SETTLED:]) ** 2) / period))
     at = [("dead", dead.low), ("dead", dead.high), ("lag", lag.low), ("lag", lag.high)]
     ends = (best, *(_likeliest(one for one in fits if getattr(one, what) == end) for what, end in at))
-    edge = "dead time" if dead.high >= most else "lag" if lag.high >= lags[-1] else ""
+    noise = size * (period**differences if differences else math.sqrt(1 + best.noise[1]))
+    if differences and not best.noise[1]:  # what moves at random is the plant, not the sensor
+        noise, drift = 0.0, rest
+    edge = "lag" if lag.high >= lags[-1] else "dead time" if dead.high >= most else ""
     return Channel(gains, dead, lag, noise, drift, moved, edge, ends)
 
 
@@ -119,8 +119,8 @@ def delayed(m: np.ndarray, dead: int, lag: float, period: float) -> np.ndarray:
 
 
 def _profile(
-    f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray,
-    deads: Sequence[int], lags: np.ndarray, ratios: np.ndarray,
+    f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray, noises: Sequence[tuple[int, int]],
+    deads: Sequence[int], lags: np.ndarray,
 ) -> list[Fit]:  # fmt: skip
     """The best gains at every point of a grid; all points of one noise are whitened together."""
     points = [(d, float(tau)) for d in deads for tau in lags]
@@ -128,11 +128,11 @@ def _profile(
     counts = good.copy()
     counts[: min(max(deads) + _SETTLED, len(f) // 3)] = False
     channels = []
-    for p, c in _NOISES:
+    for p, c in noises:
         x, y = (np.diff(one, p, axis=-1) for one in (rows, f))
         some = counts[p:]
         total = int(some.sum())
-        for ratio in ratios:
+        for ratio in _SHARES:
             whitener = _whitener(p + c, float(ratio))
             xw, yw = (lfilter([1.0], whitener, one, axis=-1)[..., some] for one in (x, y))
             square = xw @ xw.transpose(0, 2, 1)
@@ -176,35 +176,29 @@ def _whitener(order: int, ratio: float) -> np.ndarray:
 
 
 def _smoothed(rest: np.ndarray, integrations: int, differences: int, ratio: float) -> np.ndarray:
-    """The drift in what the gains leave: the smoother of its own model, by penalised least squares."""
+    """The drift in what the gains leave: without the noise that makes itself and the drift's jumps the smallest together."""
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
 
+    def difference(count: int, size: int) -> sparse.spmatrix:
+        return sparse.diags(
+            np.atleast_1d(np.poly(np.ones(count))), range(count + 1), shape=(size, size + count), format="csc"
+        )
+
     size = len(rest)
-    jumps = sparse.diags(np.poly(np.ones(integrations)), range(integrations + 1), shape=(size - integrations, size))
-    summed = sparse.csc_matrix(np.tril(np.ones((size, size)))) if differences else sparse.eye(size, format="csc")
-    normal = summed.T @ summed + (jumps.T @ jumps) / max(ratio, 1e-9)
-    return np.asarray(spsolve(sparse.csc_matrix(normal), summed.T @ (summed @ rest)))
+    jumps, noisy = difference(integrations, size - integrations), difference(differences, size)
+    both = jumps @ noisy
+    normal = both.T @ both + max(ratio, 1e-9) * sparse.eye(size + differences, format="csc")
+    return np.asarray(rest - noisy @ spsolve(normal, both.T @ (jumps @ rest)))
 
 
-_DRAWS, _QUANTILE = 400, 0.025
-_COUPLED = 1.2  # ratio of the eigenvalues' sizes from which one gain for all directions wastes some
-
-
-@dataclass(frozen=True, eq=False)
-class End:
-    """A plant that the likelihood allows: dead times, lags, and the gains that go with them."""
-
-    cycles: tuple[float, ...]
-    lags: tuple[float, ...]
-    gains: np.ndarray
+_DRAWS, _QUANTILE, _COUPLED = 400, 0.025, 1.2  # the last: ratio of eigenvalues from which one gain for all wastes some
 
 
 class Estimates:
     """What is known of a plant: estimates, intervals, and the eigenvalues of draws from them."""
 
     def __init__(self, channels: Sequence[Channel], seed: int) -> None:
-        """Take the channels and the seed of the draws."""
         self.channels = tuple(channels)
         self.gains = np.array([[g.value for g in one.gains] for one in channels])
         deviations = np.array([[(g.high - g.low) / 4 for g in one.gains] for one in channels])
@@ -219,10 +213,12 @@ class Estimates:
             for some in zip(*((one.dead_time, one.lag) for one in channels), strict=True)
         )
         self.drift = np.column_stack([one.drift for one in channels])  # by cycle, shape (cycles, n)
-        self.ends = tuple(  # the best, then the likeliest plants at both ends of dead times and of lags
-            End(tuple(float(f.dead) for f in fits), tuple(f.lag for f in fits), np.array([f.gains for f in fits]))
+        self.likely = tuple(self.dead[1].tolist()), tuple(self.lag[1].tolist())  # dead times and lags
+        # Dead times, lags and gains of plants that the likelihood allows: of the best, and at both ends of dead times and lags.
+        self.ends = {
+            (tuple(float(f.dead) for f in fits), tuple(f.lag for f in fits)): np.array([f.gains for f in fits])
             for fits in zip(*(one.ends for one in channels), strict=True)
-        )
+        }
         sizes = np.abs(np.linalg.eigvals(self.gains))
         # The inverse of Lambda; None: all directions have one gain.
         self.weights: tuple[tuple[float, ...], ...] | None = None
@@ -231,18 +227,13 @@ class Estimates:
             self.largest_weighted = _largest(draws @ np.array(self.weights))  # of Lambda times the weights
 
     @property
-    def uncertain(self) -> bool:
-        """Whether a gain may have either sign."""
-        return self.smallest <= 0 < self.largest_real
-
-    @property
     def refused(self) -> str:
         """Why nothing may be adapted; empty where something may."""
         if self.largest_real <= 0:
             return "the sign of the gain is wrong: the plant answers against its model; turn the sign of an input in the model"
         if self.least_at_most <= 0:
             return "an eigenvalue of the gains has the wrong sign: an input of the model has, or is paired with the wrong output"
-        if self.uncertain or np.linalg.eigvals(self.gains).real.min() <= 0:
+        if self.smallest <= 0 or np.linalg.eigvals(self.gains).real.min() <= 0:
             return "the sign of a gain is not certain: excite more or longer (amplitude, cycles)"
         return ""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import casadi as ca
@@ -20,14 +21,16 @@ from fpirhc.plant.chain import response_names
 from fpirhc.probing.identification import require_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
+from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
-_HOLDS = (1, 2, 4, 8, 16)  # cycles
 _NOISES, _SHARE = 2.0, 0.1  # amplitude: of the noise, and of the deviation of the desired response
-_EVEN = 0.01  # share of the period by which a time may be off
-_BEGUN = 3  # cycles after which a response is one of the run
+_EVEN, _BEGUN = (
+    0.01,
+    3,
+)  # share of the period by which a time may be off; cycles after which a response is one of the run
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,7 @@ class Excitation(Identity):
     cycles: int  # length of the sequence; after it the request is the desired response
     seed: int = 0  # of the sequence
 
-    def memory(self, elements: tuple[str, ...]) -> Layout:
-        del elements
+    def memory(self, elements: tuple[str, ...]) -> Layout:  # noqa: ARG002
         return Layout((scalar("excitation_cycle"),))
 
     def step(
@@ -62,33 +64,51 @@ class Record:
     measured: np.ndarray  # responses, shape (cycles - 1, n)
     modelled: np.ndarray  # the model's responses to the commands that acted
     usable: np.ndarray  # which cycles count: those with numbers
-    stop: str = ""  # why the run ended early; empty where it did not
+    shown: tuple[str, ...]  # what each response is a difference of, or itself where it is measured
+    differences: tuple[int, ...]  # how often
+    stop: str  # why the run ended early; empty where it did not
 
 
 def _record(
-    problem: Problem, where: str, times: np.ndarray, states: np.ndarray, commands: np.ndarray, measured: np.ndarray
-) -> Record:
-    """The responses beside those of the model, at the states of the same time and with the commands before it."""
+    problem: Problem, where: str, times: np.ndarray, states: np.ndarray, commands: np.ndarray, seen: Mapping[str, np.ndarray],
+    stop: str = "",
+) -> Record:  # fmt: skip
+    """The responses beside those of the model, at the states of the same time and with the commands before it.
+
+    A response is a difference of what is seen: an estimator's window would make it late, and its noise anything but white.
+    """
     plant = problem.plant
     require_cycles(len(times))
     still = np.ptp(commands, axis=0) <= 1e-9 * np.abs(commands).max(axis=0)  # NaN moves
     if still.any():
-        raise InvalidValue(
-            f"{where}: the input '{list(plant.inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain; "
-            "record a run in which it steps, or leave it room within its limits"
-        )
+        one = f"the input '{list(plant.inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain"
+        raise InvalidValue(f"{where}: {one}; record a run in which it steps, or leave it room within its limits")
     told, parameters = model_values(plant, problem.signals), plant.approximate
     known = parameters if told is None else told.map(len(times) - 1)(times[None, 1:], parameters)
     modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, known)).T
-    usable = np.isfinite(measured[1:]).all(axis=1) & np.isfinite(modelled).all(axis=1)
-    return Record(np.nan_to_num(measured[1:], posinf=0, neginf=0), np.nan_to_num(modelled, posinf=0, neginf=0), usable)
+    measured, shown = np.full((len(times), len(plant.response_orders)), np.nan), list[str]()
+    for column, (name, order) in zip(measured.T, plant.response_orders.items(), strict=True):
+        shown.append(max((n for n in seen if n.rstrip("'") == name), key=len))
+        missing = order - shown[-1].count("'")
+        column[missing:] = np.diff(seen[shown[-1]], missing) / problem.period**missing
+    differences = tuple(n - one.count("'") for n, one in zip(plant.response_orders.values(), shown, strict=True))
+    both = pd.DataFrame(np.hstack([measured[1:], modelled])).replace([np.inf, -np.inf], np.nan)
+    # What does not count passes through filters, as lines between what does.
+    parts = np.hsplit(both.interpolate(limit_direction="both").fillna(0.0).to_numpy(), [measured.shape[1]])
+    return Record(parts[0], parts[1], both.notna().all(axis=1).to_numpy(), tuple(shown), differences, stop)
+
+
+def _preferred(first: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The first columns, and others of coordinates that these show nothing of."""
+    known = {name.rstrip("'") for name in first}
+    return {**first, **{name: column for name, column in other.items() if name.rstrip("'") not in known}}
 
 
 def sequence(cycles: int, channels: int, seed: int) -> np.ndarray:
     """Return +-1, shape (cycles, channels), held for 1 to 16 cycles: power at all frequencies of interest; 0 in the end."""
     random, signs = np.random.default_rng(seed), np.zeros((cycles, channels))
     for j in range(channels):
-        signs[:, j] = np.repeat(random.choice([-1.0, 1.0], cycles), random.choice(_HOLDS, cycles))[:cycles]
+        signs[:, j] = np.repeat(random.choice([-1.0, 1.0], cycles), random.choice((1, 2, 4, 8, 16), cycles))[:cycles]
     signs[-1] = 0
     return signs
 
@@ -97,6 +117,7 @@ def excited(
     problem: Problem, controller: Controller, cycles: int, amplitude: Mapping[str, float] | None, seed: int
 ) -> Record:
     """Return the record of a run without deformation, excited; amplitude None: twice the noise and a tenth of what is desired."""
+    require_cycles(cycles)
     short, bare = replace(problem, duration=cycles * problem.period, measure_from=0.0), without_deformation(controller)
 
     def run_with(amplitude: tuple[float, ...]) -> tuple[Run, Record]:
@@ -104,44 +125,47 @@ def excited(
         at_once = ModelReferenced(Excitation(amplitude, cycles, seed), cycles=0.0, lag=0.0)
         with any_gain():  # nothing is iterated, so the sign of the plant's gain does not matter
             run = simulate(short, bare.with_deformation(at_once), seed=seed, compiled=False)
-        record = _record(problem, "probe", run.time, run["state"], run["command"], run["realised"])
-        if "foreign_held" in run.layout.names:
-            record = replace(record, usable=record.usable & (run["foreign_held"].ravel()[1:] == 0))
-        return run, replace(record, stop=run.stop or "")
+        plant, raw = problem.plant, raw_measurements(run)
+        seen = dict(zip(response_names(plant), run["realised"].T, strict=True))
+        if problem.sensing.spreads(plant):
+            measures = problem.sensing.measures(plant)
+            seen = _preferred(dict(zip(measures, raw.T[-len(measures) :], strict=True)), seen)
+        seen = {name: np.where(np.isnan(raw).any(axis=1), np.nan, column) for name, column in seen.items()}
+        return run, _record(problem, "probe", run.time, run["state"], run["command"], seen, run.stop or "")
 
     names = problem.plant.controlled_names
     if amplitude is not None:
         return run_with(tuple(float(amplitude.get(name, 0.0)) for name in names))[1]
     run, silent = run_with((0.0,) * len(names))
-    noise = np.median(np.abs(np.diff((silent.measured - silent.modelled)[_BEGUN:], axis=0)), axis=0) / 0.6745
+    rest = (np.asarray(run["realised"])[1:] - silent.modelled)[_BEGUN:]
+    noise = np.median(np.abs(np.diff(rest, axis=0)), axis=0) / 0.6745
     sizes = _NOISES * noise / np.sqrt(2) + _SHARE * np.std(np.asarray(run["desired"])[_BEGUN:], axis=0)
     return run_with(tuple(map(float, sizes)))[1]
 
 
 def read_recording(path: Path, problem: Problem) -> Record:
-    """Return the record in a CSV file; a response without a column is the difference of its lower derivative over a cycle."""
+    """Return the record in a CSV file; a derivative without a column is the difference of the lower one over a cycle."""
     table = _table(path)
     plant, period, mistakes = problem.plant, problem.period, Mistakes(f"recording {path}")
+    given = {str(name): column.to_numpy() for name, column in table.items()}
+    for name in sorted(plant.state.elements, key=len):
+        if name not in table and name.rstrip("'") != name and name[:-1] in table:
+            table[name] = table[name[:-1]].diff() / period
     missing = [n for n in ("time", *plant.inputs, *plant.state.elements) if n not in table]
     if missing:
-        mistakes.add(f"it lacks columns for {', '.join(missing)}; its columns are {', '.join(map(str, table))}")
-    for name in response_names(plant):
-        if name not in table and name[:-1] not in table:
-            mistakes.add(f"it has no column '{name}', nor '{name[:-1]}' to take the difference of")
-    if len(table) < 2:
-        mistakes.add("it has fewer than two rows of numbers below the line of names")
+        mistakes.add(f"it lacks columns for {', '.join(missing)}; its columns are {', '.join(given)}")
+    for name in {*plant.response_orders} - {n.rstrip("'") for n in given}:
+        mistakes.add(f"it has no column '{name}', nor one of its derivatives")
     mistakes.raise_if_any()
     times = table["time"].to_numpy()
-    uneven = ~(np.abs(np.diff(times) - period) <= _EVEN * period)
-    if uneven.any():
-        k = int(np.argmax(uneven))
-        raise InvalidValue(
-            f"recording {path}: its times are not {period:g} {problem.time_unit} apart, the period of the problem: "
-            f"{times[k]:g} is followed by {times[k + 1]:g}"
-        )
+    for before, after in pairwise(times):
+        if not abs(after - before - period) <= _EVEN * period:
+            apart = f"its times are not {period:g} {problem.time_unit} apart, the period of the problem"
+            raise InvalidValue(f"recording {path}: {apart}: {before:g} is followed by {after:g}")
     commands, states = (table[list(names)].to_numpy() for names in (plant.inputs, plant.state.elements))
-    responses = [table[n] if n in table else table[n[:-1]].diff() / period for n in response_names(plant)]
-    return _record(problem, f"recording {path}", times, states, commands, np.column_stack(responses))
+    measures = problem.sensing.measures(plant)
+    seen = _preferred({name: column for name, column in given.items() if name in measures}, given)
+    return _record(problem, f"recording {path}", times, states, commands, seen)
 
 
 def _table(path: Path) -> pd.DataFrame:
@@ -151,12 +175,10 @@ def _table(path: Path) -> pd.DataFrame:
     except OSError as error:
         raise InvalidValue(f"recording '{path}' cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise InvalidValue(
-            f"recording {path}: expected a line of names, such as time, and rows of as many numbers; {error}"
-        ) from None
+        expected = "expected a line of names, such as time, and rows of as many numbers"
+        raise InvalidValue(f"recording {path}: {expected}; {error}") from None
     numbers = table.apply(pd.to_numeric, errors="coerce").astype(float)
     for row, column in np.argwhere((numbers.isna() & table.notna()).to_numpy())[:1]:
-        raise InvalidValue(
-            f"recording {path}: row {row + 1} of numbers has {table.iat[row, column]!r} for {table.columns[column]}"
-        )
+        wrong = f"row {row + 1} of numbers has {table.iat[row, column]!r} for {table.columns[column]}"
+        raise InvalidValue(f"recording {path}: {wrong}")
     return numbers

@@ -1,12 +1,12 @@
 """A probe of bodies whose gain, dead time, lag and noise are known."""
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import pandas as pd
 import pytest
 from helpers.bodies import PERIOD, RHC, Body, body_problem
 
@@ -25,31 +25,20 @@ KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
 NAMES = ("q", "p"), ("u", "w")
 
 
-def recorded(path: Path, gains: Any, dead: int, lag: float, noise: float, *, response: bool = True) -> fp.Problem:
+def recorded(path: Path, gains: Any, dead: int, lag: float, noise: float, seed: int = 7) -> fp.Problem:
     """Record a body that is moved at random, without a controller, as a CSV file; return its problem."""
     problem = body_problem(gains, dead, lag, noise)
-    body, random = Body(np.atleast_2d(np.array(gains, dtype=float)), dead, lag, noise), np.random.default_rng(7)
+    body, random = Body(np.atleast_2d(np.array(gains, dtype=float)), dead, lag, noise), np.random.default_rng(seed)
     n = len(body.gains)
-    held, seen, rows = np.zeros(n), body.reset(1), []
+    held, seen, rows = np.zeros(n), body.reset(seed), []
     for k in range(400):
         if k % 4 == 0:
             held = random.choice([-2.0, 2.0], n)
-        rows.append([k * PERIOD, *held, *seen[: None if response else -n]])
+        rows.append([k * PERIOD, *held, *seen])
         seen = body.step(k * PERIOD, held)
-    names, inputs = (one[:n] for one in NAMES)
-    heads = ["time", *inputs, *(f"{q}{d}" for d in ("", "'", "''")[: 3 if response else 2] for q in names)]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file).writerows([heads, *rows])
+    heads = ["time", *NAMES[1][:n], *(f"{q}{d}" for d in ("", "'", "''") for q in NAMES[0][:n])]
+    pd.DataFrame(rows, columns=heads).to_csv(path, index=False)
     return problem
-
-
-class Untouched:
-    """A body that fails the test where it is asked anything."""
-
-    def reset(self, *_: object) -> list[float]:
-        raise AssertionError("a recording needs no run")
-
-    step = reset
 
 
 QUANTITIES = {"q": "m", "q'": "m/s", "q''": "m/s^2"}
@@ -59,7 +48,7 @@ QUANTITIES = {"q": "m", "q'": "m/s", "q''": "m/s^2"}
 def test_the_estimates_of_a_recording_are_those_of_the_body(gain, dead, lag, noise, tmp_path):
     """The dead time to the cycle; gain, lag and noise within 6, 10 and 20 %; all intervals contain the truth; no run is made."""
     problem = recorded(tmp_path / "run.csv", -gain, dead, lag, noise)
-    problem = replace(problem, reality=fp.ExternalPlant(Untouched(), QUANTITIES))
+    problem = replace(problem, reality=fp.ExternalPlant(Body(np.array(None)), QUANTITIES))  # fails where it is run
     found = fp.probe(problem, RHC, recording=tmp_path / "run.csv")
     late, own, slow = found.dead_time["u"], found.gain["q"]["q"], found.lag["u"]
     assert (late.low, late.value, late.high) == (dead, dead, dead)
@@ -74,18 +63,24 @@ def test_the_estimates_of_a_recording_are_those_of_the_body(gain, dead, lag, noi
 
 
 def test_a_gain_that_noise_hides_has_no_certain_sign(tmp_path):
-    """Its estimate is negative, and its interval holds both signs: the input of the model may well be right."""
+    """Its interval holds both signs: the input of the model may well be right."""
     found = fp.probe(recorded(tmp_path / "run.csv", 0.0, 0, 0.0, 0.3), RHC, recording=tmp_path / "run.csv")
-    (gain,) = found.gain["q"].values()
-    assert gain.low < gain.value < 0 < gain.high
+    assert found.gain["q"]["q"].low < 0 < found.gain["q"]["q"].high
     assert found.why.startswith("the sign of a gain is not certain")
 
 
-def test_a_response_may_be_a_difference_of_speeds(tmp_path):
-    problem = recorded(tmp_path / "run.csv", -1.6, 2, 0.0, 0.02, response=False)
-    found = fp.probe(problem, RHC, recording=tmp_path / "run.csv")
-    assert found.dead_time["u"].value == 2
-    assert found.gain["q"]["q"].low <= -1.6 <= found.gain["q"]["q"].high
+@pytest.mark.parametrize("window", [7, 61])
+def test_the_window_of_an_estimator_is_in_no_estimate(window, tmp_path):
+    """It makes the response late and colours its noise, so the plant is estimated from the positions before it."""
+    problem, path = recorded(tmp_path / "run.csv", -2.0, 3, 0.0, 0.0), tmp_path / "run.csv"
+    table = pd.read_csv(path)[["time", "u", "q"]]
+    table.assign(q=table.q + 1e-4 * np.random.default_rng(2).standard_normal(400)).to_csv(path, index=False)
+    windowed = replace(problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window, degree=4)))
+    found = fp.probe(windowed, RHC, recording=path)
+    assert found.dead_time["u"].low == found.dead_time["u"].high == 3
+    assert found.gain["q"]["q"].low <= -2.0 <= found.gain["q"]["q"].high < 0
+    assert found.noise["q"] == pytest.approx(1e-4, rel=0.1)
+    assert f"SavitzkyGolay delays the response by {window / 2 - 1:g} cycles more" in " ".join(found.notes)
 
 
 def test_coupled_bodies_have_a_gain_matrix(tmp_path):
@@ -107,7 +102,11 @@ def test_an_excited_run_finds_what_suits_the_plant():
     problem = replace(body_problem(gain, dead, lag, 0.1), duration=1.5)
     assert isinstance(problem.reality, fp.ExternalPlant)
     late = {"reality": replace(problem.reality, lag={"u": lag}), "dead_time": fp.DeadTime(inputs={"u": dead * PERIOD})}
-    found = fp.probe(replace(problem, **late), RHC, cycles=150)
+    left: dict[str, int] = {}
+    found = fp.probe(
+        replace(problem, **late), RHC, cycles=150, progress=lambda what, n, of: left.update({what: of - n})
+    )
+    assert set(left.values()) == {0}
     assert found.dead_time["u"].value == dead
     assert found.gain["q"]["q"].low <= gain <= found.gain["q"]["q"].high
     assert found.lag["u"].low <= lag <= found.lag["u"].high
@@ -143,19 +142,21 @@ def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
 
 
 @pytest.mark.slow
-def test_no_neighbour_of_the_choice_is_clearly_better():
-    """On a plant with limits that the estimate lacks, trials of 2 000 cycles walk to the best."""
-    task = fp.load_problem("van_der_pol")
-    problem, controller = replace(task.problem, duration=2000 * task.problem.period), task.controllers["RHC"]
-    found = fp.probe(problem, controller, cycles=400)
-    assert found.deformation is not None
-    gain = found.deformation.effective_gain()
-    errors = []
-    for factor in (1.0, 0.6, 1.6):
-        adapted = controller.with_deformation(found.deformation.with_effective_gain(factor * gain))
-        run = fp.simulate(problem, adapted, seed=1, compiled=False)
-        errors.append(np.mean(list(fp.measure(problem, run).rms_error.values())))
-    assert errors[0] <= 1.02 * min(errors)
+def test_intervals_contain_the_truth_in_nineteen_of_twenty_records(tmp_path):
+    missed, path = 0, tmp_path / "run.csv"
+    for seed in range(20):
+        found = fp.probe(recorded(path, -1.5, 2, 0.03, 0.3, seed), RHC, recording=path)
+        pairs = (found.gain["q"]["q"], -1.5), (found.dead_time["u"], 2), (found.lag["u"], 0.03)
+        missed += not all(one.low <= true <= one.high for one, true in pairs)
+    assert missed <= 1
+
+
+@pytest.mark.slow
+def test_a_loop_behind_a_long_window_is_not_refused():
+    """Twice the model's gain, two cycles late, and positions through 31 samples: a gain by hand divides the error by three."""
+    seen = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(1e-4))}, fp.SavitzkyGolay(31, degree=4))
+    problem = replace(body_problem(2.0, 2), duration=4.0, sensing=seen)
+    assert error(problem, fp.probe(problem, RHC).deformation) < error(problem, fp.Identity()) / 3
 
 
 @pytest.mark.slow
@@ -167,14 +168,6 @@ def test_what_a_record_does_not_bound_is_adapted_by_trials_alone():
     assert untried.deformation is None
     assert untried.why in found.notes
     assert found.deformation is None or found.trials[found.why.partition(":")[0]].passes
-
-
-@pytest.mark.slow
-def test_the_budget_of_chatter_is_kept():
-    """Steps of a millionth of the controller's own leave nothing to choose."""
-    found = fp.probe(body_problem(1.0, 0, 0.0, 0.3), RHC, chatter=1e-6, trials=False)
-    assert found.deformation is None
-    assert "no setting" in found.why
 
 
 @pytest.mark.slow
@@ -201,11 +194,11 @@ def test_a_model_that_is_not_affine_in_its_input_has_a_choice():
 
 
 WRONG_RECORDS = {
-    "no column 'q''": "time,u,q\n0,0,0\n0.01,0,0\n",
+    "it lacks columns for q; its columns are time, u, q'": "time,u,q'\n0,0,0\n0.01,0,0\n",
     "not 0.01 s apart": "time,u,q,q',q''\n0,0,0,0,0\n0.02,0,0,0,0\n",
     "row 1 of numbers has 'x' for q'": "time,u,q,q',q''\n0,0,0,x,0\n",
     "Expected 5 fields in line 3, saw 6": "time,u,q,q',q''\n0,0,0,0,0\n0,0,0,0,0,0\n",
-    "fewer than two rows": "time,u,q,q',q''\n0,0,0,0\n",
+    "1 cycles are too few": "time,u,q,q',q''\n0,0,0,0\n",
     "expected a line of names": "",
     "the input 'u' never changes, so nothing can be known of its gain": "time,u,q,q',q''\n"
     + "".join(f"{k * PERIOD:.2f},4,{k % 3},{k % 5},{k % 7}\n" for k in range(200)),
