@@ -126,7 +126,7 @@ def _value(function: ca.Function, n: int, row: tuple[Array, ...]) -> Array:
 def _sampled_jacobian(problem: Problem) -> ca.Function:
     """Return the Function (reality's state, model's state, request, reality's parameters, model's parameters) -> J (n, n)."""
     model, plant = problem.plant, problem.real_plant
-    matrix = kind(model.equations.inverse_opaque or problem.real_integrator.opaque)
+    matrix = kind(model.equations.inverse_opaque)
     x, state = matrix.sym("x", plant.state.size), matrix.sym("state", model.state.size)
     r, u = matrix.sym("r", len(model.controlled_names)), matrix.sym("u", model.input.size)
     exact, assumed = matrix.sym("exact", len(plant.parameters)), matrix.sym("assumed", len(model.parameters))

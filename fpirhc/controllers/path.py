@@ -24,7 +24,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.deformation.base import Deformation
-from fpirhc.plant.integrators import RungeKutta4
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Evidence, Model, values_of
 from fpirhc.symbolic.block import Block
@@ -232,9 +231,7 @@ def _twin(path: Path) -> Block:
 
     reads = {signal.name: signal for signal in (given, given_state, *path.reads)}
     memory, writes = (*path.memory, state, offsets, *own), (plant.response_signal("_modelled"),)
-    return Block(
-        "mirror", Layout(tuple(reads.values())), Layout(writes), step, Layout(memory), problem.integrator.opaque
-    )
+    return Block("mirror", Layout(tuple(reads.values())), Layout(writes), step, Layout(memory))
 
 
 def _seen(problem: Problem) -> ca.Function:
@@ -303,7 +300,6 @@ def believe_block(problem: Problem, raw: Signal, shown: np.ndarray) -> Block:
 def observed_model(problem: Problem) -> Model:
     """Return what the observer is built from: the model over a cycle, or at rest where a sample still shows the start."""
     plant, integrator = problem.plant, problem.integrator
-    integrator = RungeKutta4() if integrator.opaque else integrator  # an opaque step is a call without a Jacobian
     (x, u, p), w, moves = plant.symbols(), ca.SX.sym("w", len(plant.names)), ca.SX.sym("moves")
     later = ca.if_else(moves, integrator.step(plant, problem.period)(x, u, p, w), x)
     move = ca.Function("fpirhc_move", [x, u, p, w, moves], [later])

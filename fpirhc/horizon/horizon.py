@@ -48,8 +48,7 @@ class Horizon(Checked):
 
     Raises:
         InvalidValue: fewer than one stage, a step that is not positive, blocks that do not add up, a margin that is not
-            a finite number of at least 0, plans that follow in no whole number of cycles, or an integrator that is
-            not made of plain expressions.
+            a finite number of at least 0, or plans that follow in no whole number of cycles.
     """
 
     stages: Count
@@ -75,10 +74,6 @@ class Horizon(Checked):
         if self.blocks and sum(self.blocks) != self.stages:
             raise InvalidValue(
                 f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
-            )
-        if self.discretisation.opaque:
-            raise InvalidValue(
-                "a horizon needs an integrator of plain expressions, such as RungeKutta4() or Collocation()"
             )
 
     @property

@@ -1,7 +1,7 @@
 """Integrators: the plant's state one control cycle later, with the command held. Theory: docs/theory.md.
 
 Runge-Kutta 4, Euler, and collocation with a fixed number of Newton steps are plain expressions, so they can be compiled and
-exported. CVODES controls its own error, runs in CasADi's virtual machine, and is the reference for the methods with a fixed step.
+exported.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, ClassVar, cast, final
+from typing import Any, cast, final
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import FEW, Accuracy, Few
+from fpirhc.fields.kinds import FEW, Few
 from fpirhc.plant.maps import by_single_steps
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
@@ -29,8 +29,6 @@ _NAMES = ["x", "u", "p", "w"], ["x_next"]
 class Integrator(Checked, ABC):
     """Contract: how x' = f(x, u, p, w) moves in a time. A map has steps of its own, and no use for it."""
 
-    opaque: ClassVar[bool] = False  # whether the step holds operations that scalar expressions cannot
-
     def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
         """The same method with about `times` times the work; None where it has no such setting."""
         return None
@@ -38,7 +36,7 @@ class Integrator(Checked, ABC):
     def growth(self, modes: np.ndarray) -> np.ndarray | None:  # noqa: ARG002
         """Return |R(z)|, by which a cycle multiplies a mode whose pole times period is z, per mode.
 
-        None: no decaying mode ever grows, as in implicit methods and methods that control their error.
+        None: no decaying mode ever grows, as in implicit methods.
         """
         return None
 
@@ -182,38 +180,6 @@ class Collocation(_Substepped):
             return inside[:, d - 1]
 
         return once
-
-
-@dataclass(frozen=True)
-class Cvodes(Integrator):
-    """SUNDIALS CVODES.
-
-    Args:
-        tolerance: relative, and absolute in the size of every state: |x_i| + T |f_i| + T^2 |(df/dx f)_i| of the cycle T, at most 1.
-    """
-
-    tolerance: Accuracy = 1e-10
-
-    opaque = True
-
-    def finer(self, times: int) -> Cvodes:  # noqa: ARG002
-        return Cvodes(self.tolerance / 10)
-
-    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
-        x, u, p, w = symbols = _symbols(rate)
-        size, options = ca.SX.sym("size", x.numel()), {"reltol": self.tolerance, "abstol": self.tolerance}
-        moved = {"x": x, "p": ca.vertcat(u, p, w, size), "ode": rate(size * x, u, p, w) / size}
-        solver = ca.integrator("fpirhc_cvodes", "cvodes", moved, 0.0, period, options)
-        # What is large for each state in a cycle, at most 1; it has no derivative.
-        f = rate(*symbols)
-        large = ca.fabs(x) + period * ca.fabs(f) + period**2 * ca.fabs(ca.jtimes(f, x, f))
-        large = ca.densify(ca.if_else(large > 0, ca.fmin(large, 1), 1))
-        xm, *given = (ca.MX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
-        sizes = ca.Function(
-            "fpirhc_cvodes_sizes", list(symbols), [large], {"is_diff_out": [False], "never_inline": True}
-        )(xm, *given)
-        x_next = sizes * solver(x0=xm / sizes, p=ca.vertcat(*given, sizes))["xf"]
-        return ca.Function("fpirhc_cvodes_step", [xm, *given], [x_next], *_NAMES)
 
 
 def own_steps(plant: Plant, integrator: Integrator, period: float) -> int:

@@ -224,7 +224,7 @@ class Equations(Mover):
         problem, plant, count = self.problem, self.problem.real_plant, self.problem.signal_steps
         integrator, values = problem.real_integrator, None if count == 1 else real_values(plant, problem.signals)
         one = integrator.step(plant, problem.period) if values is None else own_step(plant, integrator, problem.period)
-        opaque = integrator.opaque or (values is not None and not values.is_a("SXFunction"))
+        opaque = values is not None and not values.is_a("SXFunction")
         state = like(plant.state, "_state_before")
         exact = like(plant.parameter, self.parameters if values is None else Mover.parameters)
         reads = (state, arriving, exact, *([] if values is None else [problem.plant.time]), *disturbed)

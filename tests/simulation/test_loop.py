@@ -105,17 +105,6 @@ def test_a_loop_that_runs_away_stops_where_its_error_is_a_million_times_the_refe
 # Every kind of reference and integrator, compiled where it can be and where it is worth it
 
 
-def test_reference_integrator_gives_the_same_run():
-    """CVODES against Runge-Kutta: the same closed loop within its tolerance; it stays in the virtual machine and says so."""
-    controller = fp.ComputedTorque(TRACK, fp.Sigmoid(gain=-0.5, scale=10.0))
-    reference, ordinary = (
-        fp.simulate(swing(integrator=one, duration=0.5, measure_from=0.0), controller, seed=0)
-        for one in (fp.Cvodes(1e-10), fp.RungeKutta4(2))
-    )
-    assert not reference.compiled
-    np.testing.assert_allclose(ordinary["state"], reference["state"], atol=1e-7)
-
-
 def test_a_short_run_is_not_compiled_unless_it_is_asked_for():
     """None chooses by cycles and stages; the run says why, and is that of the virtual machine."""
     chosen = fp.simulate(swing(duration=0.02, measure_from=0.0), fp.ComputedTorque(TRACK), seed=0, compiled=None)
