@@ -126,16 +126,10 @@ def steps_per_cycle(where: str, model: Plant, period: float, step: float) -> int
 
 def derivatives(mistakes: Mistakes, quantities: Iterable[str]) -> dict[str, tuple[str, int]]:
     """Return the base and the order of every quantity of a body that moves; beyond accelerations they are mistakes."""
-    every = {quantity: base_and_order(quantity) for quantity in quantities}
+    every = {one: (one.rstrip("'"), one.count("'")) for one in quantities}
     for name in (name for name, order in every.values() if order > 2):
         mistakes.add(
             f"{name} is of a higher order than 2 in the model, and a body that moves shows no derivatives beyond the second; "
             "write a model of order 2"
         )
     return every
-
-
-def base_and_order(quantity: str) -> tuple[str, int]:
-    """Return what a quantity is a derivative of, and the order: ("q1", 2) of "q1''"."""
-    name = quantity.rstrip("'")
-    return name, len(quantity) - len(name)

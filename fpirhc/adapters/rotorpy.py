@@ -68,7 +68,9 @@ def rotorpy_body(
     air = finite_numbers("rotorpy_body: wind", wind, _SEEN[:3])
     parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
     at = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
-    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": air, **_hovering(parameters)}
+    hover = np.sqrt(parameters["mass"] * 9.81 / 4 / parameters["k_eta"])  # of rotors that carry the vehicle alone
+    upright = {"q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3), "rotor_speeds": np.full(4, hover)}
+    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": air, **upright}
     loaded = {**deepcopy(parameters), "mass": parameters["mass"] + payload}
     multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
     flown = multirotor(loaded, initial_state=first, control_abstraction="cmd_acc", aero=True)
@@ -108,12 +110,6 @@ class _OuterLoop(LinearLaw):
 
     def gains_of(self, plant: Plant) -> list[tuple[float, ...]]:
         return [self.own[name] for name in plant.controlled_names]
-
-
-def _hovering(parameters: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Upright and at rest, with rotors that carry the vehicle alone."""
-    hover = np.sqrt(parameters["mass"] * 9.81 / 4 / parameters["k_eta"])
-    return {"q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3), "rotor_speeds": np.full(4, hover)}
 
 
 class _Quadrotor:

@@ -183,7 +183,8 @@ class DisturbanceKalman(ParameterEstimator):
         advance, no_forcing = USUAL.step(model, problem.period), ca.DM.zeros(len(model.names))
         gain = expression(ca.DM(self.gain(problem)))
         shown, follows = self._shown_function(model), self._has_state(model)
-        foresees = self._foresees(model)
+        # A map's response is to the command that acts after the state, so the next state is remembered.
+        foresees = bool(self._responses(model)) and model.response_age > 0
         places = [model.parameter.elements.index(n) for n in self.learned()]
         moves, adds = self.modes(problem).of(len(places))
 
@@ -212,10 +213,6 @@ class DisturbanceKalman(ParameterEstimator):
             return change, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
-
-    def _foresees(self, plant: Plant) -> bool:
-        """Whether it remembers the next state: a map's response is to the command that acts after the state, and not before."""
-        return bool(self._responses(plant)) and plant.response_age > 0
 
     def _responses(self, plant: Plant) -> tuple[str, ...]:
         return tuple(n for n in self.measured if n in response_names(plant))

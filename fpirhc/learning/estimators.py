@@ -163,7 +163,11 @@ class RecursiveLeastSquares(ParameterEstimator):
 
     def step(self, problem: Problem) -> Correct:
         plant, size = problem.plant, len(self.parameters)
-        residual, factor = self._residual(plant), self._forgetting(problem.period)
+        if self.time < problem.period:
+            raise InvalidValue(
+                f"the time of forgetting is {self.time:g}, shorter than the control cycle of {problem.period:g}"
+            )
+        residual, factor = self._residual(plant), math.exp(-problem.period / self.time)
         places = [plant.parameter.elements.index(name) for name in self.parameters]
         lower, upper, deviation = (
             ca.DM([getattr(prior, name) for prior in self.parameters.values()])
@@ -186,12 +190,6 @@ class RecursiveLeastSquares(ParameterEstimator):
             return deviation * estimate, next_memory
 
         return correct
-
-    def _forgetting(self, period: float) -> float:
-        """Factor of a pair's weight from one cycle to the next, exp(-period / time)."""
-        if self.time < period:
-            raise InvalidValue(f"the time of forgetting is {self.time:g}, shorter than the control cycle of {period:g}")
-        return math.exp(-period / self.time)
 
     def _residual(self, plant: Plant) -> ca.Function:
         """Function (z, state, input, response, model's parameters) -> (e, H) of one pair, in units of the noise."""

@@ -133,7 +133,9 @@ def plain_driver(ocp: OptimalControl, settings: PlainSettings, stops: Mapping[st
     needed = any(hessian.jac_sparsity(k, 3).nnz() for k in range(hessian.n_out()))
     # Those of all nodes stay where second derivatives need them, else of the end and two others.
     costates = ocp.stages + 1 if needed else min(ocp.stages + 1, 3)
-    constants = {**_sizes(ocp), "COSTATES": costates, **_metric(ocp), **_constants(ocp, settings), **stops}
+    scale = ", ".join(repr(float(v)) for v in ocp.scale)
+    metric = {"SCALE": f"{{{scale}}}", "FIRST_GAMMA": repr(first_gamma(ocp))}
+    constants = {**_sizes(ocp), "COSTATES": costates, **metric, **_constants(ocp, settings), **stops}
     return Driver("\n".join(texts), leaves, constants, _room(ocp, costates))
 
 
@@ -154,12 +156,6 @@ def _sizes(ocp: OptimalControl) -> dict[str, object]:
         "N": ocp.stages,
         "MEMORY": plain_memory(ocp).size,
     }
-
-
-def _metric(ocp: OptimalControl) -> dict[str, object]:
-    """Definitions of the scale and of the first gamma."""
-    scale = ", ".join(repr(float(v)) for v in ocp.scale)
-    return {"SCALE": f"{{{scale}}}", "FIRST_GAMMA": repr(first_gamma(ocp))}
 
 
 def _constants(ocp: OptimalControl, settings: PlainSettings) -> dict[str, object]:
@@ -190,7 +186,9 @@ _SEARCHES: Latest[Search] = Latest(4)
 def plain_graph(ocp: OptimalControl, settings: PlainSettings, name: str) -> ca.Function:
     """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory)."""
     arguments, memory = call_symbols(ocp)
-    search, anchor = _search(ocp, settings), first_anchor(ocp, arguments, memory)
+    own = settings.hessian, settings.map, settings.damping
+    search = _SEARCHES.of((ocp, settings.map), own[::2], lambda: Search(ocp, *own))
+    anchor = first_anchor(ocp, arguments, memory)
     if settings.ends:
         anchor, count = _converged(ocp, settings, search, arguments, anchor)
         return ca.Function(name, [*arguments, memory], _results(ocp, settings, arguments, memory, anchor, count - 1))
@@ -237,11 +235,6 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
         sent=ca.MX(10 * line_search.UNTRIED),
         curved=ca.MX.zeros(nu, nu * n),
     )
-
-
-def _search(ocp: OptimalControl, settings: PlainSettings) -> Search:
-    own = settings.hessian, settings.damping
-    return _SEARCHES.of((ocp, settings.map), own, lambda: Search(ocp, settings.hessian, settings.map, settings.damping))
 
 
 def _converged(

@@ -226,7 +226,8 @@ def _fit_multipliers(ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray,
     flat = states[:, 1:].ravel(order="F")
     upper = flat >= np.tile(ocp.state_upper - feasible_to(ocp), ocp.stages)
     lower = flat <= np.tile(ocp.state_lower + feasible_to(ocp), ocp.stages)
-    free = ~_at_bound(inputs, (ocp.input_lower, ocp.input_upper)).ravel(order="F")
+    near, least, most = _AT_BOUND * (1 + np.abs(inputs)), ocp.input_lower[:, None], ocp.input_upper[:, None]
+    free = ~((inputs <= least + near) | (inputs >= most - near)).ravel(order="F")
     if not (upper.any() or lower.any()) or not free.any() or not np.isfinite(sensitivity).all():
         return none
     # Rows in the units of the stationarity, so that the fit weighs what is judged.
@@ -245,11 +246,6 @@ def _fit(columns: np.ndarray, target: np.ndarray, upper: np.ndarray, lower: np.n
     fitted[upper] += (weights / size)[: upper.sum()]
     fitted[lower] -= (weights / size)[upper.sum() :]
     return fitted
-
-
-def _at_bound(inputs: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    near = _AT_BOUND * (1 + np.abs(inputs))
-    return (inputs <= bounds[0][:, None] + near) | (inputs >= bounds[1][:, None] - near)
 
 
 def sensitivity_of(ocp: OptimalControl) -> ca.Function:

@@ -81,7 +81,8 @@ def tolerated(ocp: OptimalControl) -> np.ndarray:
 
 def _input_units(ocp: OptimalControl, states: np.ndarray, places: np.ndarray) -> np.ndarray:
     """The units of the inputs (nu,), with those of the states (ns,), of which some are limited at these places."""
-    half = _half(ocp.input_lower, ocp.input_upper)
+    with np.errstate(invalid="ignore"):
+        half = np.asarray(0.5 * (ocp.input_upper - ocp.input_lower))
     free = ~np.isfinite(half)
     units = np.where(~free & (half > 0), half, 1.0)
     if not free.any() or not places.size:
@@ -98,11 +99,6 @@ def _answered_curvature(ocp: OptimalControl) -> np.ndarray:
     diagonal = answered_curvature(ocp.along)
     usable = np.isfinite(diagonal) & (diagonal > 0)
     return np.where(usable, diagonal, ocp.step * ocp.curvature)
-
-
-def _half(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    with np.errstate(invalid="ignore"):
-        return np.asarray(0.5 * (upper - lower))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from fpirhc.contraction.spectrum import ContractionReport
     from fpirhc.simulation.picture import Drawing
     from fpirhc.studies.compare import Comparison, Contraction
     from fpirhc.studies.open_loop import Solved
@@ -87,7 +86,9 @@ def contraction_figures(comparison: Comparison) -> list[Drawing]:
     colours, groups = colours_of(comparison), dict[tuple[str, float], list[Any]]()
     for entry in entries:
         if entry.contraction is not None:
-            groups.setdefault(_own_gain(entry.contraction.report), []).append((entry.name, entry.contraction))
+            name, scale = entry.contraction.report.own  # where no gain converges: of the effective gain
+            own = (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
+            groups.setdefault(own, []).append((entry.name, entry.contraction))
     figures = [Drawing(figsize=(5.5, 3.8)) for _ in range(len(groups) + 1) if entries]
     for figure in figures:  # places that are fixed: to fit them takes two thirds of a picture's time
         figure.subplots_adjust(left=0.13, right=0.98, bottom=0.14, top=0.92)
@@ -112,12 +113,6 @@ def contraction_figures(comparison: Comparison) -> list[Drawing]:
         axis.set_title(literal(f"The response error in the first {span}"), fontsize=10, y=1.0)
         draw_legend(axis)
     return figures
-
-
-def _own_gain(report: ContractionReport) -> tuple[str, float]:
-    """Name of the user's gain and its size per unit of the effective gain; the effective gain where no gain converges."""
-    name, scale = report.own
-    return (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
 
 
 def _draw_factor(

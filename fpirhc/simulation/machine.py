@@ -161,9 +161,11 @@ def machine_step(problem: Problem, controller: Controller, gate: Gate, monitor: 
     block = under_names(gate.block(), {"status": _GATED})
     longest = round(monitor.saturated_after / (problem.period * SECONDS.get(problem.plant.time_unit, 1.0)))
     watched = watch_block(problem, controller, _STATUS, longest=longest, window=monitor.window)
-    own = _identity_block(fingerprint(problem, controller, block.memory))
+    own = fingerprint(problem, controller, block.memory)
+    memory = Layout((scalar(FINGERPRINT, start=own),))
+    identity = Block("identity", Layout(), Layout(), lambda _: {f"{FINGERPRINT}_next": own}, memory)
     judged = clock_status_block(problem, _GATED, _STATUS)
-    blocks = [own, clock_block(problem), fed(block, "time", Signal(CLOCK)), judged, watched, _count_block()]
+    blocks = [identity, clock_block(problem), fed(block, "time", Signal(CLOCK)), judged, watched, _count_block()]
     return compose("machine", gate.reads, blocks, outputs=("command",))
 
 
@@ -171,11 +173,6 @@ def fingerprint(problem: Problem, controller: Controller, memory: Layout) -> flo
     """Return a number that another controller, or the same one on another problem, does not have."""
     facts = json.dumps([describe(problem), describe(controller), memory.columns], sort_keys=True, default=str)
     return float(int.from_bytes(hashlib.sha256(facts.encode()).digest()[:6], "big") + 1)
-
-
-def _identity_block(number: float) -> Block:
-    memory = Layout((scalar(FINGERPRINT, start=number),))
-    return Block("identity", Layout(), Layout(), lambda _: {f"{FINGERPRINT}_next": number}, memory)
 
 
 def _count_block() -> Block:

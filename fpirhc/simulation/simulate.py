@@ -7,7 +7,7 @@ is entered once per chunk: for disturbances and noise, to check that all signals
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self, TypeAlias
 
@@ -68,14 +68,6 @@ class Simulator:
     compiled: bool
     why_not_compiled: str
     live: LiveSettings
-
-    def starting_at(self, start: Mapping[str, float]) -> Simulator:
-        """Return the loop with other first values of some states; it is not compiled again where its code is the same.
-
-        Raises:
-            InvalidProblem: unknown states, or values that the problem refuses.
-        """
-        return self.built_for(replace(self.problem, start={**self.problem.start, **start}))
 
     def built_for(self, problem: Problem) -> Simulator:
         """Return the loop of another form of the problem; it is not compiled again where its code is the same."""

@@ -122,7 +122,9 @@ class Draws(Variants):
         if self.count < 1:
             raise InvalidValue(f"draws {self.count}: expected at least 1")
         wide = {n for n, (low, high) in exact_ranges(problem.moves.parameters, self.percent).items() if high > low}
-        late = bool(self.percent) and _is_late(problem)
+        delay = problem.dead_time
+        delayed = delay.measurement or any(delay.inputs.values())
+        late = bool(self.percent and delayed) and problem.foreign is None  # a body outside has its own
         noisy = bool(problem.disturbances) or not problem.sensing.ideal or problem.foreign is not None
         if self.count > 1 and not (wide or late or noisy):
             mend = "state parameters of the plant, or a dead time" if self.percent else "give --mismatch P"
@@ -235,12 +237,6 @@ def _streams(seed: int, number: int) -> np.random.SeedSequence:
 def _told_apart(variants: Sequence[Variant]) -> list[Variant]:
     counts = Counter(one.build for one in variants)
     return [replace(one, alone=counts[one.build] == 1) for one in variants]
-
-
-def _is_late(problem: Problem) -> bool:
-    """Whether a dead time can be drawn: there is one, and it is not that of a body outside."""
-    times = problem.dead_time
-    return bool(times.measurement or any(times.inputs.values())) and problem.foreign is None
 
 
 def _with_dead_times(problem: Problem, percent: float) -> Problem:

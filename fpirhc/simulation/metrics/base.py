@@ -164,7 +164,8 @@ _TAKEN = frozenset({"compiled", "cycle_us", "notes", "optimality", "outcome", "p
 def known_metrics() -> tuple[Metric, ...]:
     """Return the shipped metrics and those of installed packages, in the order of their columns."""
     shipped = [metric for module in within("fpirhc.simulation.metrics") for metric in getattr(module, "METRICS", ())]
-    installed = [metric for point in entry_points(group=GROUP) for metric in _several(point.load())]
+    loaded = [point.load() for point in entry_points(group=GROUP)]
+    installed = [one for some in loaded for one in ((some,) if isinstance(some, Metric) else some)]
     return _ordered([*shipped, *installed])
 
 
@@ -180,10 +181,6 @@ def with_own_metrics(own: Iterable[Metric]) -> tuple[Metric, ...]:
     """
     known = known_metrics()
     return _ordered([*known, *(metric for metric in own if metric not in known)])
-
-
-def _several(loaded: Metric | Iterable[Metric]) -> Iterable[Metric]:
-    return (loaded,) if isinstance(loaded, Metric) else loaded
 
 
 def _ordered(metrics: Iterable[Metric]) -> tuple[Metric, ...]:
