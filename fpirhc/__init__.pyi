@@ -46,7 +46,6 @@ from .optimisers.published import FullSpaceFixedPoint as FullSpaceFixedPoint
 from .optimisers.published import GradientFixedPoint as GradientFixedPoint
 from .optimisers.published import ReducedGradient as ReducedGradient
 from .plant.integrators import Collocation as Collocation
-from .plant.integrators import Euler as Euler
 from .plant.integrators import RungeKutta4 as RungeKutta4
 from .plant.parameter import LogNormal as LogNormal
 from .plant.parameter import Normal as Normal

@@ -1,6 +1,6 @@
 """Integrators: the plant's state one control cycle later, with the command held. Theory: docs/theory.md.
 
-Runge-Kutta 4, Euler, and collocation with a fixed number of Newton steps are plain expressions, so they can be compiled and
+Runge-Kutta 4, and collocation with a fixed number of Newton steps, are plain expressions, so they can be compiled and
 exported.
 """
 
@@ -120,21 +120,6 @@ class RungeKutta4(_Substepped):
             return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
         return once
-
-
-@dataclass(frozen=True)
-class Euler(_Substepped):
-    """Explicit Euler with equal sub-steps: x+ = x + h f(x, u). First order, as in the horizons of the original papers.
-
-    Args:
-        substeps: number of equal steps per period.
-
-    Raises:
-        InvalidValue: fewer than one sub-step.
-    """
-
-    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
-        return lambda x, *given: x + h * rate(x, *given)
 
 
 @dataclass(frozen=True)

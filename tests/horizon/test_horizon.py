@@ -39,7 +39,7 @@ def point(ocp, seed=0):
 
 
 @pytest.mark.parametrize("name", COSTS)
-@pytest.mark.parametrize("discretisation", [fp.RungeKutta4(), fp.Euler()])
+@pytest.mark.parametrize("discretisation", [fp.RungeKutta4(), fp.Collocation()])
 def test_adjoint_gradient_agrees_with_finite_differences(name, discretisation):
     """An independent check, by central differences of the rolled-out cost."""
     ocp, data = built(COSTS[name], fp.Horizon(stages=8, step=0.05, discretisation=discretisation))

@@ -188,7 +188,7 @@ def test_long_stages_of_a_map_hold_the_input_over_whole_steps(optimiser):
 
 LIMITED = fp.Limits(inputs={"torque": (-6.0, 6.0)}, states={"angle": (-0.5, 0.5)})
 TASKS = {
-    "Euler": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.Euler(2), replan="cycle")),
+    "collocation": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.Collocation(2), replan="cycle")),
     "limits of rates": lambda: task(limits=replace(LIMITED, rates={"torque": (-FASTEST, FASTEST)}), replan=2),
     "prices": lambda: task(limits=replace(LIMITED, prices={"angle": 10.0})),
     "blocks": lambda: task(horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle")),

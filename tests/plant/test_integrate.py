@@ -43,11 +43,11 @@ def test_forcing_adds_to_the_response():
     np.testing.assert_allclose((forced - free).full().ravel(), [0.0, 2.5], equal_nan=False)
 
 
-@pytest.mark.parametrize(("degree", "order"), [(0, 1.0), (2, 3.0), (3, 5.0)])
+@pytest.mark.parametrize(("degree", "order"), [(2, 3.0), (3, 5.0)])
 def test_methods_have_their_order(degree, order):
     """Halving the step divides the error by 2^order, of collocation at d points 2 d - 1."""
     truth, counts = _truth(pendulum(), [1.0, 0.5], [0.3], 2.0), (1, 2, 4) if degree == 3 else (4, 8, 16)
-    methods = [fp.Collocation(n, degree, newton=5) if degree else fp.Euler(8 * n) for n in counts]
+    methods = [fp.Collocation(n, degree, newton=5) for n in counts]
     errors = [np.linalg.norm(_after(method, 0.5, 4) - truth) for method in methods]
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), order, atol=0.2, equal_nan=False)
 
