@@ -89,11 +89,8 @@ INLINE casadi_real plain_step(const Search* s, const Plan* plan, In lower, In up
 /* Accept the tried plan and return 1, or draw in and return 0. */
 INLINE int judged(Search* s, const Plan* best, const Plan* plan, int ok, In lower, In upper) {
   int i, untried = best->value >= UNTRIED, bold = s->tau >= SHORTEST;
-  casadi_real slack = ROUNDING * (1 + fabs(best->value)), reach = 0, envelope = 0, rise = 0, step;
-  if (ok) {
-    step = plain_step(s, plan, lower, upper, &reach);
-    envelope = plan->value + step + reach;
-  }
+  casadi_real slack = ROUNDING * (1 + fabs(best->value)), rise = 0, reach, step = plain_step(s, plan, lower, upper, &reach);
+  casadi_real envelope = plan->value + step + reach;
   if (ok && !untried) {
     casadi_real descent = 0;
     int freely, plainly;
@@ -143,7 +140,7 @@ INLINE void substitute(const int* free, In lower, In pivots, Out column) {
     for (k = 0; k < i; ++k) column[i] -= lower[k * NU + i] * column[k];
   }
   for (i = 0; i < NU; ++i) column[i] /= pivots[i];
-  for (i = NU - 1; i >= 0; --i)
+  for (i = NU - 1; i-- > 0;)
     for (k = i + 1; k < NU; ++k) column[i] -= lower[i * NU + k] * column[k];
 }
 

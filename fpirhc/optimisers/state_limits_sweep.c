@@ -103,7 +103,7 @@ INLINE void solved(In lower, In pivots, Out column) {
   for (i = 0; i < NU; ++i)
     for (k = 0; k < i; ++k) column[i] -= lower[k * NU + i] * column[k];
   for (i = 0; i < NU; ++i) column[i] /= pivots[i];
-  for (i = NU - 1; i >= 0; --i)
+  for (i = NU - 1; i-- > 0;)
     for (k = i + 1; k < NU; ++k) column[i] -= lower[i * NU + k] * column[k];
 }
 

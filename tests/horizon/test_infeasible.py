@@ -14,13 +14,12 @@ SLEDGE = fp.Plant(
     parameters={"m": fp.Parameter(1.0, 1.0, "kg")},
     response=lambda q, v, u, p: {"y": u.u / p.m},
 )
-STEP = 0.1  # s
 
 
 def plan_of(start: tuple[float, float], states: dict[str, tuple[float, float]], stages: int, **more: Any) -> fp.Plan:
     """The plan from (y, y') towards y = 0."""
     reference = fp.Trajectory(lambda t: {"y": 0 * t})
-    horizon = fp.Horizon(stages=stages, step=STEP)
+    horizon = fp.Horizon(stages=stages, step=0.1)
     cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.01})
     limits = fp.Limits(inputs={"u": (-1.0, 1.0)}, states=states, **more)
     ocp, data = horizon_of(SLEDGE, reference, horizon, cost, limits)

@@ -111,8 +111,7 @@ def test_mistakes_are_named(limits, message):
 
 
 def priced(price):
-    limits = fp.Limits(states={"angle'": (-0.5, 0.5)}, prices={"angle'": price})
-    ocp, data, first = limited(limits)
+    ocp, data, first = limited(fp.Limits(states={"angle'": (-0.5, 0.5)}, prices={"angle'": price}))
     return ocp, FIXED, first, data
 
 

@@ -110,10 +110,9 @@ def test_an_empty_box_is_told(stepping):
 
 def test_a_plan_that_overflows_is_forgotten(stepping):
     """A remembered plan under which the model overflows, and a first state from which every plan does."""
-    memory = np.zeros(stepping.size)
+    memory = np.full(stepping.size, 0.1)
     memory[:8] = 1e200
-    far = np.full(3, 1e160)
-    for first, box in ((np.ones(3), 1e250), (far, 9.0)):
+    for first, box in ((np.ones(3), 1e250), (np.full(3, 1e160), 9.0), (np.full(3, 1e160), np.inf)):
         bounds = np.full(2, -box), np.full(2, box)
         one, other = stepping.both(first, stepping.data, *bounds, memory)
         same(one, other, 1e-6)
