@@ -16,7 +16,7 @@ from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.optimisers.base import Optimiser, feasible_to, first_plan, improved, judge
 from fpirhc.optimisers.state_limits import tolerated
 from fpirhc.status import Status
-from fpirhc.summary import line, number, table
+from fpirhc.summary import line, number
 
 _WORST = 5  # violations in a text
 _AT_BOUND = 1e-6  # relative distance within which an input counts as at its bound
@@ -52,11 +52,6 @@ class Plan:
 
     def __repr__(self) -> str:
         return line(self, self.status.name, *(f"{name} {value}" for name, value in self._facts()))
-
-    def _repr_html_(self) -> str:
-        """The numbers of the plan and its faults as a table, for notebooks."""
-        notes = [self.status.remedy, *self.violations(), self.overflow()]
-        return table(f"Plan: {self.status.name}", ("", "value"), self._facts(), notes)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

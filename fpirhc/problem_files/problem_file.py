@@ -32,9 +32,9 @@ from fpirhc.problem_files.settings import (
 from fpirhc.problem_files.shipped import find_problem
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures import Picture
-from fpirhc.summary import line, table
+from fpirhc.summary import line
 from fpirhc.task.cases import Cases, as_declared
-from fpirhc.task.problem import Problem, problem_facts
+from fpirhc.task.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +81,6 @@ class Task(FoundByName):
 
     def __repr__(self) -> str:
         return line(self, self.name, self.title, f"{len(self.controllers)} controllers")
-
-    def _repr_html_(self) -> str:
-        """The controllers as a table, for notebooks."""
-        pair = dict(zip(self.headline or (), ("without adaptation", "with adaptation"), strict=False))
-        kinds = {name: (type(one).__name__, type(one.deformation).__name__) for name, one in self.controllers.items()}
-        rows = [(name, *both, pair.get(name, "")) for name, both in kinds.items()]
-        notes = [*self.description.split("\n\n")[:1], f"Problem: {', '.join(problem_facts(self.problem))}."]
-        return table(f"{self.name}: {self.title}", ("controller", "kind", "deformation", "headline"), rows, notes)
 
 
 @checked_call

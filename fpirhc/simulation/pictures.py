@@ -251,7 +251,7 @@ class Shape:
 class Planar(Picture):
     """A panel for each controller in which the mechanism moves; pale lines are where the reference wants it.
 
-    In an HTML report it plays, pauses and follows the cursor of the charts; `player` is for notebooks. A picture that stands still
+    In an HTML report it plays, pauses and follows the cursor of the charts. A picture that stands still
     has moments of the run, the later the darker. The reference is drawn where it has all coordinates of the plant.
 
     Args:

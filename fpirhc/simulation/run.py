@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.errors import InvalidName, OutputError, nearest
 from fpirhc.fields.checked import ByName, FoundByName, checked_call
 from fpirhc.status import Status
-from fpirhc.summary import in_percent, in_units, line, number, table
+from fpirhc.summary import in_percent, in_units, line
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.whole_file import write_whole
 
@@ -115,14 +115,6 @@ class Run(FoundByName):
 
     def __repr__(self) -> str:
         return line(self, f"{self.problem or 'problem'}, {self.controller}", *self._facts())
-
-    def _repr_html_(self) -> str:
-        """Extremes of errors and commands as a table, for notebooks."""
-        shown = [s for s in ("true_error", "error", "command") if s in self.layout and self.cycles]
-        columns = [c for s in shown for c in self.layout[s].columns]
-        rows = [(c, self.unit(c), number(self[c].min()), number(self[c].max()), number(self[c][-1])) for c in columns]
-        title = f"Run of {self.controller} on {self.problem or 'the problem'}"
-        return table(title, ("signal", "unit", "smallest", "largest", "last"), rows, [", ".join(self._facts())])
 
     def _facts(self) -> tuple[str, ...]:
         how = "compiled C" if self.compiled else "virtual machine"

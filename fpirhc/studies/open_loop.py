@@ -25,7 +25,7 @@ from fpirhc.members import member_modules
 from fpirhc.optimisers.base import Optimiser
 from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.summary import line, number, table
+from fpirhc.summary import line, number
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
@@ -65,11 +65,6 @@ class Certificate:
 
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self._facts()))
-
-    def _repr_html_(self) -> str:
-        """The bounds as a table, for notebooks."""
-        note = "" if self.factor < 1 else "The distance to the optimum is not known: the factor is not below 1."
-        return table("Certificate", ("", "value"), self._facts(), [note])
 
     def _facts(self) -> list[tuple[str, str]]:
         limits = [

@@ -44,7 +44,7 @@ def test_what_cannot_be_kept_is_named_by_how_much(start, limits, stages, limit, 
     values = [float(text.partition(" is ")[2].split()[0]) for text in violations if "at stage 0" not in text]
     bound = next(v for v in limits if f" {v:g}" in limit)
     assert max(abs(value - bound) for value in values) == pytest.approx(most, abs=1e-3)
-    assert "soften state limits, or lengthen the horizon" in plan._repr_html_()
+    assert "soften state limits, or lengthen the horizon" in plan.status.remedy
 
 
 def test_a_price_lets_the_plan_pass_and_come_back():

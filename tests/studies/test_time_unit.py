@@ -51,7 +51,7 @@ def test_nothing_speaks_of_seconds(tmp_path, monkeypatch, capsys):
     assert f"cycles of {task.problem.period:g} {UNIT}" in repr(run)
     labels = [text for axis in run.plot().axes for text in (axis.get_xlabel(), axis.get_ylabel(), axis.get_title())]
     assert any(f"[{UNIT}]" in label for label in labels)
-    said += [*labels, *(f"[{unit}]" for unit in run.layout.units), run._repr_html_(), metrics._repr_html_()]
+    said += [*labels, *(f"[{unit}]" for unit in run.layout.units), repr(run), repr(metrics)]
     assert [text for text in said if SECONDS.search(text)] == []
     with pytest.raises(InvalidProblem, match=rf"{task.problem.period * 1.3:g} {UNIT} does not divide .* {UNIT}"):
         replace(task.problem, period=task.problem.period * 1.3)

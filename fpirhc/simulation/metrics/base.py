@@ -23,7 +23,7 @@ from fpirhc.members import within
 from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
-from fpirhc.summary import line, number, table, written_out
+from fpirhc.summary import line, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.task.problem import Problem
 
@@ -254,11 +254,6 @@ class Metrics(FoundByName):
             f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.headline
         )
         return line(self, *(" ".join(fact.split()) for fact in facts), f"worst {self.worst_status}")
-
-    def _repr_html_(self) -> str:
-        """All numbers as a table, for notebooks."""
-        rows = [(f"{m.heading} {element}".strip(), number(v), self.units[m.name][element]) for m, element, v in self]
-        return table("Metrics", ("metric", "value", "unit"), rows)
 
 
 @checked_call
