@@ -192,7 +192,7 @@ class Limits(Study):
 def _most(quantity: str, rows: pd.DataFrame) -> str:
     """Who bears most, where somebody bears more than the others."""
     best = rows.loc[rows.fails == rows.fails.max(), "controller"]
-    return f"{quantity}: {', '.join(best)} bears most." if 0 < len(best) < len(rows) else ""
+    return f"{quantity}: {', '.join(best)} bear{'s' * (len(best) == 1)} most." if 0 < len(best) < len(rows) else ""
 
 
 @checked_call

@@ -206,12 +206,13 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
             yield f"{name}: the {most} {aim.column} is {number}, at {place}.", None
     failed = result.table.loc[result.table.outcome != "finished"].groupby("controller").first()
     why = {r.controller: f" The first, {r.variant}: {r.outcome}{r.why and ': '}{r.why}" for r in _rows(failed)}
+    calm = [row.controller for row in _rows(summary) if not row.failures]
     for row in _rows(summary):
         low, high = share_interval(row.failures, row.variants)
         others = f"; of all plants drawn so {in_percent(low)} to {in_percent(high)} fail, with 95 % confidence"
-        drawn = others if result.variants.random else ""
-        if drawn or row.failures:
-            text = f"{row.controller} fails in {row.failures} of {row.variants}{drawn}."
+        drawn, names = others if result.variants.random else "", [row.controller] if row.failures else calm
+        if (drawn or row.failures) and row.controller == names[0]:
+            text = f"{', '.join(names)} fail{'s' * (len(names) == 1)} in {row.failures} of {row.variants}{drawn}."
             yield text + why.get(row.controller, ""), None
 
 
