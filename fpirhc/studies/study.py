@@ -74,7 +74,7 @@ class VariantStudy(Study):
         moves = [name for name in map(str, summary) if name.startswith(_MOVES) and name != noun]
         heads = ["controller", f"worst {noun}", f"worst {self.variants.place}", "failures", f"median {noun}"]
         heads += [f"against {first}", "95 % interval"]
-        heads += [f"moves {n.removeprefix(_MOVES)} [{units.get(n, '1')}]" for n in moves]
+        heads += [f"variation {n.removeprefix(_MOVES)} [{units.get(n, '1')}]" for n in moves]
         shown = Table(title, [*map(Column, heads), Column("better in", None)])  # the verdict has it
         text, apart = self.figure.text, self.figure.difference
         for row in _rows(summary):
