@@ -99,11 +99,8 @@ class LiveSettings:
         return problem, checked(problem, controller, numbers_only=True), values
 
     def bounds(self, path: str) -> Interval:
-        """Return the interval around the number of the build in which a setting is accepted while the others stay.
-
-        An end is the last number that a bisection accepts, to a millionth, or infinite. A limit of an input, a fact of the machine,
-        ends at that of the build.
-        """
+        """Return the interval around the number of the build in which a setting is accepted while the others stay."""
+        # A limit of an input is a fact of the machine: it ends at that of the build.
         of_machine = path[-2:] if path.startswith("limits.inputs.") else ""
         ends = (("." + "01"[side > 0], side) for side in (-1, 1))
         low, high = (self._content(path) if end == of_machine else self._end(path, side) for end, side in ends)

@@ -109,17 +109,14 @@ Seed: TypeAlias = CountOrZero  # of random numbers
 
 
 def real_number(value: object) -> float | None:
-    """Return one real number as a float, which may be NaN or infinite; None for everything else.
-
-    Arrays with one entry count. No numbers are texts, truth values, None, complex numbers, durations (numpy makes integers of
-    them), expressions, and whole numbers beyond the largest float, 1.8e308.
-    """
+    """Return one real number as a float, which may be NaN or infinite; None for everything else."""
     if type(value) is float:
         return value
     if isinstance(value, np.ndarray):
         if isinstance(value, np.ma.MaskedArray) or value.size != 1:
             return None
         value = value.ravel()[0]
+    # Of durations numpy makes integers.
     if isinstance(value, bool | np.bool_ | np.timedelta64) or not isinstance(value, numbers.Real):
         return None
     try:

@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 
 class Equations:
-    """What a plant's equations say, each Function made when it is asked for; other exact parameters do not change them.
-
-    A forcing w, one entry per coordinate, adds to the highest derivatives.
-    """
+    """What a plant's equations say, each Function made when it is asked for; other exact parameters do not change them."""
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant

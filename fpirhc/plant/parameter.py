@@ -99,11 +99,7 @@ def with_exact_values(parameters: Mapping[str, Parameter], exact: Iterable[float
 
 
 def exact_ranges(parameters: Mapping[str, Parameter], mismatch: float) -> dict[str, tuple[float, float]]:
-    """Return the least and the largest value of every exact parameter, |p - p_exact| <= P/100 |p_exact| for P percent, P < 100.
-
-    p_exact is the value in the problem file: a parameter keeps its sign, and zero stays zero. One with a `spread` lies in P/100 of
-    that spread; where all parameters have one, P may be 100 and more.
-    """
+    """Return the least and the largest value of every exact parameter, |p - p_exact| <= P/100 |p_exact| for P percent, P < 100."""
     all_spread = bool(parameters) and all(p.spread is not None or p.outside for p in parameters.values())
     if not 0 <= mismatch < (math.inf if all_spread else 100):
         signs = "and less than 100 %, where no parameter changes its sign; a wider range needs a `spread` of every Parameter"
@@ -124,10 +120,7 @@ def exact_ranges(parameters: Mapping[str, Parameter], mismatch: float) -> dict[s
 
 
 def drawn(parameter: Parameter, mismatch: float, share: float) -> float:
-    """Return the exact value at this share of the distribution, from 0 to 1.
-
-    Without a spread the factor is log-uniform between 1 - P/100 and 1 + P/100.
-    """
+    """Return the exact value at this share of the distribution, from 0 to 1."""
     if parameter.outside:
         return parameter.exact
     if parameter.spread is not None:

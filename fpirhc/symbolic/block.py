@@ -247,10 +247,7 @@ def rename(name: str, source: Signal, target: Signal) -> Block:
 
 
 def every(block: Block, cycles: int) -> Block:
-    """Return a block that runs `block` in every `cycles`-th cycle and holds its writes in between.
-
-    A skipped cycle does not evaluate the block (short circuit), so an expensive block costs time only when it runs.
-    """
+    """Return a block that runs `block` in every `cycles`-th cycle and holds its writes in between."""
     if cycles < 1:
         raise InvalidValue(f"block '{block.name}' is to run every {cycles} cycles; expected 1 or more")
     if cycles == 1:

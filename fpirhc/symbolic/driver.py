@@ -130,10 +130,7 @@ def registered(name: str, driver: Driver) -> str:
 
 @contextmanager
 def compiled_plans(yes: bool = True) -> Iterator[None]:
-    """Within it a loop of the virtual machine calls the compiled plan: a short run is not worth a compiler, its plans are.
-
-    What is composed within calls a library, so it cannot be compiled as a whole.
-    """
+    """Within it a loop of the virtual machine calls the compiled plan: a short run is not worth a compiler, its plans are."""
     token = _COMPILED.set(yes)
     try:
         yield

@@ -169,11 +169,7 @@ class Layout:
         return Layout(self.signals + other.signals)
 
     def slice(self, name: str) -> slice:
-        """Place of one signal in the flat vector.
-
-        Raises:
-            InvalidName: an unknown signal; the nearest valid name is offered.
-        """
+        """Place of one signal in the flat vector."""
         try:
             return self._slices[name]
         except (KeyError, TypeError):  # TypeError: a list or a range of numbers
@@ -189,13 +185,7 @@ class Layout:
         return Layout(tuple(replace(s, start=parts[s.name]) for s in self.signals))
 
     def pack(self, values: Mapping[str, npt.ArrayLike]) -> np.ndarray:
-        """Numbers by name -> flat vector; signals that are not named have their start values.
-
-        Raises:
-            InvalidName: an unknown signal.
-            InvalidShape: a wrong number of entries.
-            InvalidValue: no numbers.
-        """
+        """Numbers by name -> flat vector; signals that are not named have their start values."""
         flat = self.start()
         for name, value in values.items():
             place = self.slice(name)
@@ -209,11 +199,7 @@ class Layout:
         return flat
 
     def unpack(self, flat: np.ndarray) -> dict[str, np.ndarray]:
-        """Flat vector(s), entries along the last axis -> arrays by name.
-
-        Raises:
-            InvalidShape: the last axis is not `size` long.
-        """
+        """Flat vector(s), entries along the last axis -> arrays by name."""
         if flat.shape[-1] != self.size:
             raise InvalidShape(f"expected {self.size} entries, got {flat.shape[-1]}")
         return {name: flat[..., place] for name, place in self._slices.items()}

@@ -112,10 +112,7 @@ def compiling_ahead() -> Iterator[Callable[..., None]]:
 
 
 def cache_folder() -> Path:
-    """Folder of compiled libraries: the user's own one in FPIRHC_CACHE, which may be shared, or fpirhc in the user's cache.
-
-    It is a temporary folder of this process where that one cannot be written, or others may write to it: what is in it is run.
-    """
+    """Folder of compiled libraries: the user's own one in FPIRHC_CACHE, which may be shared, or fpirhc in the user's cache."""
     setting, posix = os.environ.get("FPIRHC_CACHE"), os.name == "posix"
     try:
         if setting:
@@ -124,7 +121,7 @@ def cache_folder() -> Path:
             base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fpirhc"
         base = base.absolute()  # a bare file name would be looked for in the system's library folders
         base.mkdir(mode=0o700, parents=True, exist_ok=True)
-        facts = base.lstat()  # of a link itself: one of a stranger leads to what is not meant
+        facts = base.lstat()  # of a link itself: one of a stranger leads to what is not meant, and what is in it is run
         if posix and (facts.st_uid != os.geteuid() or not stat.S_ISDIR(facts.st_mode) or facts.st_mode & 0o022):
             return Path(_temporary_folder().name)
         with tempfile.TemporaryFile(dir=base):

@@ -62,10 +62,7 @@ def _called(function: ca.Function) -> list[ca.Function]:
 
 
 def _with_bodies(source: str, bodies: Mapping[str, str], declared: str) -> str:
-    """The C in which some Functions have other bodies, and without what the old ones alone called.
-
-    What is dead is most of the text of a plan, and would have it compiled with less optimising.
-    """
+    """The C in which some Functions have other bodies, and without what the old ones alone called."""
     head, *parts = _PART.split(_LIBRARY.sub("", source) if _LIBRARIES in source else source)
     written, waiting = dict[str, str](), list[str]()
     for k, part in enumerate(parts):
@@ -76,7 +73,7 @@ def _with_bodies(source: str, bodies: Mapping[str, str], declared: str) -> str:
             written[own["place"]] = parts[k]
         else:
             waiting.append(part)
-    needed = set[str]()
+    needed = set[str]()  # what is dead is most of the text of a plan, and would have it compiled with less optimising
     while waiting:
         fresh = set(re.findall(r"\bcasadi_f\d+\b", waiting.pop())) & written.keys() - needed
         needed |= fresh
@@ -96,15 +93,12 @@ def _signature_of_loop(function: ca.Function, calls: int) -> ca.Function:
 
 
 def _loop(source: str, function: ca.Function) -> str:
-    """The body of the loop: two memories change places, and every call writes into its columns of the tables.
-
-    CasADi's own chain keeps the memories of all calls, and copies that table three times.
-    """
+    """The body of the loop: two memories change places, and every call writes into its columns of the tables."""
     found = re.search(rf"^/\* {function.name()}:\([^\n]*\*/\nstatic int (\w+)\(", source, re.MULTILINE)
     assert found
     size, reads, results = function.numel_out(0), range(1, function.n_in()), range(1, function.n_out())
     first = len(reads) + 2  # arguments of the loop: the memory, the tables, the count
-    lines = [
+    lines = [  # CasADi's own chain keeps the memories of all calls, and copies that table three times
         f"casadi_real memory[2][{size}];",
         f"const casadi_real** arg1 = arg + {first};",
         f"casadi_real** res1 = res + {len(results) + 1};",

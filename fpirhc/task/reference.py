@@ -55,11 +55,7 @@ class Reference(Checked, ABC):
         """Return {coordinate: expression of t}."""
 
     def function(self, plant: Plant) -> ca.Function:
-        """Function t -> (nominal state (nx), nominal response (n)); of a plant with outputs these are those of its outputs.
-
-        Raises:
-            InvalidProblem: a coordinate is missing, unknown, or not a scalar.
-        """
+        """Function t -> (nominal state (nx), nominal response (n)); of a plant with outputs these are those of its outputs."""
         return _FUNCTIONS.of((self, plant.equations), (), lambda: self._function(plant))
 
     def _function(self, plant: Plant) -> ca.Function:
@@ -227,10 +223,7 @@ class Setpoint(Reference):
         return _arranged(plant, {c: self._chain(plant, parts[k], points[k]) for k, c in enumerate(orders)})
 
     def _chain(self, plant: Plant, z: Expression, held: Expression) -> list[Expression]:
-        """(y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map y and its divided forward differences.
-
-        They are the first entries of D^j d for the distance d = z - w b.
-        """
+        """(y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map y and its divided forward differences."""
         order, values, apart = z.numel(), [z[0]], ca.vertcat(z[0] - held, z[1:])
         slopes = ca.DM(_slopes(self.rate, order))
         along = derivative_along(plant, slopes, lambda cycle: ca.DM(_transition(self.rate, cycle, order)))
