@@ -87,12 +87,13 @@ class _Conversation(Exchange):
 
     def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:
         self._cycles = cycle + 1
-        reading = self._body.read(cycle * self.problem.period, sent[0].copy())
-        self._bridged = 0 if reading.values is not None else self._bridged + 1
-        self._held[0] = float(reading.values is None)
-        if reading.values is not None:
-            self._answer[:] = reading.values
-        return (reading.mistake, self._body.remedy) if self._bridged > self._body.holds else None
+        answer = self._body.read(cycle * self.problem.period, sent[0].copy())
+        bad = self._held[0] = isinstance(answer, str)
+        self._bridged = self._bridged + 1 if bad else 0
+        if not isinstance(answer, str):
+            self._answer[:] = answer
+            return None
+        return (answer, self._body.remedy) if self._bridged > self._body.holds else None
 
     def end(self) -> None:
         self._body.end(self._cycles * self.problem.period, self.problem.plant.inputs)

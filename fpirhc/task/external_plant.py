@@ -40,14 +40,6 @@ Make = Callable[[Mapping[str, float], int], Body]
 """Function (values of the parameters by name, seed) -> body."""
 
 
-@dataclass(frozen=True)
-class Reading:
-    """One answer of a body."""
-
-    values: np.ndarray | None  # shape (number of quantities,); None where the answer is bad
-    mistake: str = ""  # why it is bad; empty where it is not
-
-
 @dataclass(frozen=True, eq=False)
 class ExternalPlant(Checked):
     """A reality outside: `Problem(reality=ExternalPlant(body, measures=...))`.
@@ -167,13 +159,13 @@ class ExternalPlant(Checked):
             if mistake := self._wrong(body):
                 raise InvalidProblem(f"reality: make returned {mistake}")
             self._present[:] = [body]
-        reading = self._answer(lambda: self._present[0].reset(seed), "reset")
-        if reading.values is None:
-            raise InvalidProblem(f"reality: {reading.mistake}")
-        return reading.values
+        answer = self._answer(lambda: self._present[0].reset(seed), "reset")
+        if isinstance(answer, str):
+            raise InvalidProblem(f"reality: {answer}")
+        return answer
 
-    def read(self, time: float, command: np.ndarray) -> Reading:
-        """Return the answer to a command."""
+    def read(self, time: float, command: np.ndarray) -> np.ndarray | str:
+        """Return the answer to a command, or why it is bad."""
         return self._answer(lambda: self._present[0].step(time, command), "step")
 
     def end(self, time: float, inputs: Iterable[str]) -> None:
@@ -183,10 +175,8 @@ class ExternalPlant(Checked):
             try:
                 if resting is not None:
                     answer = self._answer(partial(body.step, time, resting), "step")
-                    if answer.mistake:
-                        warnings.warn(
-                            f"reality: the inputs at rest may not have arrived: {answer.mistake}", stacklevel=2
-                        )
+                    if isinstance(answer, str):
+                        warnings.warn(f"reality: the inputs at rest may not have arrived: {answer}", stacklevel=2)
             finally:
                 close = getattr(body, "close", None)
                 if callable(close):
@@ -209,25 +199,23 @@ class ExternalPlant(Checked):
     def _present(self) -> list[Body]:
         return [] if self.body is None else [self.body]
 
-    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str) -> Reading:
+    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str) -> np.ndarray | str:
         who, expected = f"{method} of {self.name}", f"{len(self.measures)} numbers: {', '.join(self.measures)}"
         try:
             returned = ask()
             values = np.ma.filled(returned, np.nan)  # what lies under a mask is no measurement
         except FpirhcError as error:  # those of an adapter say it all
-            return Reading(None, f"{who}: {error}")
+            return f"{who}: {error}"
         except Exception as error:  # noqa: BLE001  # a stranger's object may raise anything
-            return Reading(None, f"{who} raised {_words(error)}")
+            return f"{who} raised {_words(error)}"
         if values.dtype.kind not in "iuf":
-            return Reading(None, f"{who} returned {reprlib.repr(returned)}, expected {expected}")
+            return f"{who} returned {reprlib.repr(returned)}, expected {expected}"
         if values.shape != (len(self.measures),):
-            return Reading(None, f"{who} returned the shape {values.shape}, expected {expected}")
+            return f"{who} returned the shape {values.shape}, expected {expected}"
         if not np.isfinite(values).all():
             place = int(np.argmin(np.isfinite(values)))
-            return Reading(
-                None, f"{who} returned {list(self.measures)[place]} = {values[place]}, expected a finite number"
-            )
-        return Reading(values.astype(float))
+            return f"{who} returned {list(self.measures)[place]} = {values[place]}, expected a finite number"
+        return values.astype(float)
 
 
 def _words(error: Exception) -> str:
