@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
+from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.constraint_states import ConstraintState, as_measured, check_names, entries_of, state_prices
 from fpirhc.horizon.cost import Cost, Linearisation, View, outputs_of, reads_feedforward, view_of
 from fpirhc.horizon.horizon import Horizon
@@ -166,11 +167,10 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
         before = before if keeps_input else ca.SX(0, 1)
         end = _end_view(plant, view, x, before if keeps_input else ca.SX.nan(plant.input.size))
         linearise = lambda: _linearise(plant, reference, horizon, advance)  # noqa: E731
-        final = ca.SX(cost.terminal_cost(end, plant, linearise, horizon.last))
+        terminal = cost.terminal_cost(end, plant, linearise, horizon.last)
     except InvalidName as error:
         raise InvalidProblem(f"cost: {error}") from None
-    if final.numel() != 1:
-        raise InvalidProblem(f"cost: term 'terminal' must be one scalar, got shape {final.shape}")
+    final = scalar_expression("cost: term 'terminal'", terminal, finite=False)
     _check_entries(plant, keeps_input, written)
     settings = open_in(x_next, *terms.values(), final, *(w.expression for w in written))
     theta, s = ca.vertcat(theta, *settings), ca.vertcat(x, before, ca.SX.sym("z", len(written)))

@@ -83,8 +83,7 @@ def check_problem(problem: Problem) -> None:
     mistakes.raise_if_any()
     check_maps(plant, problem.real_plant, mistakes)
     mistakes.raise_if_any()
-    # Problems share what they share.
-    parts = plant, problem.cost, problem.limits
+    parts = plant, problem.cost, problem.limits  # which problems share
     mistakes.join(_STAGES.of(parts, (), lambda: _of_stage(*parts)))
     _check_inverse(problem, mistakes)
     smooth = not_held(problem.signals, differentiated_signals(plant))
@@ -216,9 +215,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
 def _check_disturbances(problem: Problem) -> None:
     """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
     mistakes, instants = Mistakes("disturbances"), np.array([0.0, problem.period])
-    others = (
-        () if problem.foreign else (*problem.real_plant.coordinates, *problem.plant.outputs)
-    )  # nothing reaches into a body
+    others = () if problem.foreign else (*problem.real_plant.coordinates, *problem.plant.outputs)  # none of a body
     mistakes.unknown("input, coordinate or output", problem.disturbances, (*problem.plant.inputs, *others))
     for name, one in problem.disturbances.items():
         with mistakes.caught(f"'{name}': "):
@@ -258,7 +255,10 @@ def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> Mistakes:
     if cost is not None:
         with mistakes.caught():
             cost.check(plant)
-            for name, term in named_results("cost", cost.stage(view)).items():
+            terms = named_results("cost", cost.stage(view))
+            if not terms:
+                mistakes.add("cost: it has no term; return {'name': expression} with one at least")
+            for name, term in terms.items():
                 scalar_expression(f"cost: term '{name}'", term, symbols=symbols, finite=False)
     for name, path in limits.paths.items():
         with mistakes.caught():
