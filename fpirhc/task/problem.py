@@ -216,25 +216,25 @@ class Problem(Checked):
         values = [self.input_before.get(name, rest) for name, rest in zip(self.plant.inputs, resting, strict=True)]
         return np.array(values, dtype=float)
 
-    def _at_start(self, *, seen: bool) -> dict[str, float]:
-        """What sensors may show at the start, as it is judged or measured; the model's states where what moves has none."""
-        plant, at = self.plant, (self.real_start, self.inputs_before, self.real_parameters)
-        motion = self.truth.shown((*plant.state.elements, *plant.output.elements), seen=seen)
-        names = tuple(dict.fromkeys((*motion, *response_names(plant))))
-        values = self.truth.function(names, seen=seen)(*at, np.zeros(len(self.real_plant.names))).full().ravel()
-        believed = dict(zip(plant.state.elements, self.start_state.tolist(), strict=True))
-        return believed | dict(zip(names, values.tolist(), strict=True))
+    def _at_start(self, quantities: Sequence[str], *, seen: bool) -> np.ndarray:
+        """Values of quantities of the model, of the plant that moves, as they are judged or measured at the start."""
+        at = self.real_start, self.inputs_before, self.real_parameters, np.zeros(len(self.real_plant.names))
+        return np.asarray(self.truth.function(quantities, seen=seen)(*at).full()).ravel()
 
     @cached_property
     def start_output(self) -> np.ndarray:
-        """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state."""
-        values = self._at_start(seen=False)
-        return np.array([values[e] for e in self.plant.output.elements])
+        """First value of the outputs and their derivatives, of the plant that moves; without outputs the first state, as stated."""
+        outputs = self.plant.output.elements
+        return self._at_start(outputs, seen=False) if self.plant.outputs else self.start_state
 
     @cached_property
     def first_shown(self) -> Mapping[str, float]:
         """What sensors without noise show at the start, by name; of states that what moves does not have, the model's value."""
-        return self._at_start(seen=True)
+        plant = self.plant
+        motion = self.truth.shown((*plant.state.elements, *plant.output.elements))
+        names = tuple(dict.fromkeys((*motion, *response_names(plant))))
+        believed = dict(zip(plant.state.elements, self.start_state.tolist(), strict=True))
+        return believed | dict(zip(names, self._at_start(names, seen=True).tolist(), strict=True))
 
     @property
     def first_output(self) -> np.ndarray:

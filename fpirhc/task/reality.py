@@ -113,9 +113,9 @@ class Reality(Checked):
         elif own is None and name in (model.controlled or model.chains):
             mistakes.add(f"no input reaches its {what} '{seen}', however often it is differentiated")
 
-    def shown(self, quantities: Sequence[str], *, seen: bool = True) -> tuple[str, ...]:
+    def shown(self, quantities: Sequence[str]) -> tuple[str, ...]:
         """Return those of the model's states, outputs and their derivatives that it has."""
-        return tuple(e for e in quantities if self._own(e.rstrip("'"), seen=seen) in self._units)
+        return tuple(e for e in quantities if self._own(e.rstrip("'"), seen=True) in self._units)
 
     def shows(self, name: str) -> bool:
         """Whether it has a coordinate or an output at which one of the model is judged."""
