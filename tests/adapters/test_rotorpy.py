@@ -28,8 +28,7 @@ def shown(plant: fp.ExternalPlant, seconds: float = 0.1) -> dict[str, float]:
     """What it measures after it was told to hover."""
     plant.first(0)
     for k in range(round(seconds / 1e-2)):
-        values = plant.read(k * 1e-2, np.array([0.0, 0.0, 9.81])).values
-    assert values is not None
+        values = plant.read(k * 1e-2, np.array([0.0, 0.0, 9.81]))
     return dict(zip(plant.measures, values, strict=True))
 
 
