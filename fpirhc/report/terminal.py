@@ -285,11 +285,18 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
     for name, answers in found.answers.items():
         shown = [one for one in answers if verbose or one.verdict != "yes"]
         say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
-        for one, after in zip(shown, [*(later.change for later in shown[1:]), ""], strict=False):
-            evidence = f" ({one.evidence})" if one.evidence else ""
-            say(f"  {one.verdict:7s} {one.question}{evidence}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
-            if one.change and one.change != after:  # the same advice stands once, below its last row
-                say(f"          -> {one.change}", "bold")
+        for change in dict.fromkeys(one.change for one in shown):  # once, below its rows
+            rows = [one for one in shown if one.change == change]
+            if rows[1:] and rows[0].verdict == "unknown" and not verbose:
+                say(f"  unknown {len(rows)} questions")
+                rows = []
+            for one in rows:
+                told = f"  {one.verdict:7s} {one.question}" + f" ({one.evidence})" * bool(one.evidence)
+                say(told, STYLES[Outcome.WORSE] if one.verdict == "no" else "")
+            if change:
+                say(f"          -> {change}", "bold")
+    if len({one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}) > 1:
+        say("Take one advice at a time, the uppermost first, and ask again after each.")
     say(", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
 
 

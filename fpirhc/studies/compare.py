@@ -59,7 +59,7 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            owners.setdefault(f"{error}{best and f'; write {best}'}", []).append(f"'{name}'")
+            owners.setdefault(f"{error}{best and f'. {best}'}", []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     for why, names in owners.items():
