@@ -73,8 +73,7 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
     """
     say(view.title, "bold", f" {view.conditions}")
     sentences = list(view.sentences)
-    shown = sentences if verbose else sentences[:1]
-    show_sentences(shown)
+    show_sentences(shown := sentences if verbose else sentences[:1])
     if others := sentences[len(shown) :]:
         outcomes = Counter(str(outcome) for _, outcome in others if outcome not in IN_FULL)
         say(
@@ -144,8 +143,7 @@ def show_table(table: Table, console: Console | None = None) -> None:
 def _parts(table: Table, width: int) -> list[list[int]]:
     """Places of the columns of every part, without those that name the rows."""
     room = width - _EDGES - sum(_least(table, k) + _BETWEEN for k in range(table.names))
-    parts: list[list[int]] = [[]]
-    used = 0
+    parts, used = list[list[int]]([[]]), 0
     for k in range(table.names, len(table.columns)):
         need = _least(table, k) + _BETWEEN
         if parts[-1] and used + need > room:
@@ -174,9 +172,8 @@ def _grid(table: Table, part: Sequence[int]) -> Grid:
     places = [*range(table.names), *part]
     for k in places:
         justify: JustifyMethod = "left" if k < table.names or table.columns[k].left else "right"
-        head = Text(_whole_units(table.columns[k].head))
         width = None if k < table.names else _least(table, k)  # names have what the numbers leave
-        grid.add_column(head, justify=justify, width=width, overflow="fold")
+        grid.add_column(Text(_whole_units(table.columns[k].head)), justify=justify, width=width, overflow="fold")
     for row in table.rows:
         cells = (Text(printable(row.cells[k]), "bold" if k in row.best else "") for k in places)
         grid.add_row(*cells, style=row.style)
@@ -287,17 +284,14 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
         say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
         for change in dict.fromkeys(one.change for one in shown):  # once, below its rows
             rows = [one for one in shown if one.change == change]
-            if rows[1:] and rows[0].verdict == "unknown" and not verbose:
-                say(f"  unknown {len(rows)} questions")
-                rows = []
-            for one in rows:
-                told = f"  {one.verdict:7s} {one.question}" + f" ({one.evidence})" * bool(one.evidence)
-                say(told, STYLES[Outcome.WORSE] if one.verdict == "no" else "")
-            if change:
-                say(f"          -> {change}", "bold")
-    if len({one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}) > 1:
-        say("Take one advice at a time, the uppermost first, and ask again after each.")
-    say(", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
+            brief = len(rows) > 1 and rows[0].verdict == "unknown" and not verbose
+            for one in rows[: 1 if brief else None]:
+                what = f"{len(rows)} questions" if brief else one.question + f" ({one.evidence})" * bool(one.evidence)
+                say(f"  {one.verdict:7s} {what}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
+            say(f"          -> {change}", "bold") if change else None
+    advised = {one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}
+    first = "Take one advice at a time, the uppermost first, and ask again after each.\n" * (len(advised) > 1)
+    say(first + ", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))
 
 
 def show_probe(title: str, answer: Probe) -> None:

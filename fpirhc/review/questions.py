@@ -383,7 +383,7 @@ QUESTIONS = (
              "without adaptation| {error_recommended:%} at {recommended_gain:4}| {error_at_half:%} at half of the gain| "
              "{error_at_twice:%} at twice| {error_at_best:%} at the best that was run, {best_gain:4}| total variation of {of} "
              "{movement:r} ({start})| {movement_recommended:r} as recommended| {movement_without:r} without adaptation", "No gain "
-             "that was run helps, is calm, and has reserve.", "filter form Predicted window without", "adaptive"),
+             "that was run helps, is calm, and has reserve.", "filter form Predicted window sensors without", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "rms error of {of} {rms_error:u} ({counted}), {error:%} of its "
              "motion of {size:u}| mean {mean_error:u}", "", "residual_time gain without rate weight window Predicted limits "
              "speed"),

@@ -213,7 +213,7 @@ limits reversed
 gain of the wrong sign
   gain=-0.7 -> gain=0.7
   {"pump1": (0.0, 2.0), "pump2": (0.0, 2.0)} -> {"pump1": (-2.0, 2.0), "pump2": (-2.0, 2.0)}
-    no Is the gain admissible? ... Set the gain to -
+    no Is the gain admissible? ... Set deformation.gain to -
 """
 OTHERS = {
     "no input in the response": one(

@@ -1,7 +1,6 @@
 """The table of a review: its keys and names, its exit code, and what it asks of whom."""
 
 import json
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -16,20 +15,19 @@ from fpirhc.__main__ import main
 
 LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
 NAMES = {  # of numbers by key, which scripts read
-    "turns": {"jumps"}, "posed": {"share_finite"}, "inverse": {"condition"},
+    "turns": {"jumps"}, "posed": {"share_finite"},
     "ranges": {"without", "measured"}, "plans": {"not_converged", "error", "error_with_more_iterations"},
     "gain": {"error", "error_recommended", "error_at_half", "error_at_twice", "error_at_four_times", "error_turned",
              "recommended_times", "recommended_gain", "best_gain", "error_at_best", "error_without", "movement",
              "movement_recommended", "movement_without"},
     "follows": {"rms_error", "error", "size", "mean_error"},
     "input_limits": {"at_a_limit", "largest", "share_of_the_limit", "needed", "period"},
-    "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "doubles_in", "mean_step", "at_a_limit"},
-    "horizon": {"error", "error_with_twice_the_horizon"}, "box": {"share_that_come_back", "plants", "left", "error"},
+    "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "mean_step", "at_a_limit"},
+    "horizon": {"error", "error_with_twice_the_horizon", "recommended_stages"},
+    "box": {"share_that_come_back", "plants", "left", "error"},
     "input_gain": {"most", "least"}, "limits": {"excess", "beyond", "time_of_it", "share_of_cycles"},
-    "latency": {"cycles_borne", "time_borne", "cycles_tried", "left", "error", "error_without", "mean_step", "mean_step_without"},
-    "inner": {"rate_with_outputs_held", "time_constant", "doubles_in", "left"},
-    "noise": {"rms_change", "rms_step", "movement", "movement_without_noise", "error_without_noise", "error"},
-    "bias": {"added_by_a_bias", "share_of_the_response", "error_with_right_sensors", "error"},
+    "latency": {"left", "error", "error_without", "mean_step", "mean_step_without"}, "inner": {"rate_with_outputs_held", "left"},
+    "noise": {"rms_change", "rms_step", "movement", "movement_without_noise"},
     "model": {"error_without", "error_with", "added"},
     "pays": {"error_without", "error_with", "added", "divided_by"},
 }  # fmt: skip
@@ -42,12 +40,6 @@ def test_a_limit_that_is_left_has_the_numbers_of_the_run():
     worst, most = int(speed.argmax()), speed.max() - 1
     wanted = {"excess": most, "beyond": most / 2, "time_of_it": worst * PERIOD, "share_of_cycles": np.mean(speed > 1)}
     assert answers(fast)["limits"].numbers == pytest.approx(wanted, rel=5e-3)
-
-
-@pytest.mark.parametrize("wrong", [-1.0, 100.0, math.nan])
-def test_a_mismatch_that_makes_no_sense_is_refused(wrong):
-    with pytest.raises(ValueError, match="mismatch"):
-        fp.review(mass(), {}, mismatch=wrong, seed=0)
 
 
 def test_the_plants_of_the_box_are_drawn_by_its_mismatch():
@@ -73,7 +65,7 @@ def noisy(size: float, name: str = "q''") -> fp.Problem:
 
 
 @pytest.mark.parametrize(
-    ("size", "gain", "remedy"), [(0.1, -0.5, "Set the gain to -"), (0.2, -0.05, "Filtered(map, pole=")]
+    ("size", "gain", "remedy"), [(0.1, -0.5, "Set deformation.gain to -"), (0.2, -0.05, "Filtered(map, pole=")]
 )
 def test_what_is_recommended_under_noise_is_calm_in_a_run(size, gain, remedy):
     """Own runs with the noise: less than twice the movement without adaptation, where today's has more, and a smaller error."""
@@ -94,9 +86,9 @@ def test_a_remedy_is_what_the_loop_has():
     """No gain is lowered and no map filtered where there is no map."""
     law = answers(noisy(0.02, "q'"), fp.ComputedTorque(fp.Exponential(rate=60.0)))
     plan = {a.key: a for a in fp.review(biased(1.0), {"it": plans()["RHC"]}, mismatch=0.0, seed=0).answers["it"]}
-    said = "No run with one of these passes: set the rate of the tracking law to 30/120/15/240."
+    said = "No run with one of these passes: rate 30, 120, 15, 240."
     assert law["noise"].change == f"Measure the response with less noise. {said}"
-    assert not [one for one in (*law.values(), *plan.values()) if "the gain" in one.change or "Filtered" in one.change]
+    assert not [one for one in (*law.values(), *plan.values()) if "gain" in one.change or "Filtered" in one.change]
 
 
 @pytest.mark.parametrize(
