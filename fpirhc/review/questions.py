@@ -269,7 +269,7 @@ def _noise(case: Case) -> Fact | None:
 def set_gain(controller: Controller, times: float) -> str:
     """What to write for so many times the gain: by a path that `--set` takes, where the gain is a number of its own."""
     name, value = own_gain(controller.deformation)
-    paths = (path.replace(".map.", ".") for path in paths_to(name, controller, 9) if "deformation." in path)
+    paths = (path.replace(".map", "") for path in paths_to(name, controller, 9) if "deformation." in path)
     return f"Set {' and '.join(paths) or f'the {name}'} to {times * value:.4g}."
 
 
