@@ -50,19 +50,20 @@ def compare(
 ) -> None:  # fmt: skip
     """Run controllers side by side and write a report. It names the winner, by how much, and at what price."""
     task = _task(problem, set_, controllers)
+    from fpirhc.report.html import render
+    from fpirhc.report.terminal import announce_backend, progress_bars
     from fpirhc.studies.compare import compare as run
     from fpirhc.studies.compare import select
     from fpirhc.studies.open_loop import first_plans, with_optimisers
 
-    named = list(select(task, controllers)) if controllers else None
+    named, folder = list(select(task, controllers)) if controllers else None, opt.folder_of(out, task.name)
     if plans:
-        return _show_plans(task, first_plans(task, optimisers, named), opt.folder_of(out, task.name))
+        with progress_bars() as progress:
+            progress("first plans", 0, 1)
+            solved = first_plans(task, optimisers, named)
+        return _show_plans(task, solved, folder)
     if optimisers:
         task, named = with_optimisers(task, optimisers, named), None
-    folder = opt.folder_of(out, task.name)
-    from fpirhc.report.html import render
-    from fpirhc.report.terminal import announce_backend, progress_bars
-
     with progress_bars() as progress:
         result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
     announce_backend(entry.run for entry in result.entries)
