@@ -86,15 +86,6 @@ def step_of(plant: Plant, matrix: np.ndarray, time: float) -> np.ndarray:
     return np.linalg.matrix_power(np.eye(len(matrix)) + sampling(plant) * matrix, round(time / sampling(plant)))
 
 
-def derivative_along(plant: Plant, slopes: ca.DM, phi: Callable[[float], ca.DM]) -> Callable[[Expression], Expression]:
-    """Return the function z -> D z of z' = slopes z, z(t) = phi(t) z(0): of a map its divided difference."""
-    if plant.step is None:
-        return lambda z: slopes @ z
-    cycle = sampling(plant)
-    moved = phi(cycle)
-    return lambda z: (moved @ z - z) / cycle
-
-
 def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
     """Return the function from eigenvalues s of the rates to the growth rates of modes: Re s, or log|1 + T s| / T of a map."""
     if plant.step is None:

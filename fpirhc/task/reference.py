@@ -26,8 +26,8 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.chain import response_units
-from fpirhc.plant.maps import derivative_along, time_derivatives
-from fpirhc.plant.motion import followed, followed_units
+from fpirhc.plant.maps import time_derivatives
+from fpirhc.plant.motion import followed, followed_units, sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
@@ -224,11 +224,16 @@ class Setpoint(Reference):
 
     def _chain(self, plant: Plant, z: Expression, held: Expression) -> list[Expression]:
         """(y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map y and its divided forward differences."""
-        order, values, apart = z.numel(), [z[0]], ca.vertcat(z[0] - held, z[1:])
-        slopes = ca.DM(_slopes(self.rate, order))
-        along = derivative_along(plant, slopes, lambda cycle: ca.DM(_transition(self.rate, cycle, order)))
+        order = z.numel()
+        if plant.step is None:  # a rest is at zero, not at minus zero
+            highest = power(self.rate, order) * (held - z[0])
+            for j in range(1, order):
+                highest = highest - math.comb(order, j) * power(self.rate, order - j) * z[j]
+            return [*ca.vertsplit(z), highest]
+        step, values, apart = sampling(plant), [z[0]], ca.vertcat(z[0] - held, z[1:])
+        phi = _transition(self.rate, step, order)
         for _ in range(order):
-            apart = along(apart)
+            apart = (phi @ apart - apart) / step
             values.append(apart[0])
         return values
 
@@ -261,16 +266,11 @@ class Setpoint(Reference):
         mistakes.raise_if_any()
 
 
-def _slopes(rate: float, order: int) -> np.ndarray:
-    """A of d' = A d, the distance of a filter from its set-point, shape (order, order)."""
-    companion = [[0.0] * order] * (order - 1) + [[math.comb(order, j) * power(rate, order - j) for j in range(order)]]
-    return np.eye(order, k=1) - companion
-
-
 def _transition(rate: float, time: float | ca.SX, order: int) -> ca.DM | ca.SX:
     """Phi(time), shape (order, order)."""
     matrix = ca.SX if isinstance(time, ca.SX) else ca.DM
-    nilpotent = matrix(_slopes(rate, order) + rate * np.eye(order))
+    companion = [[0.0] * order] * (order - 1) + [[math.comb(order, j) * power(rate, order - j) for j in range(order)]]
+    nilpotent = matrix(np.eye(order, k=1) + rate * np.eye(order) - companion)
     term = terms = matrix.eye(order)
     for k in range(1, order):
         term = term @ nilpotent * time / k
