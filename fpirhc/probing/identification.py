@@ -84,9 +84,11 @@ def require_cycles(cycles: int) -> None:
 def _channel(f: np.ndarray, m: np.ndarray, period: float, good: np.ndarray, differences: int) -> Channel:
     cycles, most, noises = len(f), _MOST_DEAD, [(p, c) for c in (0, max(differences, 1)) for p in _DRIFTS]
     lags = np.r_[0.0, 0.1 * period, np.geomspace(0.2 * period, 0.2 * cycles * period, _LAGS)]
-    while True:  # an estimate at the edge of the search widens it
+    while True:  # an estimate at the edge of the search widens it, and a gain that may be nothing
         fits = _profile(f, m, period, good, noises, range(most + 1), lags)
-        if _likeliest(fits).dead < most - 1 or 2 * most > cycles // 4:
+        best = _likeliest(fits)
+        inside = best.dead < most - 1 and (np.abs(best.gains) > 5 * best.deviation).any()
+        if inside or 2 * most > cycles // 3:
             break
         most *= 2
     best, near, nearest = _likeliest(fits), _near(fits, _ENOUGH * _WIDER**2), _near(fits, _ENOUGH)

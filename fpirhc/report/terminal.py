@@ -300,9 +300,10 @@ def show_probe(title: str, answer: Probe) -> None:
     for estimate, value in answer.facts:
         estimates.add([estimate, value])
     show_table(estimates)
-    trials = Table("trials", [Column("candidate", left=True), Column("error, of that without"), Column("worst")])
-    for candidate, tried in answer.trials.items():
-        trials.add([candidate, written_out(tried.error), written_out(tried.worst)])
+    names = ("error, of that without", "worst", "passes")
+    trials = Table("trials", [Column("candidate", left=True), *map(Column, names)])
+    for candidate, one in answer.trials.items():
+        trials.add([candidate, written_out(one.error), written_out(one.worst), "yes" if one.passes else "no"])
     if trials.rows:
         show_table(trials)
     for note in answer.notes:

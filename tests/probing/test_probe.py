@@ -17,7 +17,7 @@ KNOWN = [  # gain, dead time in cycles, lag in s, noise of the response
     (1.0, 0, 0.0, 0.05),
     (0.4, 0, 0.0, 0.05),
     (2.5, 0, 0.0, 0.05),
-    (1.0, 15, 0.0, 0.1),  # beyond the first search
+    (1.0, 60, 0.0, 0.1),  # beyond the first search, in which no gain shows
     (1.6, 7, 0.0, 0.3),
     (0.6, 0, 0.05, 0.05),
     (1.5, 2, 0.03, 0.3),
