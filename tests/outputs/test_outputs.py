@@ -134,7 +134,7 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "name in it": (lambda: double({"y": fp.Output("m", lambda x, p: x.c)}), "state 'c' is unknown"),
     "controlled": (lambda: double(SQUARE, controlled=("z",)), "output 'z' is unknown. Valid: y"),
     "name of a state": (lambda: double(SQUARE, states={"a'": "m", "b": "m"}), "'a'' is not an identifier"),
-    "name of an input": (lambda: double({"u": fp.Output("m", lambda x, p: x.a)}), "both an output and an input"),
+    "name of an input": (lambda: double({"u": fp.Output("m", lambda x, p: x.a)}), "both an input and an output"),
     "no rate": (lambda: double(SQUARE, rates=lambda x, u, p: {"a": x.b}), "rates does not give the derivative b' of state 'b'"),
     "reference": (lambda: replace(squared(lambda t: 1 + 0 * t), reference=fp.Trajectory(lambda t: {"yy": t})), "mean 'y'"),
     "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: output 'z' is unknown"),
