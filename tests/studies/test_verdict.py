@@ -252,7 +252,7 @@ def test_plans_contraction_and_null_tests_raise_flags_and_a_cost_says_what_count
     [
         ({"reference": fp.Trajectory(lambda t: {"y": 1.5 - ca.exp(-1e3 * t)}), "start": {"y": 2.0}}, 1.5),
         ({"start": {"y": 0.5}}, 0.5),
-        ({"limits": fp.Limits(states={"y": (0.0, 4.0)}), "start": {"y": 1.0}}, 4.0),
+        ({"limits": fp.Limits(states={"y": (-1.0, 3.0)}), "start": {"y": 1.0}}, 4.0),
         ({"limits": fp.Limits(states={"y": (0.0, math.inf)}), "start": {"y": 1.0}}, 1.0),
         ({"cost": fp.Quadratic(states={"y": 0.25}), "horizon": fp.Horizon(5, 1e-2), "start": {"y": 1.0}}, 2.0),
         ({"reference": fp.Trajectory(lambda t: {"y": 1e3 + 0 * t}), "start": {"y": 1e3 + 1e-7}}, 1.0),
