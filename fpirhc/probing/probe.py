@@ -117,7 +117,7 @@ def probe(
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"
         else:
-            why = "no setting that comes back at the ends of the record makes the error clearly less"
+            why = "no setting whose double bears the ends of what the record allows makes the error clearly less"
     if choice and choice.candidates and trying:
         choice.on_plant(seed + 1)
         notes += choice.notes
