@@ -336,7 +336,7 @@ run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number o
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
 run mine.py RHC --set optimiser.iterations=0 => FixedPoint.iterations: expected a whole number from 1
 compare mine.py --set exact.mass=-1 => enlarges the error: mass of the plant and of the model differ in sign; give the model
-compare mine.py --set deformation.map.gain=2.6 => has the wrong sign ... ; write ModelReferenced(
+compare mine.py --set deformation.map.gain=2.6 => has the wrong sign ... Set deformation.gain to -
 run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file
 compare mine.py --plans --optimisers => '--optimisers' requires an argument
 compare mine.py --plans --optimisers ipot => optimiser 'ipot' is unknown. Did you mean 'ipopt'? Valid: fixed-point, ipopt,
