@@ -75,7 +75,7 @@ class Metric(Checked):
     report: bool = True
     shown: tuple[str, ...] | None = None
     floor: float = 1e-12
-    order: float = 100.0
+    order: float = math.inf
     always: bool = True
 
     def __post_init__(self) -> None:
