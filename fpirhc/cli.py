@@ -257,8 +257,9 @@ def probe(
     for name, one in select(task, [controller] if controller else None).items():
         with suppress(NotSupported):
             one.with_deformation(one.deformation)
-            able.append(name)
-    require(able, "probe needs a controller with a deformation: choose another one by --controller")
+            able += [name] * (one.deforms == "response")
+    asked = controller or task.name
+    require(able, f"probe needs a controller that deforms the response, such as ComputedTorque; '{asked}' has none")
     name, one = able[0], task.controllers[able[0]]
     settings: dict[str, Any] = {"cycles": cycles, "amplitude": amplitude, "recording": recording, "chatter": chatter}
     print(f"fpirhc: {probing.runs_made(task.problem, trials=trials, **settings)}", file=sys.stderr)

@@ -98,6 +98,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "probe line.py --cycles 80 --no-trials", 0, "line: probe with CTC"),
         (recorded, "probe line.py --recording run.csv --json", 0, "{"),
         (None, "probe line.py --cycles 80 --chatter 1e-9 --no-trials", 1, "line: probe with CTC"),
+        (None, "probe heat_exchanger", 2, "fpirhc: probe needs a controller that deforms the response"),
         (WEAK, "probe line.py --cycles 80", 2, "fpirhc: two runs of 80 cycles to excite the plant; then some"),
     ],
     "compare": [
