@@ -192,15 +192,15 @@ def progress_bars() -> Iterator[Report]:
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
-    bars, known = Progress(*columns, console=Console(stderr=True), transient=True), dict[str, TaskID]()
-    told: dict[str, float] = {}
+    out, told, known = Console(stderr=True), dict[str, float](), dict[str, TaskID]()
+    bars = Progress(*columns, console=out, transient=True, disable=not out.is_terminal)
 
     def report(name: str, done: int, total: int) -> None:
         now = time.monotonic()
         if done < total and now - told.get(name, -math.inf) < _DRAWN:
             return  # the rate is computed anew from all that was told, which takes longer than a short run
         told[name] = now
-        bars.start()  # here, because it leaves a line behind, which is none of an error that comes before
+        bars.start()
         if name not in known:
             known[name] = bars.add_task(printable(name), total=total, rate="")
         speed = bars.tasks[bars.task_ids.index(known[name])].speed
