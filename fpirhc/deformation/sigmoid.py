@@ -58,7 +58,7 @@ class Sigmoid(Deformation):
 
     @cached_property
     def _tanh_fixed_point(self) -> float:
-        """The root y = tanh(x*) of 2 t y^2 + y = t with t = ca.tanh(D), in the form that has no 0/0 at D = 0."""
+        """The root y = tanh(x*) of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
         t = ca.tanh(self.shift)
         return 2 * t / (1 + ca.sqrt(1 + 8 * (t * t)))
 

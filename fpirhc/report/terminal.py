@@ -104,7 +104,7 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         if len(by_text) == 1 or table.columns[k].left:
             most = max(by_text, key=lambda text: len(by_text[text]))
             apart = [f"{text} ({', '.join(names)})" for text, names in by_text.items() if text != most]
-            below.append(f"{table.columns[k].head}: {', '.join([most or '-', *apart])}")
+            below.append(f"{table.columns[k].head}: {'; '.join([*apart, 'else ' * bool(apart) + (most or '-')])}")
         elif len(_parts(table.of([*range(table.names), *kept, k]), width)) == 1:
             kept.append(k)
         else:

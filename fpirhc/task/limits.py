@@ -68,7 +68,7 @@ class Limits(Checked):
         states: intervals (lower, upper) by name of the state (q1, q1', ...).
         rates: intervals of the change of inputs per second, from stage to stage of a plan and from cycle to cycle of the command,
             by name of the input.
-        paths: named limits on expressions of state and input in stages 0 ... N-1.
+        paths: limits on expressions of state and input in stages 0 ... N-1; price one of states alone, since stage 0 is measured.
         prices: prices, in cost per second and unit, of limits that are kept wherever that is worth its price (exact penalties, L1),
             by name of a state or path, or by name of an input for its rate. Such a limit is kept exactly while its multiplier is
             below the price. The price is not part of the cost's terms; `Plan.slacks` gives what was paid.
