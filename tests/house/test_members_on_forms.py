@@ -96,10 +96,10 @@ for family, found in (
     ("optimisers", examples("optimisers", PLAN)),
     ("estimators", LEARNERS),
 ):
-    for k, example in enumerate(found):
-        name = f"{type(example).__name__} {k}"
-        MEMBERS[name] = partial(around, example, family)
-        OF_CLASS.setdefault(type(example).__name__, []).append(name)
+    for example in found:  # a number within its class, which other members do not change
+        group = OF_CLASS.setdefault(type(example).__name__, [])
+        group.append(f"{type(example).__name__} {len(group)}")
+        MEMBERS[group[-1]] = partial(around, example, family)
 
 
 # Pairs that are not served, with the sentence that their user reads
@@ -114,13 +114,13 @@ OF_TIME = ("LyapunovMRAC", "ResolvedAccelerationRate")
 NO_FILTER = "no stationary gain makes the filter stable; give noise={'a': ...}, or measure more states"
 IN_STEPS = "map", "believed map"
 REFUSED: dict[tuple[str, str], str] = {
-    **{("Sigmoid 11", form): WRONG_SIGN for form in FORMS},
-    **{("Sigmoid 12", form): WRONG_SIGN for form in FORMS},
+    **{("Sigmoid 2", form): WRONG_SIGN for form in FORMS},
+    **{("Sigmoid 3", form): WRONG_SIGN for form in FORMS},
     **{
         (OF_CLASS["FullSpaceFixedPoint"][0], form): "serves problems without limits only (it is a baseline)"
         for form in FORMS
     },
-    **{("Paired 13", form): WRONG_PAIR for form in ("map", "encoder", "believed", "believed map")},
+    **{("Paired 0", form): WRONG_PAIR for form in ("map", "encoder", "believed", "believed map")},
     ("Estimating", "states"): NO_FILTER,
     ("Estimating", "believed"): NO_FILTER,
     **{(one, "at once"): NEEDS.format(one, "the command moves 'y' at once (order 0)") for one in OF_DERIVATIVES},
@@ -132,8 +132,8 @@ REFUSED: dict[tuple[str, str], str] = {
 }
 YOUNG = "order 1", "curve", "at once", "late", "late curve"
 FARTHER = {  # pairs that are served and leave their reference
-    **{("Paired 13", form): "its pairs are three cycles old, where nothing is late by three" for form in YOUNG},
-    ("Sigmoid 9", "order 3"): "its scale of 1 m/s^3 is less than the change that a cycle asks for",
+    **{("Paired 0", form): "its pairs are three cycles old, where nothing is late by three" for form in YOUNG},
+    ("Sigmoid 0", "order 3"): "its scale of 1 m/s^3 is less than the change that a cycle asks for",
 }
 
 
