@@ -193,12 +193,13 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
     try:
         yield
     except NotContractive as error:
-        # of a layer above, which is only asked when nothing else follows
-        review = import_module("fpirhc.review.review")
+        review = import_module(
+            "fpirhc.review.review"
+        )  # of a layer above, which is only asked when nothing else follows
         advice = review.recommended_for(problem, controller)
         if not advice:
             raise
-        raise NotContractive(error.fault, f"write {advice}") from None
+        raise NotContractive(error.fault, advice[0].lower() + advice[1:].removesuffix(".")) from None
 
 
 @contextmanager
