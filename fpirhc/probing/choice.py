@@ -83,14 +83,15 @@ class Choice:
 
         one = mapped(known.largest)
         found: dict[str, Deformation] = {
-            "referenced": ModelReferenced(one, cycles=cycles, lag=lag, pole=leak),
-            "prompt": ModelReferenced(one, cycles=0.0, lag=0.0),
-            "lagging": ModelReferenced(one, cycles=0.0, lag=lag),
+            "ModelReferenced": ModelReferenced(one, cycles=cycles, lag=lag, pole=leak),
+            "ModelReferenced(cycles=0, lag=0)": ModelReferenced(one, cycles=0.0, lag=0.0),
+            "ModelReferenced(cycles=0)": ModelReferenced(one, cycles=0.0, lag=lag),
             # A model behind the same estimator shares its delay, and a desired response does not.
-            "plain": Paired(one, cycles=_one(likely + age)) if late or age else one,
+            "Paired" if late or age else "Affine": Paired(one, cycles=_one(likely + age)) if late or age else one,
         }
         if known.weights is not None:
-            found["matrix"] = ModelReferenced(mapped(known.largest_weighted, known.weights), cycles=0.0, lag=0.0)
+            weighted = mapped(known.largest_weighted, known.weights)
+            found["ModelReferenced(Affine(weights))"] = ModelReferenced(weighted, cycles=0.0, lag=0.0)
         return {name: one for k, (name, one) in enumerate(found.items()) if one not in list(found.values())[:k]}
 
     def _shortlist(self) -> dict[str, Deformation]:
@@ -207,8 +208,7 @@ def _one(values: np.ndarray) -> float | tuple[float, ...]:
 
 
 def estimated_problem(
-    problem: Problem, gains: np.ndarray, cycles: Sequence[float], lags: Sequence[float], drift: np.ndarray,
-    noise: Mapping[str, float],
+    problem: Problem, gains: np.ndarray, dead: Sequence[float], lags: Sequence[float], drift: np.ndarray, noise: Mapping[str, float]
 ) -> Problem:  # fmt: skip
     """Return the problem whose reality has gains Lambda, a drift w by cycle that stays in the end, and noise of sensors."""
     own, period, (plant, signals) = problem.of_model, problem.period, _plant(problem.plant, gains)
@@ -225,7 +225,7 @@ def estimated_problem(
     added = [name for name in actuated.coordinates if name not in plant.coordinates]
     at_rest = [float(u) for u, lag in zip(own.inputs_before, lags, strict=True) if lag > 0]
     moving = Reality(actuated, integrator=finer, start=dict(zip(added, at_rest, strict=True)))
-    late = DeadTime(inputs={name: c * period for name, c in zip(own.plant.inputs, cycles, strict=True)})
+    late = DeadTime(inputs={name: c * period for name, c in zip(own.plant.inputs, dead, strict=True)})
     return replace(
         own, plant=problem.plant, start=start, reality=moving, dead_time=late, signals={**own.signals, **courses},
         disturbances={}, sensing=replace(own.sensing, sensors=sensors),
@@ -255,6 +255,5 @@ def _plant(model: Plant, gains: np.ndarray) -> tuple[Plant, tuple[str, ...]]:
         return dict(model.response(*derivatives, Named(tuple(model.inputs), inputs, "input"), own))
 
     vars(response)["__signature__"] = inspect.signature(model.response)
-    return replace(
-        model, parameters={**known, **{name: outside(0.0, "1") for name in signals}}, response=response, inverse=None
-    ), signals
+    parameters = {**known, **{name: outside(0.0, "1") for name in signals}}
+    return replace(model, parameters=parameters, response=response, inverse=None), signals

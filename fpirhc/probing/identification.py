@@ -183,9 +183,8 @@ def _smoothed(rest: np.ndarray, integrations: int, differences: int, ratio: floa
     from scipy.sparse.linalg import spsolve
 
     def difference(count: int, size: int) -> sparse.spmatrix:
-        return sparse.diags(
-            np.atleast_1d(np.poly(np.ones(count))), range(count + 1), shape=(size, size + count), format="csc"
-        )
+        entries, shape = np.atleast_1d(np.poly(np.ones(count))), (size, size + count)
+        return sparse.diags(entries, range(count + 1), shape=shape, format="csc")
 
     size = len(rest)
     jumps, noisy = difference(integrations, size - integrations), difference(differences, size)

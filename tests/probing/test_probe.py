@@ -120,6 +120,7 @@ def test_an_excited_run_finds_what_suits_the_plant():
     kept = [one for name, one in found.trials.items() if found.candidates[name] == found.deformation]
     assert all(one.worst <= 1.03 for one in kept)
 
+    assert all(name.startswith(type(one).__name__) for name, one in found.candidates.items())
 
 def error(problem: fp.Problem, deformation: Deformation | None) -> float:
     assert deformation is not None
