@@ -240,7 +240,7 @@ def probe(
     ] = None,
     cycles: Annotated[int | None, given("N", "length of the excitation [default: 300]")] = None,
     amplitude: Annotated[float | None, given("NUMBER", "size of the excitation, in the unit of the response")] = None,
-    recording: Annotated[Path | None, given("CSV", "estimate from a recorded run: time, inputs, measurements")] = None,
+    recording: Annotated[Path | None, given("CSV", "estimate from a run: time, what is measured, inputs after it")] = None,
     chatter: Annotated[float | None, given("NUMBER", "largest rms step of a command per cycle that is allowed")] = None,
     trials: Annotated[bool, typer.Option(help="try candidates on the plant itself")] = True, seed: opt.Seed = 0,
     json: opt.Json = False,

@@ -24,7 +24,7 @@ from fpirhc.probing.recording import Record, excited, read_recording
 from fpirhc.summary import line, number
 from fpirhc.task.problem import Problem
 
-CYCLES, _WIDE = 300, 0.2  # of the excitation; half an interval of a gain from which it is told to be wide, as a share
+CYCLES, _WIDE, _LIMITED = 300, 0.2, 0.2  # of the excitation; shares that are told: half an interval, cycles at a limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def probe(
         cycles: of the excitation, 50 to 500; None: 300.
         amplitude: of the sequence, in the unit of the response, by controlled quantity or one for all; 0 only listens. None: twice
             the noise and a tenth of the deviation of the desired response in a first run.
-        recording: CSV file in place of runs, without `cycles` and `amplitude`: columns "time", every input, what is measured.
+        recording: CSV file in place of runs, without `cycles` and `amplitude`: "time", what is measured then, every input after it.
         chatter: largest rms step of the command per cycle, in the input's unit, by input or one for all; None: 1.5 times that of
             the controller alone, or 2 % of the input's range.
         trials: whether candidates are tried on the plant; False on a machine that must not be risked.
@@ -107,8 +107,7 @@ def probe(
     estimates = Estimates(identify(*columns), seed)
     trying, notes = trials and listened, [f"the run ended early: {record.stop}"] if record.stop else []
     notes += _cautions(problem, record, estimates)
-    choice, name = None, None
-    why = estimates.refused or ("" if trying else estimates.unbounded)
+    choice, name, why = None, None, estimates.refused or ("" if trying else estimates.unbounded)
     if not why:
         notes += filter(None, [estimates.unbounded])
         noise = dict(zip(record.shown, (one.noise for one in estimates.channels), strict=True))
@@ -128,15 +127,14 @@ def probe(
     elif choice and choice.candidates:
         name = next(iter(choice.candidates))
         why = f"{name}, not tried on the plant"
-    channels = estimates.channels
-    by = lambda names, what: {n: getattr(one, what) for n, one in zip(names, channels, strict=True)}  # noqa: E731
+    by = lambda names, what: {n: getattr(one, what) for n, one in zip(names, estimates.channels, strict=True)}  # noqa: E731
     return Probe(
         gain={name: dict(zip(names, gains, strict=True)) for name, gains in by(names, "gains").items()},
         dead_time=by(inputs, "dead_time"), lag=by(inputs, "lag"), noise=by(names, "noise"), drift=by(names, "drifting"),
         deformation=choice.candidates[name] if choice and name else None, why=why,
         trials=choice.results if choice else {}, candidates=choice.candidates if choice else {},
         problem=choice.problem if choice else None, notes=tuple(notes),
-        facts=tuple(_facts(problem, record.shown, channels)),
+        facts=tuple(_facts(problem, record.shown, estimates.channels)),
     )  # fmt: skip
 
 
@@ -157,7 +155,8 @@ def _facts(problem: Problem, shown: Sequence[str], channels: Sequence[Channel]) 
     yield from ((f"dead time of {name}, cycles", _interval(one.dead_time)) for name, one in by_input)
     yield from ((f"lag of {name}, {time}", _interval(one.lag)) for name, one in by_input)
     for name, seen, one in zip(names, shown, channels, strict=True):
-        yield f"noise of {seen}, {derivative_unit(units[name], seen.count(chr(39)), time)}", number(one.noise)
+        size = number(one.noise) if one.noise else "not resolved"
+        yield f"noise of {seen}, {derivative_unit(units[name], seen.count(chr(39)), time)}", size
     for name, unit, one in zip(names, plant.response_signal("realised").entry_units, channels, strict=True):
         yield f"drift of {name}, {unit}/{time}^0.5", number(one.drifting)
 
@@ -170,13 +169,19 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates) -> Iterato
         inside = f"no sensor shows {', '.join(hidden)}: dead time and lag contain those of the estimator, which colours the noise"
         yield f"{inside}, so the truth may be outside the intervals; measure it, or record it without a filter"
     elif own:
-        which = type(problem.sensing.estimator).__name__
-        yield f"the dead time is that of the plant alone; {which} delays the response by {own:g} cycles more"
-    for row, (name, channel) in enumerate(zip(problem.plant.controlled_names, estimates.channels, strict=True)):
-        wide = max(one.high - one.low for one in channel.gains) / 2 / max(abs(channel.gains[row].value), 1e-300)
+        yield f"the dead time is the plant's; {type(problem.sensing.estimator).__name__} delays the response by {own:g} cycles more"
+    each = zip(problem.plant.controlled_names, problem.plant.inputs, record.limited, estimates.channels, strict=True)
+    for row, (name, u, limited, one) in enumerate(each):
+        wide = max(gain.high - gain.low for gain in one.gains) / 2 / max(abs(one.gains[row].value), 1e-300)
         if (more := wide / _WIDE) > 1 and not estimates.refused:
             mend = f"{more:.2g} times the amplitude, or {more**2:.2g} times the cycles, would make that {100 * _WIDE:.0f} %"
             yield f"the gain of {name} is only known to {100 * wide:.0f} %: {mend}"
+        if limited > _LIMITED:
+            yield f"{u} is at a limit in {100 * limited:.0f} % of the cycles, which tells little: excite less, or widen its limits"
+        around, known = problem.dead_time.measurement, problem.dead_time.inputs.get(u, 0.0)
+        if problem.foreign and not hidden and one.dead_time.low - (around + known) / problem.period > 1 - 1e-9:
+            time = f"dead_time=fp.DeadTime(inputs={{'{u}': {one.dead_time.value * problem.period - around:.6g}}})"
+            yield f"state {time}: reviews and predictions need it; a deformation to paste has its own cycles, and stays"
 
 
 def _by_name(what: str, setting: Any, names: Sequence[str], least: float, words: str) -> dict[str, float] | None:

@@ -27,10 +27,7 @@ from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
 _NOISES, _SHARE = 2.0, 0.1  # amplitude: of the noise, and of the deviation of the desired response
-_EVEN, _BEGUN = (
-    0.01,
-    3,
-)  # share of the period by which a time may be off; cycles after which a response is one of the run
+_EVEN, _BEGUN = 0.01, 3  # share of the period by which a time may be off; cycles before a response is one of the run
 
 
 @dataclass(frozen=True)
@@ -66,6 +63,7 @@ class Record:
     usable: np.ndarray  # which cycles count: those with numbers
     shown: tuple[str, ...]  # what each response is a difference of, or itself where it is measured
     differences: tuple[int, ...]  # how often
+    limited: np.ndarray  # share of the cycles in which each command stands at a limit
     stop: str  # why the run ended early; empty where it did not
 
 
@@ -73,10 +71,7 @@ def _record(
     problem: Problem, where: str, times: np.ndarray, states: np.ndarray, commands: np.ndarray, seen: Mapping[str, np.ndarray],
     stop: str = "",
 ) -> Record:  # fmt: skip
-    """The responses beside those of the model, at the states of the same time and with the commands before it.
-
-    A response is a difference of what is seen: an estimator's window would make it late, and its noise anything but white.
-    """
+    """The responses to the commands of the row before, beside the model's: differences of what is seen, late by no window."""
     plant = problem.plant
     require_cycles(len(times))
     still = np.ptp(commands, axis=0) <= 1e-9 * np.abs(commands).max(axis=0)  # NaN moves
@@ -93,9 +88,10 @@ def _record(
         column[missing:] = np.diff(seen[shown[-1]], missing) / problem.period**missing
     differences = tuple(n - one.count("'") for n, one in zip(plant.response_orders.values(), shown, strict=True))
     both = pd.DataFrame(np.hstack([measured[1:], modelled])).replace([np.inf, -np.inf], np.nan)
+    limited = np.isclose(commands, np.array(problem.limits.input_bounds(plant))[:, None]).any(axis=0).mean(axis=0)
     # What does not count passes through filters, as lines between what does.
     parts = np.hsplit(both.interpolate(limit_direction="both").fillna(0.0).to_numpy(), [measured.shape[1]])
-    return Record(parts[0], parts[1], both.notna().all(axis=1).to_numpy(), tuple(shown), differences, stop)
+    return Record(parts[0], parts[1], both.notna().all(axis=1).to_numpy(), tuple(shown), differences, limited, stop)
 
 
 def _preferred(first: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -49,6 +49,7 @@ def test_the_estimates_of_a_recording_are_those_of_the_body(gain, dead, lag, noi
     """The dead time to the cycle; gain, lag and noise within 6, 10 and 20 %; all intervals contain the truth; no run is made."""
     problem = recorded(tmp_path / "run.csv", -gain, dead, lag, noise)
     problem = replace(problem, reality=fp.ExternalPlant(Body(np.array(None)), QUANTITIES))  # fails where it is run
+    problem = replace(problem, limits=fp.Limits(inputs={"u": (-2.0, 9.0)}))  # half of the commands are at one
     found = fp.probe(problem, RHC, recording=tmp_path / "run.csv")
     late, own, slow = found.dead_time["u"], found.gain["q"]["q"], found.lag["u"]
     assert (late.low, late.value, late.high) == (dead, dead, dead)
@@ -58,6 +59,7 @@ def test_the_estimates_of_a_recording_are_those_of_the_body(gain, dead, lag, noi
     assert slow.low <= lag <= slow.high
     assert found.noise["q"] == pytest.approx(noise, rel=0.25)
     assert found.deformation is None
+    assert [words in " ".join(found.notes) for words in ("is at a limit in", "DeadTime(")] == [True, dead > 0]
     assert found.why.startswith("the sign of the gain is wrong")
     assert found.lines == "deformation=fp.Identity(),"
 
@@ -69,17 +71,18 @@ def test_a_gain_that_noise_hides_has_no_certain_sign(tmp_path):
     assert found.why.startswith("the sign of a gain is not certain")
 
 
-@pytest.mark.parametrize("window", [7, 61])
-def test_the_window_of_an_estimator_is_in_no_estimate(window, tmp_path):
+@pytest.mark.parametrize(("window", "noise"), [(7, 1e-4), (61, 1e-4), (7, 0.0)])
+def test_the_window_of_an_estimator_is_in_no_estimate(window, noise, tmp_path):
     """It makes the response late and colours its noise, so the plant is estimated from the positions before it."""
     problem, path = recorded(tmp_path / "run.csv", -2.0, 3, 0.0, 0.0), tmp_path / "run.csv"
     table = pd.read_csv(path)[["time", "u", "q"]]
-    table.assign(q=table.q + 1e-4 * np.random.default_rng(2).standard_normal(400)).to_csv(path, index=False)
+    table.assign(q=table.q + noise * np.random.default_rng(2).standard_normal(400)).to_csv(path, index=False)
     windowed = replace(problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window, degree=4)))
     found = fp.probe(windowed, RHC, recording=path)
     assert found.dead_time["u"].low == found.dead_time["u"].high == 3
     assert found.gain["q"]["q"].low <= -2.0 <= found.gain["q"]["q"].high < 0
-    assert found.noise["q"] == pytest.approx(1e-4, rel=0.1)
+    assert found.noise["q"] == pytest.approx(noise, rel=0.1)
+    assert (dict(found.facts)["noise of q, m"] == "not resolved") == (noise == 0)
     assert f"SavitzkyGolay delays the response by {window / 2 - 1:g} cycles more" in " ".join(found.notes)
 
 
@@ -117,10 +120,10 @@ def test_an_excited_run_finds_what_suits_the_plant():
     assert predicted == pytest.approx(true, rel=0.1)
     assert found.deformation is not None
     assert error(problem, found.deformation) < 0.6 * error(problem, fp.Identity())
+    assert all(name.startswith(type(one).__name__) for name, one in found.candidates.items())
     kept = [one for name, one in found.trials.items() if found.candidates[name] == found.deformation]
     assert all(one.worst <= 1.03 for one in kept)
 
-    assert all(name.startswith(type(one).__name__) for name, one in found.candidates.items())
 
 def error(problem: fp.Problem, deformation: Deformation | None) -> float:
     assert deformation is not None
