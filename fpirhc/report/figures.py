@@ -103,9 +103,7 @@ def contraction_figures(comparison: Comparison) -> list[Drawing]:
             apart = apart / np.maximum(np.ptp(entry.run["desired"], axis=0), 1e-300)
         size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
         shown = np.where((size > 0) & np.isfinite(size), size, np.nan)
-        axes[-1].semilogy(
-            np.arange(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1
-        )
+        axes[-1].semilogy(range(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1)
     for axis in axes[-1:]:
         unit = f"[{units.pop()}]" if len(units) == 1 else "of the ranges of desired"
         caption_axes(axis, "control cycle", literal(f"|realised - desired| {unit}"))
@@ -128,11 +126,9 @@ def _draw_factor(
     sectors: dict[float, str] = {}
     for name, one in entries:
         own, colour = scale * one.report.effective_gain, colours[name]
-        label = literal(f"{name}, predicted")
-        axis.plot(own, one.report.predicted, "o", ms=9, mfc="none", mew=1.5, color=colour, label=label)
+        axis.plot(own, one.report.predicted, "o", ms=9, mfc="none", mew=1.5, color=colour, label=literal(name))
         axis.plot(own, one.measured, "x", ms=7, mew=1.5, color=colour, zorder=5)
-        sector: float = max(one.report.sector_limit, key=abs)
-        sectors.setdefault(round(sector, 3), colour)
+        sectors.setdefault(round(float(max(one.report.sector_limit, key=abs)), 3), colour)
     for sector, colour in sectors.items():
         if sector and abs(sector) < 0.999 * abs(limit):
             axis.axvline(scale * sector, color=colour, lw=1.6, ls=":", label="sector limit")

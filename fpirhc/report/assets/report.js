@@ -81,7 +81,7 @@ function draw({ box, spec }) {
     scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec)) } },
     axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: { sync: { key: sync.key } },
-    legend: { markers: { dash: (_, k) => (series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
+    legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
     hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
   };
   const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
