@@ -129,6 +129,13 @@ def step_for_basin(largest_error: float, poles: int, rate: float, period: float)
     return spare * math.sin(angle) ** poles * math.tan(angle) * rate * period * largest_error
 
 
+def largest_behind_estimator(problem: Problem, deformation: Deformation) -> float:
+    """Return the effective gain from which on a run is refused behind an estimator; infinite where none spreads the response."""
+    jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian_at_start(problem.of_equations))
+    seen, acts = _weights_of_estimators(problem), np.isfinite(jacobian).all() and np.abs(jacobian).max() > _NOTHING
+    return (largest_gain(deformation, jacobian, seen) if seen and acts and deformation.form.steady else 0.0) or math.inf
+
+
 def require_converging(problem: Problem, deformation: Deformation) -> None:
     """Raise if the deformation cannot converge from the start of the problem: no gain does, or not one of this sign or size.
 

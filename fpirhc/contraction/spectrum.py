@@ -221,16 +221,15 @@ class ContractionReport:
     own: tuple[str, float]  # the gain that the user sets, per unit of the effective gain
     linear_limit: tuple[float, float]  # interval of the effective gain in which small errors converge
     sector_limit: tuple[float, float]  # interval of the effective gain in which errors of any size converge
-    text: str  # the verdict and the admissible gains, for a reader
-    fault: str = ""  # what is wrong; empty where the deformation converges
-    remedy: str = ""  # what would do instead
+    text: str  # the verdict, for a reader
+    admissible: str = ""  # the gains that converge, behind an estimator too; empty where its own does not
 
 
-def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0) -> ContractionReport:
+def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float, largest: float) -> ContractionReport:
     """Return whether a deformation converges on plants with these eigenvalues, with the fault and what would do instead.
 
     A gain between the sector and the linear limit is no fault. Where the response is late by some cycles, the limits are those
-    without this delay, and the text says so.
+    without this delay, and the text says so; the admissible gains end at the `largest` one behind it, where that is finite.
     """
     gain, (name, value) = deformation.effective_gain(), own_gain(deformation)
     predicted = predicted_factor(spectrum.eigenvalues, gain)
@@ -240,31 +239,23 @@ def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float = 0.0)
         linear, sector = linear_limit(spectrum.eigenvalues), sector_limit(deformation, spectrum.eigenvalues)
     except NotContractive as error:
         none = (0.0, 0.0)
-        return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error), error.fault, error.remedy)
+        return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error))
     scale, what, fault = value / gain, with_its_gain(deformation), ""
-    admissible = _admissible(name, scale, linear, sector)
+    ends = [abs(scale) * min(abs(sum(limit)), largest) for limit in (linear, sector)]  # one end of a limit is zero
+    admissible = f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, 0 < |{name}| < {ends[0]:.3g}"
+    if not np.isclose(ends[0], ends[1]):
+        admissible += f", and below {ends[1]:.3g} to converge from errors of any size"
     behind = f", without the response's delay of {late:.4g} cycles" if late else ""
     text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle{behind}"
     if not sector[0] < gain < sector[1]:
-        text += (
-            ", but only a small one: it is beyond the sector limit, where large errors may end in a bounded oscillation"
-        )
-    text += f". Admissible: {admissible}."
+        text += ", but only a small one: beyond the sector limit large errors may end in a bounded oscillation"
     if gain * sum(linear) < 0:
         fault = f"{what} has the wrong sign, so every cycle enlarges the error"
     elif abs(gain) >= abs(sum(linear)):
         fault = f"{what} is too large: errors grow by the factor {predicted:.3g} per cycle"
-    remedy = f"use {admissible}{behind}" if fault else ""
-    text = f"{fault}; {remedy}" if fault else text
-    return ContractionReport(predicted, gain, (name, scale), linear, sector, text, fault, remedy)
-
-
-def _admissible(name: str, scale: float, linear: tuple[float, float], sector: tuple[float, float]) -> str:
-    ends = [abs(scale * sum(limit)) for limit in (linear, sector)]  # one end of a limit is zero
-    bounds = f"0 < |{name}| < {ends[0]:.3g}"
-    if not np.isclose(ends[0], ends[1]):
-        bounds += f", and below {ends[1]:.3g} to converge from errors of any size"
-    return f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, {bounds}"
+    if fault:
+        text, admissible = f"{fault}; use {admissible}{behind if largest == np.inf else ''}", ""
+    return ContractionReport(predicted, gain, (name, scale), linear, sector, text, admissible)
 
 
 _WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the transient of a useful gain is shorter

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from fpirhc.contraction.delayed import largest_behind_estimator
 from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import checked
@@ -71,18 +72,22 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
 class Contraction:
     """The factor by which the iteration shrinks an error per cycle."""
 
-    predicted: float
     growing: float  # share of the cycles in which small errors grow
     measured: float
     report: ContractionReport
     spectrum: Spectrum
 
-    def said(self, run: Run) -> str:
-        """What is admissible, and how near every response came to what was desired, root mean square of the whole run."""
+    def said(self, run: Run, lost: Collection[str]) -> str:
+        """What it leaves of an error, what is admissible, and the rms distance of every response from what was desired."""
         near = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1]) ** 2, axis=0))
         units = (with_space(run.unit(f"desired.{n}")) for n in run.layout["desired"].elements)
         each = (f"{n} {written_out(v)}{u}" for n, v, u in zip(run.layout["desired"].elements, near, units, strict=True))
-        return f"{self.report.text} Measured factor {written_out(self.measured)}; realised - desired, rms: {', '.join(each)}."
+        one, factor = self.report, f"Measured factor {written_out(self.measured)}"
+        if one.admissible:  # a fit is right within two hundredths
+            factor += ": the bound does not hold in this run" * (self.measured > one.predicted + 0.02)
+            held = run.stop is None and run.controller not in lost
+            factor = f"Admissible: {one.admissible}. {factor}" if held else factor
+        return f"{one.text}. {factor}; realised - desired, rms: {', '.join(each)}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +164,8 @@ class Comparison(Study):
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
         lists = {"Notes": notes, "Flags": [f"{f.pair[1]}: {f.flags}" for f in self.findings if f.pair and f.flags]}
         lists[f"Null tests: {NULL}"] = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
-        lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run)}" for e in self.entries if e.contraction]
+        lost = {f.pair[1] for f in self.findings if f.pair and f.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)}
+        lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run, lost)}" for e in self.entries if e.contraction]
         return self.viewed(sentences, about, (table.filled,), self._facts(), lists=lists, skipped=self.skipped)
 
     def _facts(self) -> dict[str, Any]:
@@ -281,9 +287,10 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     if not metrics.values.get("contraction.predicted"):
         return None
     spectrum, late = sampled_spectrum(problem, run), problem.response_delay
-    predicted, growing, measured = (metrics[f"contraction.{n}"][""] for n in ("predicted", "growing", "measured"))
+    growing, measured = (metrics[f"contraction.{n}"][""] for n in ("growing", "measured"))
     growing = 0.0 if late else growing  # behind a delay the iteration is another one, which was asked before the run
-    return Contraction(predicted, growing, measured, assess_gain(controller.deformation, spectrum, late), spectrum)
+    largest = largest_behind_estimator(problem, controller.deformation)
+    return Contraction(growing, measured, assess_gain(controller.deformation, spectrum, late, largest), spectrum)
 
 
 def _has_exact_model(problem: Problem, controller: Controller) -> bool:

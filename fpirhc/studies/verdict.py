@@ -156,9 +156,8 @@ def _moves(pair: Pair) -> float:
 
 def _chatters(pair: Pair) -> float:
     """The same of inputs that move many times their own span: a command that settles once moves by its span."""
-    moved = _moved(pair)
-    command = {n: pair.adaptive.run[f"command.{n}"] for n in moved}
-    back_and_forth = {n for n, c in command.items() if np.abs(np.diff(c)).sum() >= 10 * np.ptp(c)}
+    moved, run = _moved(pair), pair.adaptive.run
+    back_and_forth = {n for n in moved if np.abs(np.diff(c := run[f"command.{n}"])).sum() >= 10 * np.ptp(c)}
     return max((moved[n] for n in back_and_forth), default=math.nan)
 
 

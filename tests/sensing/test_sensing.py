@@ -7,6 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
+from helpers import tasks
 from helpers.plants import chain, linear
 
 import fpirhc as fp
@@ -174,16 +175,10 @@ def estimated(estimator, plant, period, states):
     return np.array([s for s, _ in collected]), np.array([r for _, r in collected])
 
 
-@pytest.mark.parametrize(
-    ("estimator", "degree"),
-    [
-        (fp.PositionDifference(), 2),
-        (fp.SavitzkyGolay(7, 2), 2),
-        (fp.SavitzkyGolay(9, 3), 3),
-        (fp.SavitzkyGolay(21, 5), 5),
-    ],
-    ids=str,
-)
+ORDERS = [(fp.SavitzkyGolay(size, degree), degree) for size, degree in ((7, 2), (9, 3), (21, 5))]
+
+
+@pytest.mark.parametrize(("estimator", "degree"), [(fp.PositionDifference(), 2), *ORDERS], ids=str)
 def test_polynomials_up_to_the_degree_are_met_exactly(estimator, degree):
     """The response at the window's centre; Savitzky-Golay also the state at the newest sample, without any delay."""
     plant, period, size = chain(2), 0.05, 40
@@ -240,21 +235,17 @@ def limit_of(weights: np.ndarray, pairing: float) -> float:
 @pytest.mark.parametrize("paired", [False, True])
 def test_limit_is_that_of_the_characteristic_polynomial(estimator, paired):
     """3 % below the limit a gain is accepted and its loop is stable, 3 % above it is refused."""
-    problem = resting(
-        linear(1.0, 0.8), start={"y": 0.0, "y'": 1.0}, duration=2.0, sensing=fp.Sensing(estimator=estimator)
-    )
+    sensing, start = fp.Sensing(estimator=estimator), {"y": 0.0, "y'": 1.0}
+    problem = resting(linear(1.0, 0.8), start=start, duration=2.0, sensing=sensing)
     cycles = problem.response_delay if paired else 0.0
     limit = 0.8 * limit_of(estimator.weights(2, problem.period), cycles)
     assert limit > 0
-    below, above = (
-        fp.ComputedTorque(GENTLE, fp.Paired(fp.Affine(gain=-2 * share * limit), cycles=cycles))
-        for share in (0.97, 1.03)
-    )
-    result = run(problem, below)
+    below, above = (fp.Paired(fp.Affine(gain=-2 * share * limit), cycles=cycles) for share in (0.97, 1.03))
+    result = run(problem, fp.ComputedTorque(GENTLE, below))
     parts = np.array_split(np.abs(result["realised.y"] - result["desired.y"]), 4)
     assert parts[3].max() < parts[1].max()
     with pytest.raises(NotContractive):
-        run(problem, above)
+        run(problem, fp.ComputedTorque(GENTLE, above))
 
 
 WINDOW = fp.Sensing(estimator=fp.SavitzkyGolay(window=31, degree=2))
@@ -272,6 +263,13 @@ def test_delay_that_makes_the_loop_unstable_is_refused_with_remedies_that_are_ac
     paired = fp.Paired(wild, cycles=problem.response_delay)
     for accepted, deformation in ((problem, fp.Affine(gain=-1.8 * limit)), (problem, paired), (shorter, wild)):
         assert run(accepted, fp.ComputedTorque(tracking, deformation)).stop is None
+    # A comparison has the same limit; where neither law follows it has none, and its bound is said not to hold.
+    laws = {"law": fp.ComputedTorque(tracking), "FPI": fp.ComputedTorque(tracking, fp.Affine(gain=-0.9 * limit))}
+    lost = replace(problem, limits=fp.Limits(inputs={"u": (0.0, 0.01)}), duration=4.0)
+    tried = (fp.compare(tasks.made(one, laws), seed=0, compiled=False) for one in (problem, lost))
+    held, left = (one.view.lists["Contraction"][0] for one in tried)
+    assert f"Admissible: a negative gain, 0 < |gain| < {2 * limit:.3g}. Measured" in held
+    assert ("bound does not" in held, "bound does not" in left, "Admissible" in left) == (False, True, False)
 
 
 def test_dead_time_counts_but_is_not_judged_alone():
