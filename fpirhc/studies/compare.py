@@ -64,7 +64,7 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     for why, names in owners.items():
-        mistakes.add(f"controller {', '.join(names)}: {why}")
+        mistakes.add(f"controller{'s' * (len(names) > 1)} {', '.join(names)}: {why}")
     mistakes.raise_if_any()
 
 

@@ -79,7 +79,8 @@ OF_AN_END = edited(
 BENDS = edited(f"{PLAN},", f"{PLAN[:-1]}, hessian=fp.ExactHessian()),")
 GENTLE, LONG = edited("fp.Sigmoid(gain=-0.5)", "fp.Affine(gain=-0.02)"), edited("duration=1.0", "duration=4.0")
 HARMS = lambda: (GENTLE(), LONG())  # noqa: E731 -- by what the first thousand cycles show
-WRONG_SIGN = edited("gain=-0.5", "gain=0.5, scale=1.0")
+TOO = '"Too": fp.ComputedTorque(tracking, fp.Sigmoid(gain=0.5, scale=1.0)'
+WRONG_SIGN = edited("gain=-0.5)", f"gain=0.5, scale=1.0)), {TOO}")
 WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.0}})\ncontrollers = {')
 MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
 RUN = "A mass on a line with a wrong gain."
@@ -105,7 +106,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "compare line.py --no-compile", 0, MASS),
         (None, "compare line.py --no-compile -c CTC CTC+FPI --set deformation.gain=-0.4 exact.k=4", 0, MASS),
         (None, "compare --controllers CTC --json line.py --no-compile", 0, "{"),
-        (WRONG_SIGN, "compare line.py --no-compile", 2, "fpirhc: problem 'line': controller 'CTC+FPI'"),
+        (WRONG_SIGN, "compare line.py --no-compile", 2, "fpirhc: problem 'line': controllers 'CTC+FPI', 'Too'"),
     ],
     "plans": [
         (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
