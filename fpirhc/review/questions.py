@@ -167,8 +167,7 @@ def _horizon(case: Case) -> Fact | None:
     if horizon is None or bench.controller.planner is None:
         return None
     short = bench.start.first(bench.cycles // 2)
-    own = bench.share(short)
-    errors, helps = [own], own > SLIGHT  # else there is nothing that a longer one could mend
+    errors, helps = [own := bench.share(short)], own > SLIGHT  # else there is nothing that a longer one could mend
     while helps and len(errors) < 5:
         lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
         horizon = replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
@@ -322,6 +321,8 @@ def gain_by_run(case: Case) -> Fact:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
         best = 1.0
+    if "of the model differ in sign" in own.refusal:  # also where a turned gain works
+        return Fact(Verdict.NO, numbers, of, f"{own.refusal}.")
     if verdict != Verdict.YES and best in (0.0, 1.0):
         tried = min(rungs, key=lambda times: rungs[times].error)
         numbers |= {"best_gain": tried * value, "error_at_best": rungs[tried].error}
@@ -385,8 +386,7 @@ QUESTIONS = (
              "{movement:r} ({start})| {movement_recommended:r} as recommended| {movement_without:r} without adaptation", "No gain "
              "that was run helps, is calm, and has reserve.", "filter form Predicted window sensors without", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "rms error of {of} {rms_error:u} ({counted}), {error:%} of its "
-             "motion of {size:u}| mean {mean_error:u}", "", "residual_time gain without rate weight window Predicted limits "
-             "speed"),
+             "motion of {size:u}| mean {mean_error:u}", "", "residual_time gain without rate weight window Predicted limits speed"),
     Question("returns", "Does it come back from a push?", _returns, "{left:%} of a push by 1 % of the states' ranges is left "
              "after {pushed}| {left_of_ten_times:%} of one by 10 % after {halfway}| a command at a limit in {at_a_limit:%} of the "
              "way back| time constant {time_constant} {time}| a cycle leaves {largest_factor:5} at worst| commands change by "

@@ -193,10 +193,8 @@ def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[
     try:
         yield
     except NotContractive as error:
-        review = import_module(
-            "fpirhc.review.review"
-        )  # of a layer above, which is only asked when nothing else follows
-        advice = review.recommended_for(problem, controller)
+        # of a layer above, which is only asked when nothing else follows
+        advice = import_module("fpirhc.review.review").recommended_for(problem, controller)
         if not advice:
             raise
         raise NotContractive(error.fault, advice[0].lower() + advice[1:].removesuffix(".")) from None

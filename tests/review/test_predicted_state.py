@@ -58,7 +58,7 @@ def test_what_the_model_lacks_is_lacking_in_the_prediction(late, form, by, remov
     expected = [FORCE / KP * (1 + KD * late + KP * late**2 / 2), FORCE / KP * (KD * late + KP * late**2 / 2), 0.0]
     assert run["true_error.q"][-1] == pytest.approx(expected[int(removed)], rel=0.01, abs=1e-6)
     told = {a.key: a for a in fp.review(problem, {"it": law(late, form, **by)}, mismatch=0.0, seed=0).answers["it"]}
-    assert ("residual_time" in told["follows"].change) == (form is not None and not by)
+    assert (f"residual_time={late:g})" in told["follows"].change) == (form is not None and not by)
     said = " ".join(a.change for a in told.values())
     assert not [words for words in ("state it", "state the dead", "predict it") if words in said]
 
