@@ -25,8 +25,8 @@ for name, run in runs.items():
 # offset-free plan is better than the iteration by a fifth: its filter measures the
 # response too, and has a gain of one.
 
-spikes, signals, portrait = task.pictures
-spikes.draw(plt.figure(figsize=(8, 2), layout="constrained"), runs)
+signals, portrait = task.pictures
+signals.draw(plt.figure(figsize=(8, 5), layout="constrained"), runs)
 portrait.draw(plt.figure(figsize=(8, 3), layout="constrained"), runs)
 
 # %%

@@ -126,7 +126,7 @@ CASES: dict[str, Case] = {
     "a map of a right model behind a window that is too long": Case(
         lambda: (replace(reviewed.lift(), sensing=fp.Sensing({}, fp.SavitzkyGolay(41, 3))), {"it": sigmoid(-2.0)}),
         {("it", "model"): "no"},
-        changes={("it", "model"): "Set deformation.gain to -0.125."},
+        changes={("it", "model"): "Set deformation.gain to -0.0625."},
     ),
     "an inverse with two branches": Case(
         foreign("cstr", "RHC", "RHC+FPI"),
