@@ -225,7 +225,9 @@ class ContractionReport:
     admissible: str = ""  # the gains that converge, behind an estimator too; empty where its own does not
 
 
-def assess_gain(deformation: Deformation, spectrum: Spectrum, late: float, largest: float) -> ContractionReport:
+def assess_gain(
+    deformation: Deformation, spectrum: Spectrum, late: float = 0.0, largest: float = np.inf
+) -> ContractionReport:
     """Return whether a deformation converges on plants with these eigenvalues, with the fault and what would do instead.
 
     A gain between the sector and the linear limit is no fault. Where the response is late by some cycles, the limits are those
