@@ -79,11 +79,12 @@ class NotContractive(FpirhcError, ValueError):
     Args:
         fault: what is wrong.
         remedy: what the iteration by itself would bear, such as "use 0 < |gain| < 0.4"; empty where nothing is known.
+        turned: parameters whose values in the plant and in the model differ in sign, where the sign is wrong by them.
     """
 
-    def __init__(self, fault: str, remedy: str = "") -> None:
-        super().__init__(fault, remedy)
-        self.fault, self.remedy = fault, remedy
+    def __init__(self, fault: str, remedy: str = "", turned: Sequence[str] = ()) -> None:
+        super().__init__(fault, remedy, turned)
+        self.fault, self.remedy, self.turned = fault, remedy, turned
 
     def __str__(self) -> str:
         return f"{self.fault}; {self.remedy}" if self.remedy else self.fault

@@ -172,7 +172,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
         why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
         remedy = "give the model the plant's sign, because a plan with the other one goes the wrong way"
         remedy = remedy if turned else f"use a {'negative' if value > 0 else 'positive'} {name}, {interval}"
-        raise NotContractive(f"{what} has the wrong sign, so every cycle enlarges the error{why}", remedy)
+        raise NotContractive(f"{what} has the wrong sign, so every cycle enlarges the error{why}", remedy, turned)
     if seen is None:
         top = max(eigenvalues, key=abs)
         raise NotContractive(

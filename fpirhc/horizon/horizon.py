@@ -28,8 +28,7 @@ class Horizon(Checked):
     Args:
         stages: number of stages N.
         step: length of one stage, s, over which the input is constant.
-        discretisation: integrator of the model over one stage: RungeKutta4(), Euler(), Collocation(). A
-            map has none: a stage is a whole number of its steps.
+        discretisation: RungeKutta4() or Collocation() over one stage; a map has none: a stage is a whole number of its steps.
         lengths: of the stages, as multiples of `step`, which is that of the first one: fine stages first. One number of at least
             1 for every stage, a whole one on a map; empty: all stages are equal. Every stage counts with its length in the cost,
             limits and costs of input changes with the time since the change before. Prices of limits count every node alike.

@@ -321,8 +321,8 @@ def gain_by_run(case: Case) -> Fact:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
         best = 1.0
-    if "of the model differ in sign" in own.refusal:  # also where a turned gain works
-        return Fact(Verdict.NO, numbers, of, f"{own.refusal}.")
+    if own.turned:  # also where a turned gain works
+        return Fact(Verdict.NO, numbers, of, f"{own.turned}.")
     if verdict != Verdict.YES and best in (0.0, 1.0):
         tried = min(rungs, key=lambda times: rungs[times].error)
         numbers |= {"best_gain": tried * value, "error_at_best": rungs[tried].error}
