@@ -18,24 +18,17 @@ Errors count from 3 s on:
     INDI                         1.7e-05
     INDI, filtered                0.0011
     ADRC                           0.012
-    intelligent PD               0.00029
-    disturbance observer         0.00016
     L1 adaptive                  0.00021
-    repetitive control             0.019
     sliding mode                  0.0018
     acceleration feedback         0.0057
     acceleration rate              0.034
     force MRAC, no FPI             0.033
     force MRAC                   0.00027
-    backstepping, no FPI            0.12
-    backstepping MRAC              0.001
     Lyapunov MRAC                 0.0022
 
 INDI without a filter is an iteration of unit gain and CTC+FPI one of a quarter: here more gain is better, because nothing is
-noisy or late. ADRC measures the angle alone. Repetitive control learns from the second swing on, and
-the load of 3 s does not repeat.
-The backstepping pair follows a reference model and has no integral. Lyapunov's rule has
-the best of several adaptations; its leakage has little effect here.
+noisy or late. ADRC measures the angle alone. Lyapunov's rule has the best of several adaptations; its
+leakage has little effect here.
 """
 
 import casadi as ca
@@ -85,17 +78,12 @@ controllers = {
     "INDI": fp.rivals.INDI(track),
     "INDI, filtered": fp.rivals.INDI(track, frequency=50.0),  # rad/s, as published for quadrotors
     "ADRC": fp.rivals.ADRC(RATE, observer=10 * RATE),
-    "intelligent PD": fp.rivals.IntelligentPID(track, {"angle": 1 / inertia}, window=10),
-    "disturbance observer": fp.rivals.DisturbanceObserver(track, bandwidth=300.0),  # 1/s
     "L1 adaptive": fp.rivals.L1Adaptive(track, bandwidth=300.0),  # rad/s
-    "repetitive control": fp.rivals.RepetitiveControl(track, repeats=4.189, gain=0.4, smoothing=0.05),  # s
     "sliding mode": fp.rivals.SlidingMode(rate=RATE, gain=500.0, width=1.0),  # rad/s^2, rad/s: chatters from 4 ms on
     "acceleration feedback": fp.rivals.AccelerationFeedback(track, gain=5.0, time_constant=0.02),
     "acceleration rate": fp.rivals.ResolvedAccelerationRate(RATE),
     "force MRAC, no FPI": fp.rivals.ForceMRAC(track, fp.Identity()),
     "force MRAC": fp.rivals.ForceMRAC(track, fp.Sigmoid(gain=-0.5, shift=0.3, scale=25.0)),  # scale in N m
-    "backstepping, no FPI": fp.rivals.BacksteppingMRAC(RATE, (RATE, RATE), fp.Identity()),
-    "backstepping MRAC": fp.rivals.BacksteppingMRAC(RATE, (RATE, RATE), sigmoid),
     "Lyapunov MRAC": fp.rivals.LyapunovMRAC(RATE, adaptation=300.0, leakage=0.02),
 }
 headline = ("CTC", "CTC+FPI")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from copy import copy
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
@@ -44,8 +44,6 @@ class PlantModel:
     plant: Plant  # equations of the model
     signals: Mapping[str, Exogenous]  # measured disturbances, with their preview
     exact: bool = False  # whether its parameters are the exact ones; such a controller is a bound to compare with
-    # values of parameters in place of the approximate ones, by name
-    given: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def parameter(self) -> Signal:
@@ -54,9 +52,7 @@ class PlantModel:
 
     def parameters(self, plant: Plant) -> np.ndarray:
         """Return the parameters with which the controller evaluates a plant, shape (np,)."""
-        if self.exact or not self.given:
-            return plant.exact if self.exact else plant.approximate
-        return np.array([self.given.get(n, p.approximate) for n, p in plant.parameters.items()], dtype=float)
+        return plant.exact if self.exact else plant.approximate
 
 
 @dataclass(frozen=True)
@@ -226,15 +222,6 @@ class OfDerivatives(Undeformed, ABC):
     def check(self, problem: Problem) -> None:
         instead = "use ComputedTorque, with a deformation where the model is wrong"
         require_derivatives(problem.plant, type(self).__name__, of_time=self.of_time, instead=instead)
-
-
-class PairedAtOnce(Undeformed, ABC):
-    """Contract: a controller that takes a response for that of the last command, also behind dead time."""
-
-    def notes(self, problem: Problem) -> tuple[str, ...]:
-        age = problem.dead_time.longest
-        text = f"{type(self).__name__} takes a response for that of the last command, and it is that of a command {age:.3g} "
-        return (f"{text}{problem.time_unit} older: dead time is not compensated",) if age else ()
 
 
 @dataclass(frozen=True)

@@ -50,8 +50,8 @@ def _of_nominal_run(problem: Problem, count: int) -> tuple[np.ndarray, np.ndarra
     return states[:, places], inputs[:, places]
 
 
-def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np.ndarray:
-    """Return inputs beside these states, shape (nu, count): of the model with some parameters, by its inverse or its nominal run.
+def reference_inputs(problem: Problem, count: int) -> np.ndarray:
+    """Return the model's inputs beside these states, shape (nu, count), by its inverse or its nominal run.
 
     Those before the run stand for a model with more or fewer inputs than controlled coordinates.
     """
@@ -60,7 +60,7 @@ def reference_inputs(problem: Problem, count: int, parameters: np.ndarray) -> np
         return _of_nominal_run(problem, count)[1]
     if len(plant.controlled_names) != len(plant.inputs):
         return np.repeat(problem.inputs_before[:, None], count, axis=1)
-    states, repeated = reference_states(problem, count), np.repeat(parameters[:, None], count, axis=1)
+    states, repeated = reference_states(problem, count), np.repeat(plant.approximate[:, None], count, axis=1)
     wanted = nominal_motion(problem).map(count)(times[None, :])[1]
     return np.asarray(plant.equations.inverse.map(count)(states, wanted, repeated).full())
 
@@ -183,9 +183,9 @@ def request_of_plans(problem: Problem) -> RequestChange:
     return RequestChange(float(np.linalg.norm(np.abs(at_start) @ (upper - lower))), sudden=True)
 
 
-def request_of_commands(problem: Problem, parameters: np.ndarray) -> RequestChange:
-    """Return the change period max|dQ/dt| of the command Q that the model with these parameters needs along the reference."""
-    values, times = reference_inputs(problem, _INSTANTS, parameters), np.linspace(0.0, problem.duration, _INSTANTS)
+def request_of_commands(problem: Problem) -> RequestChange:
+    """Return the change period max|dQ/dt| of the command Q that the model needs along the reference."""
+    values, times = reference_inputs(problem, _INSTANTS), np.linspace(0.0, problem.duration, _INSTANTS)
     return RequestChange(problem.period * _steepest(values, times), sudden=False)
 
 

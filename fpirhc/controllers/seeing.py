@@ -149,7 +149,7 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
     rate = plant.equations.rate(x, u, p)
     jacobians = ca.Function("fpirhc_observed", [x, u, p], [ca.jacobian(rate, x), ca.jacobian(shown, x)])
     states, slopes, seen = [], [], []
-    along = reference_states(problem, _INSTANTS), reference_inputs(problem, _INSTANTS, plant.approximate)
+    along = reference_states(problem, _INSTANTS), reference_inputs(problem, _INSTANTS)
     for state, needed in zip(*(rows.T for rows in along), strict=True):
         slope, part = (np.asarray(m.full()) for m in jacobians(state, needed, plant.approximate))
         if np.isfinite(slope).all() and np.isfinite(part).all():

@@ -183,16 +183,6 @@ def test_a_plan_is_the_minimum_by_hand(steps: int) -> None:
 GROWTH = {"growth": fp.Uncertain(0.1, 2.0, 0.3)}
 
 
-def test_the_reference_model_of_a_map_has_its_pole_in_the_cycle() -> None:
-    """The deviation from the reference is (1 - rate T)^k of the first one."""
-    run = simulated(
-        replace(stock(), horizon=None, cost=None),
-        fp.rivals.BacksteppingMRAC(3.0, [5.0], fp.ModelReferenced(fp.Affine(-1.0))),
-    )
-    deviation = (run["reference"] - run["model"])[:, 0]
-    assert deviation == pytest.approx(deviation[0] * 0.7 ** np.arange(40), rel=1e-9)
-
-
 LEARNERS = {"least squares": fp.RecursiveLeastSquares(GROWTH, {"stock": 0.01}, 5.0)}
 
 

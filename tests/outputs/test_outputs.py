@@ -158,10 +158,6 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
         lambda: sedated(hill(4.0), disturbances={"depth": fp.Formula(ca.sqrt)}), "not finite"
     ),
     "gains": (lambda: simulated(sedated(hill(5.5)), fp.PID({"deep": -1.0})), "controlled coordinate 'deep' is unknown"),
-    "orders": (
-        lambda: simulated(sedated(hill(5.5)), fp.rivals.BacksteppingMRAC(1.0, (1.0,), fp.Affine(-1.0))),
-        "has relative order 2, but rates has 1",
-    ),
     "mechanics": (
         lambda: simulated(circle(arm()), fp.load_problem("planar_arm").controllers["AID"]), "mechanics in its own coordinates"
     ),

@@ -3,15 +3,11 @@
 from .acceleration_feedback import AccelerationFeedback as AccelerationFeedback
 from .adaptive_inverse_dynamics import AdaptiveInverseDynamics as AdaptiveInverseDynamics
 from .adrc import ADRC as ADRC
-from .backstepping_mrac import BacksteppingMRAC as BacksteppingMRAC
-from .disturbance_observer import DisturbanceObserver as DisturbanceObserver
 from .force_mrac import ForceMRAC as ForceMRAC
 from .indi import INDI as INDI
-from .intelligent_pid import IntelligentPID as IntelligentPID
 from .l1_adaptive import L1Adaptive as L1Adaptive
 from .lyapunov_mrac import LyapunovMRAC as LyapunovMRAC
 from .pid import PID as PID
-from .repetitive_control import RepetitiveControl as RepetitiveControl
 from .resolved_rate import ResolvedAccelerationRate as ResolvedAccelerationRate
 from .sliding_mode import SlidingMode as SlidingMode
 from .slotine_li import SlotineLi as SlotineLi

@@ -5,18 +5,15 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, law_blocks
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import PlantModel
 from fpirhc.controllers.reference_states import request_of_commands
 from fpirhc.deformation.base import Deformation, automatic, scaled_for
-from fpirhc.errors import Mistakes, NotSupported
-from fpirhc.fields.kinds import Finite
+from fpirhc.errors import NotSupported
 from fpirhc.members import Example
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
@@ -34,31 +31,23 @@ class ForceMRAC(Controller):
     Args:
         tracking: the law that gives the desired response.
         deformation: the fixed-point map on commands; a scale is in units of the inputs.
-        model: values of the reference model's parameters by name; those not named are the plant's approximate ones.
     """
 
     tracking: Tracking
     deformation: Deformation
-    model: Mapping[str, Finite] = field(default_factory=dict)
 
     def with_defaults(self, problem: Problem) -> ForceMRAC:
         if not automatic(self.deformation):
             return self
-        request = request_of_commands(problem, self.plant_model(problem).parameters(problem.plant))
-        return replace(self, deformation=scaled_for(self.deformation, request))
-
-    def plant_model(self, problem: Problem) -> PlantModel:
-        return PlantModel(problem.plant, problem.signals, given=self.model)
+        return replace(self, deformation=scaled_for(self.deformation, request_of_commands(problem)))
 
     deforms = "command"
 
     def check(self, problem: Problem) -> None:
-        """Raise if the reference model has parameters that the plant does not have, or values that are no numbers.
+        """Raise where the response does not recalculate the last command, with which a model-referenced map compares it.
 
         Raises:
-            InvalidProblem: all mistakes together.
-            NotSupported: a model-referenced deformation where sensing is not ideal or something is late, because the last command
-                is then not the one that the response recalculates.
+            NotSupported: such a map where sensing is not ideal or something is late.
         """
         form, late = self.deformation.form, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
         believes = form.late or any(every(form.lag))
@@ -67,9 +56,6 @@ class ForceMRAC(Controller):
                 "ForceMRAC cannot use a model-referenced deformation here: it compares the last command with the one recalculated "
                 "from the response, through no estimator, dead time or lag; use the map itself or Increment"
             )
-        mistakes = Mistakes("ForceMRAC")
-        mistakes.unknown("model: parameter", self.model, problem.plant.parameters)
-        mistakes.raise_if_any()
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         return law_blocks(built, self.tracking, self._force_block(built.plant, built.warm_up))

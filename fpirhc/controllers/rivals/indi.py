@@ -11,35 +11,41 @@ import casadi as ca
 
 from fpirhc.controllers.base import law_blocks
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import PairedAtOnce
-from fpirhc.fields.kinds import Accuracy, Positive
+from fpirhc.controllers.contract import Undeformed
+from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, like, scalar
+from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
+
+_DAMPING = 0.55  # zeta of the low-pass
 
 
 @dataclass(frozen=True)
-class INDI(PairedAtOnce):
+class INDI(Undeformed):
     """Increments of the command by the model's input gain. Dead time is not compensated.
 
     Args:
         tracking: the law that gives the desired response.
-        frequency: w of the low-pass on command and response, rad/s; None: no filter.
-        damping: zeta of the low-pass, below one.
+        frequency: w of the low-pass on command and response, rad/s, with a damping of 0.55; None: no filter.
     """
 
     tracking: Tracking
     frequency: Positive | None = None
-    damping: Accuracy = 0.55
+
+    def notes(self, problem: Problem) -> tuple[str, ...]:
+        age = problem.dead_time.longest
+        text = f"INDI takes a response for that of the last command, and it is that of a command {age:.3g} {problem.time_unit} "
+        return (f"{text}older: dead time is not compensated",) if age else ()
 
     def filter(self, period: float) -> tuple[float, float]:
         """Return (c_1, c_2) of H for cycles of that period: y_k = (1 - c_1 - c_2) x_k + c_1 y_{k-1} + c_2 y_{k-2}."""
         if self.frequency is None:
             return 0.0, 0.0
-        decay = ca.exp(-self.damping * self.frequency * period)
-        return 2 * decay * ca.cos(self.frequency * period * ca.sqrt(1 - self.damping * self.damping)), -decay * decay
+        decay = ca.exp(-_DAMPING * self.frequency * period)
+        return 2 * decay * ca.cos(self.frequency * period * ca.sqrt(1 - _DAMPING * _DAMPING)), -decay * decay
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         return law_blocks(built, self.tracking, self._increment_block(built))
