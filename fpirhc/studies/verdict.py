@@ -303,8 +303,8 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
-        among = " of those with the wrong model" if any(e.exact for e in entries) else ""
-        yield f"The smallest rms error{among} is that of {best}: {in_percent(least)} of the range of the reference ({yard.span})."
+        among = " with the wrong model" if any(e.exact for e in entries) else ""
+        yield f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:

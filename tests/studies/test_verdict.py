@@ -189,7 +189,7 @@ def test_what_counts_and_what_comes_first():
     assert best == ["B+FPI"]  # which is marked
     assert [text.partition(":")[0] for text in comparison.view.lists["Flags"]] == ["B+FPI", "A+FPI"]
     assert [f.pair[1] for f in found if f.pair] == ["B+FPI", "A+FPI"] * 2
-    [share] = [s for f in found for s in re.findall(r"^The smallest rms error is that of B\+FPI: (\S+) % of", f.text)]
+    [share] = [s for f in found for s in re.findall(r"^Smallest rms error: B\+FPI, (\S+) % of", f.text)]
     assert float(share) == pytest.approx(100 * math.sqrt(((0.2 / 1.757) ** 2 + (0.2 / 2) ** 2) / 2), rel=0.01)
     [unmeasured] = findings(compared({"A": cases["A"]}, {"measure_from": PERIOD * (CYCLES - 0.4)})).values()
     assert unmeasured.text == "A+FPI and A cannot be compared: an error is no number."
@@ -263,7 +263,7 @@ def test_errors_are_measured_against_the_motion_that_is_wanted(changes, scale):
     """The range of the reference, or how far the start is from it, m; else the cost's weight, the limits, or 1."""
     one = tasks.made(tank(**changes), {"law": fp.ComputedTorque(fp.Exponential(rate=20.0))})
     found = fp.compare(one, seed=0, compiled=False)
-    [share] = [float(part) for text in found.verdict for part in re.findall(r"that of law: (\S+) % of the range", text)]
+    [share] = [float(part) for text in found.verdict for part in re.findall(r"rms error: law, (\S+) % of the range", text)]
     assert 100 * found["law"].errors["y"] / share == pytest.approx(scale, rel=1e-2)
 
 
@@ -276,7 +276,7 @@ def test_a_controller_that_has_the_exact_model_is_a_bound_and_wins_nothing():
     found = fp.compare(tasks.made(one, laws), seed=0, compiled=False)
     assert [e.name for e in found.entries if e.exact] == ["exact"]
     said, table = " ".join(found.verdict), found.view.tables[0]
-    assert "The smallest rms error of those with the wrong model is that of fast" in said
+    assert "Smallest rms error with the wrong model: fast," in said
     assert "exact is no bound here; smaller errors: fast. Its cost or its rate is another." in said
     assert {row.cells[0] for row in table.rows if row.best} <= {"fast", "law"}
     right = fp.compare(tasks.made(one.with_exact(one.plant.approximate), laws), seed=0, compiled=False)
@@ -347,7 +347,7 @@ def test_what_noise_of_the_response_costs_is_what_it_costs():
     """One sentence about the headline; a run with a sensor of that noise has the same movement, and then nothing is said."""
     one = tasks.van_der_pol
     names = [*one.headline]
-    [told] = [f for f in fp.compare(one, seed=0, controllers=names).findings if "measured without noise" in f.text]
+    [told] = [f for f in fp.compare(one, seed=0, controllers=names).findings if "measures its response without noise" in f.text]
     said = float(re.findall(r"variation of the command by (\S+) ", told.text)[0])
     quiet = fp.simulate(one.problem, one.controllers[names[1]], seed=0).first(1000)
     noise = fp.Noise(1e-3 * float(np.ptp(quiet["realised"])))
