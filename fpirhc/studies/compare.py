@@ -318,8 +318,8 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     moves = float((bench.moves(other) / np.maximum(bench.moves(quiet), 1e-300)).max())
     ratios = {n: after[n] / max(e, 1e-300) for n, e in before.items()}
     name = max(ratios, key=ratios.__getitem__)
-    text = f"{run.controller} measures its response without noise. White noise of {in_percent(NOISE)} of the response's range (rms) "
-    text += f"would multiply the rms error of {name} by {written_out(ratios[name])} and the total variation of the command "
+    text = f"{run.controller} measures its response without noise. White noise of {in_percent(NOISE)} of its range (rms) would "
+    text += f"multiply the rms error of {name} by {written_out(ratios[name])} and the total variation of the command "
     return Finding(f"{text}by {written_out(moves)} ({bench.since(quiet.cycles)}).", ratios=ratios)
 
 
