@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import partial
+from textwrap import indent
 from types import CodeType
 from typing import Any, TypeVar
 
@@ -100,14 +104,28 @@ def _is_setting(one: Field[Any], content: object) -> bool:
     return bool(content) and _differs(one, content) if kind == "where given" else kind is True
 
 
-def as_written(value: Any) -> str:
-    """Return a dataclass as a user would write it: 'Class(field=...)' with those fields that differ from their defaults.
+def as_written(value: Any, prefix: str = "", width: float = math.inf) -> str:
+    """Return a value as a user would write it, on lines of this width: of a dataclass those fields that differ from their defaults.
 
-    Numbers that were computed have six digits.
+    Numbers that were computed have six digits; a function is its name, and a class of this package has the prefix.
     """
-    told = [(f.name, getattr(value, f.name)) for f in fields(value) if f.init and _differs(f, getattr(value, f.name))]
-    text = f"{type(value).__name__}({', '.join(f'{name}={content!r}' for name, content in told)})"
-    return _COMPUTED.sub(lambda number: f"{float(number[0]):.6g}", text)
+    inner = partial(as_written, prefix=prefix, width=width - 4)
+    if is_dataclass(value) and not isinstance(value, type):
+        told = [(f, getattr(value, f.name)) for f in fields(value) if f.init and f.metadata.get("setting", True)]
+        parts = [f"{f.name}={inner(content)}" for f, content in told if _differs(f, content)]
+        own = prefix if type(value).__module__.startswith("fpirhc.") else ""
+        begin, end = f"{own}{type(value).__name__}(", ")"
+    elif isinstance(value, Mapping):
+        begin, parts, end = "{", [f"{inner(key)}: {inner(content)}" for key, content in value.items()], "}"
+    elif isinstance(value, list | tuple):
+        begin, parts, end = "(", [*map(inner, value)], ",)" if len(value) == 1 else ")"
+    else:
+        named = isinstance(plain := describe(value), str)
+        text = json.dumps(value, ensure_ascii=False) if isinstance(value, str) else plain if named else repr(plain)
+        return _COMPUTED.sub(lambda number: f"{float(number[0]):.6g}", text)
+    whole = f"{begin}{', '.join(parts)}{end}"
+    lines = indent("".join(f"\n{one}," for one in parts), "    ")
+    return whole if len(whole) <= width else f"{begin}{lines}\n{end[-1]}"
 
 
 _COMPUTED = re.compile(r"\d+\.\d{7,}(e[+-]?\d+)?")  # more digits than a user writes

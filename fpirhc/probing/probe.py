@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -49,7 +48,7 @@ class Probe(FoundByName):
     @property
     def lines(self) -> str:
         """The line to paste into a problem file, as the deformation of the controller."""
-        return "deformation=" + re.sub(r"\b([A-Z]\w*\()", r"fp.\1", as_written(self.deformation or Identity())) + ","
+        return f"deformation={as_written(self.deformation or Identity(), 'fp.')},"
 
     def __repr__(self) -> str:
         return line(self, *(f"{name} {value}" for name, value in self.facts), self.lines, self.why)

@@ -122,7 +122,7 @@ def _draw_factor(
     factors = np.abs(1 - gains[:, None] * first.spectrum.eigenvalues.ravel()).max(axis=1)
     axis.plot(scale * gains, factors, color="#444444", lw=1.2)
     axis.axhline(1.0, color="#aa0000", lw=0.8)
-    axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit")
+    axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit: small errors")
     sectors: dict[float, str] = {}
     for name, one in entries:
         own, colour = scale * one.report.effective_gain, colours[name]
@@ -131,10 +131,10 @@ def _draw_factor(
         sectors.setdefault(round(float(max(one.report.sector_limit, key=abs)), 3), colour)
     for sector, colour in sectors.items():
         if sector and abs(sector) < 0.999 * abs(limit):
-            axis.axvline(scale * sector, color=colour, lw=1.6, ls=":", label="sector limit")
+            axis.axvline(scale * sector, color=colour, lw=1.6, ls=":", label="sector limit: errors of any size")
     axis.set_ylim(0, 1.6)
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))
-    caption_axes(axis, literal(gain), "max|1 - a lambda|")
+    caption_axes(axis, literal(gain), "contraction factor")
     axis.set_title("Contraction of the iteration alone: o predicted, x measured", fontsize=10, y=1.0)
     draw_legend(axis)

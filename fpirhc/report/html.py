@@ -1,6 +1,6 @@
 """HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view.
 
-The verdict is first, then come charts, the main columns, pictures, notes, and settings.
+The verdict is first, then come the main columns, charts, pictures, notes, and settings.
 """
 
 from __future__ import annotations
@@ -126,7 +126,8 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    context |= {"in_full": IN_FULL, "policy": Markup(policy)}
+    illustrated = ["Contraction"] if context.get("contraction") else []  # lists that stand above their pictures
+    context |= {"in_full": IN_FULL, "policy": Markup(policy), "illustrated": illustrated}
     return template.render(view=view, others=said, styles=styles, scripts=every, **context)
 
 
@@ -142,12 +143,7 @@ def _environment() -> Environment:
 
     loader = PackageLoader(__package__)
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters |= {
-        "css_class": css_class,
-        "whole_numbers": whole_numbers,
-        "blocks": blocks,
-        "indented": lambda value: json.dumps(value, indent=1),
-    }
+    environment.filters |= {"css_class": css_class, "whole_numbers": whole_numbers, "blocks": blocks}
     return environment
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
 from rich.cells import cell_len
@@ -50,7 +50,6 @@ STYLES = {
     None: "",  # a remark
 }
 _IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, and what no line breaks at in their place
-_MOST_STEPS = 6  # of the set-points of one coordinate in a text
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
 _DRAWN = 0.1  # s from one picture of a bar to the next
@@ -224,8 +223,6 @@ def announce_backend(runs: Iterable[Run]) -> None:
 def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Path]) -> None:
     """Print what speaks against its adaptation, one run's metrics and the paths of its files."""
     show_harm(harm)
-    for text in set_points_in_force(run):
-        say(text)
     for column in columns([metrics]):
         say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
@@ -233,17 +230,6 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Pa
     for text in (*metrics.broken.values(), *run.remarks):
         say(text)
     say(f"saved: {', '.join(map(str, saved))}", wrap=False)
-
-
-def set_points_in_force(run: Run) -> list[str]:
-    """Return one line per coordinate with the set-points of the run and the times from which they were in force."""
-    record = cast(dict[str, list[list[float]] | str], run.settings.get("setpoints", {}))
-    lines = []
-    for name, steps in record.items():
-        shown = [steps] if isinstance(steps, str) else [f"{value:g} from {at:g} {run.time_unit}" for at, value in steps]
-        more = [f"and {len(shown) - _MOST_STEPS} more"] if len(shown) > _MOST_STEPS else []
-        lines.append(f"set-points of {name}: {', '.join([*shown[:_MOST_STEPS], *more])}")
-    return lines
 
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:

@@ -87,7 +87,7 @@ def draw_legend(axis: Axes) -> None:
     handles, labels = axis.get_legend_handles_labels()
     named = {_cut(label, _NAME): handle for handle, label in zip(handles, labels, strict=True)}
     if named:
-        axis.legend(named.values(), named, fontsize=7, loc="best", framealpha=0.8)
+        axis.legend(named.values(), named, fontsize=8, loc="best", framealpha=0.8)
 
 
 def _cut(name: str, length: int) -> str:

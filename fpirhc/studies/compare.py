@@ -162,8 +162,8 @@ class Comparison(Study):
         about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
         notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
-        lists = {"Notes": notes, "Flags": [f"{f.pair[1]}: {f.flags}" for f in self.findings if f.pair and f.flags]}
-        lists[f"Null tests: {NULL}"] = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
+        null = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
+        lists = {"Notes": notes, f"Null tests: {NULL}": null}
         lost = {f.pair[1] for f in self.findings if f.pair and f.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)}
         lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run, lost)}" for e in self.entries if e.contraction]
         return self.viewed(sentences, about, (table.filled,), self._facts(), lists=lists, skipped=self.skipped)

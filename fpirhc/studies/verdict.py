@@ -51,7 +51,6 @@ class Finding:
     outcome: Outcome | None = None  # of the pair that it is about; None for a remark
     pair: tuple[str, str] | None = None  # names without and with adaptation
     ratios: Mapping[str, float] = field(default_factory=dict)  # error with adaptation over that without, largest first
-    flags: str = ""  # that are raised, or 'none'
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
@@ -225,14 +224,14 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     one_way = Outcome.WORSE if up else Outcome.BETTER if down else Outcome.NO_DIFFERENCE
     outcome = Outcome.MIXED if up and down else one_way
     raised = flags_of(Pair(plain, adaptive, yard, major))
-    said, flags = [text for _, text in raised], "; ".join(text for _, text in raised) or "none"
+    said = [text for _, text in raised]
     if any(yard.beyond(plain, n) and yard.beyond(adaptive, n) for n in major):
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
     errors = ", ".join(f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(run.unit(f'error.{n}'))}" for n in ratios)
     text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'}, {yard.span})."
-    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios, flags)
+    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
 
 
 def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:

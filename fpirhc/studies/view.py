@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from fpirhc.describe import describe
+from fpirhc.describe import as_written
 from fpirhc.studies.verdict import Outcome
 from fpirhc.summary import Table, in_percent
 
@@ -32,7 +32,7 @@ class View:
     sentences: Sequence[tuple[str, Outcome | None]]
     conditions: str  # what the numbers of the first table are measured on
     tables: Sequence[Table]  # its tables, the controllers first; those without rows are not shown
-    settings: Mapping[str, Any]  # settings of the problem and of every controller, by name
+    settings: Mapping[str, str]  # settings, as Python, of the problem and of every controller, by name
     versions: Mapping[str, str]  # versions of fpirhc and of what its numbers depend on
     command: str  # the command that reproduces it; '' where there is none
     elapsed: float  # wall time, s
@@ -49,12 +49,12 @@ class View:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Study(ABC):
-    """The result of a study: its problem, settings of the problem and the controllers, versions, command line, wall time in s."""
+    """The result of a study: its problem, settings as Python by name, versions, command line, wall time in s."""
 
     problem: str
     title: str
     description: str
-    settings: Mapping[str, Any]
+    settings: Mapping[str, str]
     versions: Mapping[str, str]
     command: str
     elapsed: float
@@ -90,7 +90,7 @@ def circumstances(task: Task, controllers: Mapping[str, Controller], command: st
         "problem": task.name,
         "title": task.title,
         "description": task.description,
-        "settings": {"problem": describe(task.problem), **{n: describe(c) for n, c in controllers.items()}},
+        "settings": {n: as_written(v, "fp.", 100) for n, v in {"problem": task.problem, **controllers}.items()},
         "versions": versions(),
         "command": command,
         "elapsed": time.perf_counter() - begin,

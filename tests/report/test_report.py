@@ -49,9 +49,12 @@ def test_report_is_self_contained_and_small(written):
     pictures = re.findall(r"alt='(Contraction of .*?|The response error in the first .*?)[:']", whole)
     assert pictures == ["Contraction of the iteration alone", "The response error in the first 150 cycles, 0.15 s"]
     assert "0.15 s: |realised - desired| [m/s^2]'" in whole
-    marks = ("id='verdict'", "<h2>Signals over time", "<table>", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
+    marks = ("id='verdict'", "<table>", "<h2>Signals over time", "<h2>Contraction", "<h2>The problem", "<h2>Settings")
     places = [whole.index(mark) for mark in marks]
     assert places == sorted(places)
+    settings = whole[whole.index("<h2>Settings") :]  # as Python, and only what is no default
+    assert "<pre>fp.ExactModel(controller=fp.ComputedTorque(tracking=fp.Exponential(rate=6.0)))</pre>" in settings
+    assert "deformation=fp.Sigmoid(gain=-0.5, scale=5.0)" in settings
 
 
 def test_the_best_number_is_of_those_with_the_wrong_model_and_no_factor_is_best(comparison):
