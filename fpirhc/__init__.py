@@ -11,9 +11,12 @@ import lazy_loader as _lazy
 
 __version__ = _version("fpirhc")
 _import, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
+_MODULES = {"rivals": "fpirhc.controllers.rivals", "figures": "fpirhc.simulation.metrics.figures"}
 
 
 def __getattr__(name: str) -> object:
+    if name in _MODULES:
+        return _import_module(_MODULES[name])
     if name in __all__:
         return _import(name)
     if name.startswith("_"):  # tools look for such names in whatever they meet, and nobody means a public one by them

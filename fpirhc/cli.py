@@ -73,7 +73,7 @@ def compare(
 
 
 def _show_plans(task: Any, solved: Any, folder: Path) -> None:
-    from fpirhc.report.figures import plan_figure, save_figure
+    from fpirhc.report.html import plan_figure, save_figure
     from fpirhc.report.terminal import show_plans
     from fpirhc.status import Status
 
@@ -133,9 +133,9 @@ def run(
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], opt.folder_of(out, task.name)
     from fpirhc.controllers.contract import resolved
-    from fpirhc.report.figures import save_figure
+    from fpirhc.report.html import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, say, show_run
-    from fpirhc.simulation.metrics import measure
+    from fpirhc.simulation.metrics.base import measure
     from fpirhc.simulation.simulate import simulate
     from fpirhc.studies.variants import Draws
 
@@ -410,7 +410,7 @@ def export(
 
     chosen, folder = select(task, [controller])[controller], out or Path("results", task.name, to)
     if to == "lab":
-        from fpirhc.export.lab import write_lab
+        from fpirhc.export.web import write_lab
 
         if live:
             raise typer.BadParameter("--live: a lab has sliders of parameters, gains and limits of inputs, no others")

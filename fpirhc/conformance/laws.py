@@ -23,8 +23,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import build, compose_controller
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
-from fpirhc.horizon.cost import Quadratic
-from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.cost import Horizon, Quadratic
 from fpirhc.members import FAMILIES as FAMILIES
 from fpirhc.members import Example as Example
 from fpirhc.members import examples as examples

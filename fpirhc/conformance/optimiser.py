@@ -14,8 +14,7 @@ from fpirhc.conformance.laws import Array, Broken, Draw, keep, within
 from fpirhc.errors import CompileError, InvalidProblem, NotSupported
 from fpirhc.fields.checked import checked_call, replaced
 from fpirhc.fields.kinds import Range, Seed
-from fpirhc.horizon.cost import LQRTerminal, Quadratic
-from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.cost import Horizon, LQRTerminal, Quadratic
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser, worked

@@ -1,7 +1,7 @@
 """A controller that leaves Python: its C, the C names of its numbers, the samples that it is replayed with, targets and libraries.
 
-The C is that of `Stepper.function`; no target computes anything of the controller anew. A target is a module of
-`fpirhc.export.targets` with a value `TARGET`, which turns a `Device` into files; an addition is one file.
+The C is that of `Stepper.function`; no target computes anything of the controller anew. A module of
+this folder with `TARGETS`, values that turn a `Device` into files, adds them.
 """
 
 from __future__ import annotations
@@ -268,7 +268,7 @@ class Target:
 @cache
 def targets() -> dict[str, Target]:
     """Return all targets by name."""
-    members = [module.TARGET for module in within("fpirhc.export.targets")]
+    members = [target for module in within("fpirhc.export") for target in getattr(module, "TARGETS", ())]
     return {target.name: target for target in sorted(members, key=lambda one: one.name)}
 
 

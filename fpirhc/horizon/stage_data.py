@@ -8,8 +8,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from fpirhc.horizon.cost import Cost, reads_feedforward
-from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.cost import Cost, Horizon, reads_feedforward
 from fpirhc.horizon.nominal import feedforward
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import kind

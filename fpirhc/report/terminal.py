@@ -33,7 +33,7 @@ from fpirhc.summary import Column, Table, number, printable, written_out
 if TYPE_CHECKING:
     from fpirhc.probing.probe import Probe
     from fpirhc.review.review import Review
-    from fpirhc.simulation.metrics import Metrics
+    from fpirhc.simulation.metrics.base import Metrics
     from fpirhc.simulation.run import Run
     from fpirhc.studies.open_loop import Solved
     from fpirhc.studies.view import Progress as Report

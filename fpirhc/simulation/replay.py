@@ -6,7 +6,7 @@
 z_i lies on the polynomial of the plant's order through the last good samples and the new one: so a plant moves whose input is
 held. The commands of these steps are dropped: the one in force went on acting, so what remembers the last command keeps it.
 After more than `bridged` cycles the windows of estimators and observers alone are filled anew, and everything else stays as it
-was before the gap. A stepper, a simulated loop and `export/targets/controller.c` do the same.
+was before the gap. A stepper, a simulated loop and `export/templates/controller.c` do the same.
 """
 
 from __future__ import annotations

@@ -17,9 +17,8 @@ import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
 from fpirhc.fields.user_code import named_results, scalar_expression
-from fpirhc.horizon.constraint_states import check_names
-from fpirhc.horizon.cost import Cost, view_of_symbols
-from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.cost import Cost, Horizon, view_of_symbols
+from fpirhc.horizon.transcription import check_names
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.maps import check_maps, over
 from fpirhc.plant.motion import followed, followed_units, words

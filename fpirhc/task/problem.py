@@ -13,8 +13,7 @@ import numpy as np
 from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, Finite
-from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.horizon import Horizon
+from fpirhc.horizon.cost import Cost, Horizon
 from fpirhc.horizon.nominal import nominal_run
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.integrators import USUAL, Integrator, own_steps

@@ -4,13 +4,22 @@ Offset-free predictive control is `Estimating(RecedingHorizon(...), DisturbanceK
 the filter it is the periodic one.
 """
 
-import lazy_loader as _lazy
+from fpirhc.controllers.rivals.acceleration_feedback import AccelerationFeedback
+from fpirhc.controllers.rivals.adaptive_inverse_dynamics import AdaptiveInverseDynamics
+from fpirhc.controllers.rivals.adrc import ADRC
+from fpirhc.controllers.rivals.force_mrac import ForceMRAC
+from fpirhc.controllers.rivals.indi import INDI
+from fpirhc.controllers.rivals.l1_adaptive import L1Adaptive
+from fpirhc.controllers.rivals.lyapunov_mrac import LyapunovMRAC
+from fpirhc.controllers.rivals.pid import PID
+from fpirhc.controllers.rivals.resolved_rate import ResolvedAccelerationRate
+from fpirhc.controllers.rivals.sliding_mode import SlidingMode
+from fpirhc.controllers.rivals.slotine_li import SlotineLi
+from fpirhc.errors import without
 
-from fpirhc.errors import without as _without
-
-_import, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)
-_missing = _without("fpirhc.rivals", __all__)
-
-
-def __getattr__(name: str) -> object:
-    return _import(name) if name in __all__ else _missing(name)
+__all__ = [
+    "ADRC", "INDI", "PID", "AccelerationFeedback", "AdaptiveInverseDynamics",
+    "ForceMRAC", "L1Adaptive", "LyapunovMRAC", "ResolvedAccelerationRate",
+    "SlidingMode", "SlotineLi",
+]  # fmt: skip
+__getattr__ = without("fpirhc.rivals", __all__)

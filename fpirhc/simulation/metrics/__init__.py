@@ -3,7 +3,3 @@
 A file of this folder that defines `METRICS`, a tuple of `Metric`, adds them; so does an entry point of the group
 `fpirhc.metrics` of another package, and `metrics = (...)` in a problem file.
 """
-
-import lazy_loader as _lazy
-
-__getattr__, __dir__, __all__ = _lazy.attach_stub(__name__, __file__)

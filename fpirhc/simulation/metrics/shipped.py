@@ -1,16 +1,31 @@
-"""Shipped metrics: errors and settling of what is judged, the commands, cycles by status, and the plans of an optimiser."""
+"""Shipped metrics: errors and settling of what is judged, the commands, cycles by status, plans, the stage cost, the contraction.
+
+The stage cost by term is the problem's own, so the same one judges all controllers, whatever their models. The contraction is the
+factor by which the iteration shrinks an error per cycle: from the symbols along the measured cycles (all, where a run ended before
+`measure_from`), and identified from the run.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 
+from fpirhc.contraction.spectrum import Spectrum, identified_factor, jacobians_along, predicted_factor
+from fpirhc.horizon.problem import OptimalControl
+from fpirhc.horizon.stage_data import stage_data
+from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.simulation.metrics.base import Function, Metric, by_name, coordinate_unit, input_unit, measured_cycles
 from fpirhc.simulation.run import Run
+from fpirhc.simulation.tables import LOGGED
 from fpirhc.status import Status
 from fpirhc.summary import in_percent, written_out
+from fpirhc.symbolic.evaluate import Evaluator, Latest
+from fpirhc.task.exogenous import model_values, real_values, rows_of
 from fpirhc.task.problem import Problem
 
 _SMALLEST = 1e-12  # range of a reference
@@ -140,6 +155,154 @@ def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every me
     return len(np.unique(run["solve"], axis=0))  # a plan that is held for several cycles counts once
 
 
+_SHORTEST = 10  # cycles from which a run is long enough for a factor
+_SAMPLES = 200  # cycles of a run whose eigenvalues are computed
+
+
+def predicted(problem: Problem, run: Run) -> float | None:
+    """Return the largest max|1 - a lambda| in sampled cycles of the run; None for an ExternalPlant. See `fpirhc.contraction`."""
+    eigenvalues = _eigenvalues(problem, run)
+    return None if eigenvalues is None else predicted_factor(eigenvalues, _gain(run))
+
+
+def growing(problem: Problem, run: Run) -> float | None:
+    """Return the share of the sampled cycles with max|1 - a lambda| >= 1, in which small errors do not shrink."""
+    eigenvalues = _eigenvalues(problem, run)
+    return None if eigenvalues is None else float(np.mean(np.abs(1 - _gain(run) * eigenvalues).max(axis=1) >= 1))
+
+
+def measured(problem: Problem, run: Run) -> float | None:
+    """Return the factor that is fitted to requests and responses of the run; NaN where they do not excite every direction.
+
+    None for a plant outside whose response is late, or that nothing excites.
+    """
+    if not _adapts(run) or (not problem.equations_known and problem.response_delay):
+        return None
+    factor = identified_factor(run["deformed"], run["plant_realised"], _gain(run), _weights(run))
+    return factor if problem.equations_known or np.isfinite(factor) else None
+
+
+def _gain(run: Run) -> float:
+    gain = run.settings["effective_gain"]
+    assert isinstance(gain, float)
+    return gain
+
+
+def _weights(run: Run) -> np.ndarray | None:
+    rows = run.settings.get("weights")
+    return None if rows is None else np.array(rows)
+
+
+def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
+    """Return the eigenvalues of the weighted response Jacobian at sampled cycles of a run, with its controller's parameters.
+
+    The cycles are those from `measure_from` on, without the first of the run, before which there is no request.
+
+    With a reality that is a plant they are those over a whole cycle; signals from outside have the values of the cycle.
+    """
+    first = max(1, int(np.argmax(measured_cycles(problem, run))))
+    rows = np.unique(np.linspace(first, run.cycles - 1, _SAMPLES).astype(int))
+    states, deformed, times = run["state"][rows], run["deformed"][rows], run.time[rows] + problem.period / 2
+    task = problem.of_equations
+    modelled = replace(task, plant=task.real_plant) if run.settings.get("model is reality") else task
+    real = run["reality_state"][rows] if "reality_state" in run.layout else states
+    known = rows_of(model_values(modelled.plant, task.signals), times, np.array(run.settings["parameters"]))
+    exact = rows_of(real_values(task.real_plant, task.signals), times, task.real_plant.exact)
+    jacobians = jacobians_along(modelled, real, states, deformed, known, exact)
+    finite, weights = jacobians[np.isfinite(jacobians).all(axis=(1, 2))], _weights(run)
+    return Spectrum(np.linalg.eigvals(finite if weights is None else finite @ weights))
+
+
+def _eigenvalues(problem: Problem, run: Run) -> np.ndarray | None:
+    """Those of sampled cycles; None where its factors do not follow from equations."""
+    eigenvalues = sampled_spectrum(problem, run).eigenvalues if _adapts(run) and problem.equations_known else None
+    return eigenvalues if eigenvalues is not None and len(eigenvalues) else None
+
+
+def _adapts(run: Run) -> bool:
+    """Whether the run has a contraction: where its controller adapts the plant's own response."""
+    return bool(run.settings.get("iterates")) and run.cycles >= _SHORTEST
+
+
+_CHUNK = 500  # cycles whose costs are evaluated in one call
+# Every controller of a comparison is judged by the same cost.
+_COSTS: Latest[tuple[OptimalControl, Evaluator]] = Latest(2)
+
+
+def cost(problem: Problem, run: Run) -> dict[str, float]:
+    """Return the sum of the stage cost by term, and 'total', from `measure_from` on.
+
+    It is empty for a run that ended early, and where the reality lacks states of the model: their cost is nobody's.
+    """
+    whole = "plant_state" in run.layout and run.layout["plant_state"].elements == problem.plant.state.elements
+    if problem.cost is None or problem.horizon is None or run.stop is not None or not whole:
+        return {}
+    terms, costs = _costs(problem, run)
+    sums = by_name(terms, costs[measured_cycles(problem, run)].sum(axis=0))
+    return {**sums, "total": sum(sums.values())}
+
+
+def _costs(problem: Problem, run: Run) -> tuple[tuple[str, ...], np.ndarray]:
+    """The terms, and what every cycle costs by term, at the actual state and command, with the exact parameters.
+
+    With a reality it is the model's cost at the states that really were, with the exact values of the model's own parameters.
+    Effort relative to a feedforward is relative to the feedforward of the plant.
+    """
+    shifted, own = LOGGED in run.layout.names, bool(problem.own_signals)
+    ocp, evaluator = _COSTS.of((problem,), (shifted,), lambda: _cost_evaluator(problem, shifted=shifted))
+    states, commands = run["plant_state"], run["command"]
+    before = np.vstack([commands[:1], commands[:-1]])
+    # Along the reference that the run had, where it is no function of the time alone.
+    motion = [run[name] for name in ("reference", "reference_response")] if own else []
+    # A disturbed output is h + d; its error is that of h to the reference less d.
+    shift = [run[LOGGED]] if shifted else []
+    sources = run["time"], *motion, *shift, states, commands, before
+    costs = np.empty((run.cycles, len(ocp.terms)))
+    evaluator.arguments[-1][:] = problem.plant.exact
+    for at in range(0, run.cycles, _CHUNK):
+        size = min(_CHUNK, run.cycles - at)
+        for argument, source in zip(evaluator.arguments, sources, strict=False):
+            argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
+        evaluator.evaluate()
+        costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
+    return tuple(ocp.terms), costs
+
+
+def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl, Evaluator]:
+    """A horizon of one cycle, and its cost terms of many cycles."""
+    assert problem.horizon is not None
+    assert problem.cost is not None
+    plant, own = problem.plant, bool(problem.own_signals)
+    one_cycle = replace(problem.horizon, stages=1, step=problem.period, blocks=(), margins={}, lengths=())
+    ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
+    outside = real_values(plant, problem.signals)
+    data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
+    return ocp, Evaluator(_cost_function(ocp, data_of, _CHUNK, shifted=shifted))
+
+
+def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shifted: bool) -> ca.Function:
+    """Function (times, [states and responses of the reference], [shift], states, inputs, inputs before, parameters) -> cost terms.
+
+    They are those of `count` cycles. The shift is subtracted from the reference.
+    """
+    t, x, before = ca.MX.sym("t"), *(ca.MX.sym(ocp.start.name_in(k), ocp.start.size1_in(k)) for k in (0, 1))
+    u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
+    motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
+    data = data_of(t, *(ca.repmat(m, 1, 2) for m in motion), p)[:, 0]
+    if shifted:
+        place = ocp.data.slice("reference")
+        shift = ca.MX.sym("shift", place.stop - place.start)
+        data = ca.vertcat(data[: place.start], data[place] - shift, data[place.stop :])
+        motion = [*motion, shift]
+    terms = ocp.stage_cost(ocp.start(x, before), u, data)[1]
+    one = ca.Function("fpirhc_cost", [t, *motion, x, u, before, p], [terms])
+    with contextlib.suppress(RuntimeError):  # a table to look up, or a solver, is no scalar code
+        one = one.expand()
+    tables = [ca.MX.sym(one.name_in(k), one.size1_in(k), count) for k in range(one.n_in() - 1)]
+    costs = one.map(count)(*tables, ca.repmat(p, 1, count))
+    return ca.Function("fpirhc_costs", [*tables, p], [costs])
+
+
 METRICS = (
     Metric("rms_error", rms_error, by="coordinate", unit=coordinate_unit, short="rms", headline=True, order=10),
     Metric("max_error", max_error, by="coordinate", unit=coordinate_unit, order=20),
@@ -179,4 +342,18 @@ METRICS = (
     Metric("solve.worst_stationarity", _over("stationarity", np.max), title="worst residual", order=90),
     Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, order=90),
     Metric("plans", plans, better="neither", report=False, order=90),
+    Metric("cost", cost, by="term", shown=("total",), order=70, always=False),
+    # A difference of 1e-4 has no meaning: the factor is a fit, or a difference of eigenvalues from one.
+    Metric(
+        "contraction.predicted",
+        predicted,
+        short="contr. factor",
+        better="neither",  # the smallest factor is not the best gain
+        headline=True,
+        floor=1e-4,
+        order=85,
+        always=False,
+    ),
+    Metric("contraction.growing", growing, title="contraction above 1", text=in_percent, order=85, always=False),
+    Metric("contraction.measured", measured, floor=1e-4, order=85, always=False),
 )

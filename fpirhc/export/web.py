@@ -10,6 +10,7 @@ import base64
 import hashlib
 import html
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +20,8 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, package, require
-from fpirhc.export.device import c_of, literal, web_module
-from fpirhc.export.targets.c import template
+from fpirhc.export.c import data_of, filled, layout_of, sources, template
+from fpirhc.export.device import Device, Target, c_of, literal, recorded, web_module
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
@@ -121,7 +122,7 @@ class LabLoop:
             "arguments": "\n".join(f"    arg[{k + 1}] = table_{k} + k * {size};" for k, size in enumerate(count)),
         }
         files = {f"lab_step{k}.c": text for k, text in enumerate(own)}
-        return web_module({**files, "lab_run.c": template("loop.c", words, __package__)})
+        return web_module({**files, "lab_run.c": template("loop.c", words)})
 
 
 def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: Path) -> None:
@@ -197,14 +198,14 @@ def _page(task: Task, file: str, loops: list[LabLoop]) -> str:
         "period": problem.period,
         "cycles": problem.cycles,
         "measured": problem.measure_from,
-        "worker": template("worker.js", {}, __package__),
+        "worker": template("worker.js", {}),
         "colors": [PALETTE[k % len(PALETTE)] for k in range(len(loops))],
         "loops": [_loop_data(loop) for loop in loops],
         "sliders": _sliders(problem, loops),
         "charts": _charts(loops),
     }
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
-    own = f"const DATA={text};\n{template('lab.js', {}, __package__)}"
+    own = f"const DATA={text};\n{template('lab.js', {})}"
     scripts = asset("uPlot.iife.min.js"), asset("axes.js"), own
     hashes = " ".join(f"'sha256-{base64.b64encode(hashlib.sha256(one.encode()).digest()).decode()}'" for one in scripts)
     policy = (
@@ -218,7 +219,7 @@ def _page(task: Task, file: str, loops: list[LabLoop]) -> str:
         "styles": asset("uPlot.min.css") + asset("report.css"),
         "scripts": "\n".join(f"<script>{one}</script>" for one in scripts),
     }
-    return template("page.html", words, __package__)
+    return template("page.html", words)
 
 
 def _loop_data(loop: LabLoop) -> dict[str, Any]:
@@ -252,3 +253,24 @@ def _charts(loops: list[LabLoop]) -> list[dict[str, Any]]:
 
 def _place(loop: LabLoop, column: str) -> int | None:
     return loop.shown.index(column) if column in loop.shown else None
+
+
+def _files(device: Device) -> Mapping[str, str | bytes]:
+    name, layout, structs = device.name, layout_of(device), data_of(device)
+    calls = [f'EXPORT("{part}") void* get_{part}(void) {{ return &c.{part}; }}' for part in structs]
+    if device.bounds:
+        calls.append(
+            f'EXPORT("set") int put(int which, double value) {{ return {name}_set(&c, ({name}_setting)which, value); }}'
+        )
+    files = {**sources(device), f"{name}_wasm.c": filled(device, "wasm.c", data="\n".join(calls))}
+    text = json.dumps(layout, indent=1)
+    return {
+        f"{name}.wasm": web_module(files),
+        f"{name}.mjs": filled(device, "wasm.mjs", layout=text, data=json.dumps(list(structs))),
+        "layout.json": text,
+        "samples.bin": recorded(device),
+        "replay.mjs": filled(device, "wasm_replay.mjs"),
+    }
+
+
+TARGETS = (Target("wasm", _files),)

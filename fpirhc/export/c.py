@@ -13,12 +13,15 @@ from importlib import resources
 import numpy as np
 
 from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
-from fpirhc.export.device import Device, Target, identifiers, in_comment, literal, recorded
+from fpirhc.errors import InvalidValue, NotInstalled
+from fpirhc.export.device import Device, Target, identifiers, in_comment, literal, recorded, shared_library
+from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.replay import CLOCK_MEMORY, LONGEST
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
 from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.native import why_no_compiler
 
 _FEW = 12  # entries of a signal that are named in C; longer ones are arrays
 _WIDTH = 120
@@ -51,17 +54,14 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     }
 
 
-TARGET = Target("c", _files)
-
-
 def filled(device: Device, file: str, **more: str) -> str:
-    """Return a template of this folder with its words between @ filled in."""
+    """Return a template with the words of a controller and these between @ filled in."""
     return template(file, {"name": device.name, "NAME": device.name.upper(), "title": device.title, **more})
 
 
-def template(file: str, words: Mapping[str, str], package: str = "fpirhc.export.targets") -> str:
-    """Return a template of a package with its words between @ filled in."""
-    text = resources.files(package).joinpath(file).read_text(encoding="utf-8")
+def template(file: str, words: Mapping[str, str]) -> str:
+    """Return a template with its words between @ filled in."""
+    text = resources.files(__package__).joinpath("templates", file).read_text(encoding="utf-8")
     return re.sub(r"@(\w+)@", lambda m: words[m[1]], text)
 
 
@@ -315,3 +315,83 @@ def layout_of(device: Device) -> dict[str, object]:
 def _columns(layout: Layout) -> list[dict[str, object]]:
     rows = zip(layout.columns, layout.units, layout.start().tolist(), strict=True)
     return [{"name": column, "unit": unit, "start": start} for column, unit, start in rows]
+
+
+def _library_files(device: Device) -> Mapping[str, str | bytes]:
+    name = device.name
+    change = f"  return {name}_set(({name}_controller*)controller, ({name}_setting)setting, value);"
+    nothing = "  (void)controller, (void)setting, (void)value;\n  return 0;"
+    own = {
+        **sources(device),
+        f"{name}_library.c": filled(device, "library.c", change=change if device.bounds else nothing),
+        "README.md": filled(
+            device,
+            "library.md",
+            sample=_listed(device.inputs),
+            command=_listed(Layout((device.stepper.signals["command"],))),
+            settings=", ".join(device.bounds) or "none",
+        ),
+    }
+    made = shared_library(own)
+    if made is None:
+        raise NotInstalled(
+            f"a shared library needs a C compiler: {why_no_compiler()}; install gcc or clang, or pip install 'fpirhc[compiler]'"
+        )
+    return {
+        **own,
+        f"{name}_{made.platform}{made.ending}": made.content,
+        "layout.json": json.dumps(layout_of(device), indent=1),
+    }
+
+
+def _listed(layout: Layout) -> str:
+    """Names and units in their order."""
+    return ", ".join(f"`{name}` [{unit}]" for name, unit in zip(layout.columns, layout.units, strict=True))
+
+
+_ATANH = (
+    "#include <math.h>\n#ifdef __AVR__\n#define atanh(x) (0.5f * log((1 + (x)) / (1 - (x)))) /* it has none */\n#endif"
+)
+_MEMBER = re.compile(r"^ *(?:casadi_real|\}) (\w+)(?:\[\d+\])?;", re.MULTILINE)
+
+
+def _arduino_files(device: Device) -> Mapping[str, str | bytes]:
+    name, unit = device.name, device.problem.plant.time_unit
+    return {
+        "library.properties": f"name={name}\nversion=1.0.0\nauthor=fpirhc\nmaintainer=fpirhc\nsentence={device.title}\n"
+        "paragraph=A controller written from its symbolic step.\ncategory=Signal Input/Output\nurl=\narchitectures=*\n"
+        f"includes={name}.h\n",
+        **{f"src/{file}": _in_float(text, file.endswith(".h")) for file, text in sources(device).items()},
+        f"examples/{name}/{name}.ino": filled(device, "arduino.ino", unit=unit, pace=_pace(device, unit)),
+        "layout.json": json.dumps(layout_of(device), indent=1),
+    }
+
+
+def _pace(device: Device, unit: str) -> str:
+    """The line with the period in microseconds."""
+    if unit not in SECONDS:
+        return f'#error "the period is in {unit}: write const unsigned long TICKS = ...; with its microseconds here"'
+    ticks = round(1e6 * float(device.problem.period) * SECONDS[unit])
+    if not 1 <= ticks < 2**31:  # half of what the counter of microseconds holds
+        raise InvalidValue(
+            f"the period of {1e-6 * ticks:g} s is none that the clock of an Arduino counts: expected 1 us to 35 min"
+        )
+    return f"const unsigned long TICKS = {ticks};"
+
+
+def _in_float(text: str, header: bool) -> str:
+    """C whose numbers are float, and whose whole numbers are those of the processor.
+
+    A sketch reads the header after Arduino's own ones: a number called B0, PI or PORTB there is no macro of theirs.
+    """
+    text = text.replace("#define casadi_real double", "#define casadi_real float")
+    text = text.replace("#define casadi_int long long int", "#define casadi_int int")
+    names = dict.fromkeys(
+        n for n in _MEMBER.findall(text) if header and n.isupper() and n != "F"
+    )  # F("text") is another thing
+    undefined = "".join(f"#undef {name}\n" for name in names)
+    text = text.replace("#ifdef __cplusplus", f"{undefined}\n#ifdef __cplusplus", 1)
+    return text.replace("#include <math.h>", _ATANH, 1) if re.search(r"\batanh\(", text) else text
+
+
+TARGETS = Target("c", _files), Target("library", _library_files), Target("arduino", _arduino_files)

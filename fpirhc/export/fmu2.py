@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.errors import package
+from fpirhc.export.c import data_of, filled, sources
 from fpirhc.export.device import Device, Target, shared_library
-from fpirhc.export.targets.c import data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
 
 
@@ -64,7 +64,7 @@ def _files(device: Device) -> Mapping[str, str | bytes]:
     return {f"{device.name}.fmu": _archive(contents)}
 
 
-TARGET = Target("fmu2", _files)
+TARGETS = (Target("fmu2", _files),)
 
 
 # Variables and their numbers: the time, what is written in every cycle, commands, status, and the rest
