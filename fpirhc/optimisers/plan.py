@@ -223,24 +223,20 @@ def _fit_multipliers(ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray,
     lower = flat <= np.tile(ocp.state_lower + feasible_to(ocp), ocp.stages)
     near, least, most = _AT_BOUND * (1 + np.abs(inputs)), ocp.input_lower[:, None], ocp.input_upper[:, None]
     free = ~((inputs <= least + near) | (inputs >= most - near)).ravel(order="F")
-    if not (upper.any() or lower.any()) or not free.any() or not np.isfinite(sensitivity).all():
-        return none
     # Rows in the units of the stationarity, so that the fit weighs what is judged.
     weight = np.tile(1 / (ocp.step * ocp.curvature), ocp.stages)[free]
     columns = weight[:, None] * sensitivity.T[free]
-    return _fit(columns, -weight * slope.ravel(order="F")[free], upper, lower).reshape(none.shape, order="F")
-
-
-def _fit(columns: np.ndarray, target: np.ndarray, upper: np.ndarray, lower: np.ndarray) -> np.ndarray:
+    signed = np.hstack([columns[:, upper], -columns[:, lower]])
+    if not signed.size or not np.isfinite(sensitivity).all():
+        return none  # no state at a bound, or no input that could leave it
     from scipy.optimize import nnls
 
-    signed = np.hstack([columns[:, upper], -columns[:, lower]])
     size = np.maximum(np.linalg.norm(signed, axis=0), 1e-300)
-    weights, _ = nnls(signed / size, target)
+    weights, _ = nnls(signed / size, -weight * slope.ravel(order="F")[free])
     fitted = np.zeros(upper.size)
     fitted[upper] += (weights / size)[: upper.sum()]
     fitted[lower] -= (weights / size)[upper.sum() :]
-    return fitted
+    return fitted.reshape(none.shape, order="F")
 
 
 def sensitivity_of(ocp: OptimalControl) -> ca.Function:
