@@ -162,6 +162,18 @@ def test_contraction_is_the_factor_of_the_plant_and_the_gain():
     assert plain["contraction.predicted"] == {}
 
 
+def test_contraction_with_a_signal_from_outside_is_that_of_the_middle_of_a_cycle():
+    """Of y'' = w u with w = 1 + t, which the model takes for one: 1 - a w is largest in the first measured cycle."""
+    plant = replace(linear(1.0, 1.0), parameters={"b": fp.outside(1.0, "1/kg")})
+    signals, laws = (
+        {"b": fp.Unknown(lambda t: 1 + t)},
+        fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.8)),
+    )
+    task = problem(plant=plant, start={"y": 0.5}, period=1e-2, duration=1.0, measure_from=0.2, signals=signals)
+    found = fp.measure(task, fp.simulate(task, laws, seed=0, compiled=False))["contraction.predicted"][""]
+    assert found == pytest.approx(abs(1 - laws.deformation.effective_gain() * 1.205), rel=1e-9)
+
+
 def test_contraction_of_an_exact_model_is_that_of_the_reality_that_it_is():
     """Of a reality y'' = 2 u the model y'' = 1.6 u sees 1.25 of its own response, and the reality as the model sees one."""
     deformation = fp.Affine(gain=-0.8)

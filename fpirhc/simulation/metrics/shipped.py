@@ -85,8 +85,7 @@ def at_limits(problem: Problem, run: Run) -> np.ndarray:
     measured = measured_cycles(problem, run)
     lower, upper = (end[measured] for end in _limits(problem, run))
     span = upper - lower
-    near = _AT * np.where(np.isfinite(span), span, np.fmax(1.0, np.fmin(np.abs(lower), np.abs(upper))))
-    near, commands = np.where(np.isfinite(near), near, 0.0), _measured(problem, run)
+    near, commands = _AT * np.where(np.isfinite(span), span, 1.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
     slowest, fastest = problem.period * np.array(problem.limits.rate_bounds(problem.plant))
     slack = 1e-6 * np.fmin(fastest, -slowest)
@@ -260,11 +259,12 @@ def _costs(problem: Problem, run: Run) -> tuple[tuple[str, ...], np.ndarray]:
     costs = np.empty((run.cycles, len(ocp.terms)))
     evaluator.arguments[-1][:] = problem.plant.exact
     for at in range(0, run.cycles, _CHUNK):
-        size = min(_CHUNK, run.cycles - at)
+        part = slice(at, at + _CHUNK)
+        size = len(costs[part])
         for argument, source in zip(evaluator.arguments, sources, strict=False):
-            argument.reshape(_CHUNK, -1)[:size] = source[at : at + size]
+            argument.reshape(_CHUNK, -1)[:size] = source[part]
         evaluator.evaluate()
-        costs[at : at + size] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
+        costs[part] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
     return tuple(ocp.terms), costs
 
 
