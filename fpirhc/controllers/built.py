@@ -219,7 +219,7 @@ def _reads(built: Built, *seen: Signal) -> Layout:
 def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
     """Return the controller as one step: (memory, time, state, realised, parameters) -> (memory, trace, command).
 
-    `ahead`: whether time and state are those at which the command will act. The step then also reads the measured state, its time,
+    `ahead`: whether time and state are those at which the command will act. The step then also reads the measured state
     and the signals of the last cycle, where a block needs them.
     """
     blocks, delays = _blocks_of(built)
@@ -233,8 +233,8 @@ def compose_controller(built: Built, *, ahead: bool = False) -> Composite:
 
 def _measuring(built: Built, blocks: Sequence[Block]) -> list[Block]:
     """Blocks that write what is measured, where some blocks read it: what is given, unless a controller acts on predictions."""
-    read, given = _read_by(blocks), (*built.plant.motion, built.plant.time)
-    return [rename(f"measured_{one.name}", one, measured(one)) for one in given if measured(one).name in read]
+    read = _read_by(blocks)
+    return [rename(f"measured_{o.name}", o, measured(o)) for o in built.plant.motion if measured(o).name in read]
 
 
 def _read_by(blocks: Sequence[Block]) -> set[str]:

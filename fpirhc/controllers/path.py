@@ -338,11 +338,6 @@ class Pairs:
         return max(self.problem.sensing.warm_up_cycles(self.problem.plant, late), math.ceil(late - 1e-9) + 1)
 
     @property
-    def late(self) -> float:
-        """How long before the cycle the state of a pair was that of the plant, in units of time."""
-        return self.dead_time.measurement + whole(self._delay) * self.problem.period
-
-    @property
     def memory(self) -> tuple[Signal, ...]:
         """Past states, commands and outputs."""
         kept = [(self._states, self.problem.plant.state, self.problem.start_state)]
@@ -379,5 +374,5 @@ class Pairs:
 
 
 def measured(signal: Signal) -> Signal:
-    """Return the signal of what is measured of state, outputs or time, where a controller may act on what is predicted."""
+    """Return the signal of what is measured of state or outputs, where a controller may act on what is predicted."""
     return Signal(f"_measured_{signal.name}", signal.elements, signal.units)

@@ -11,7 +11,6 @@ import pytest
 from helpers.plants import pendulum
 
 import fpirhc as fp
-from fpirhc.contracts import Controller
 from fpirhc.errors import InvalidValue, NotSupported
 
 FREE = (-np.inf, np.inf)
@@ -265,7 +264,6 @@ def crossed():
     )
 
 
-AIMED = replace(task(), dead_time=fp.DeadTime(measurement=0.01), reference=fp.Setpoint({"q": 0.5}, rate=2.0))
 REFUSED = {
     "bounds that admit an indefinite mass matrix": (
         book((3.2, 1.2, 0.7, 0.7)),
@@ -273,7 +271,12 @@ REFUSED = {
         InvalidValue,
         "not positive definite.*at a1 = ",
     ),
-    "set-points before a dead time": (AIMED, AID, NotSupported, "knows of set-points; use rule=Projection"),
+    "an error that dead time makes late": (
+        replace(task(), dead_time=fp.DeadTime(inputs={"u": 0.01})),
+        AID,
+        NotSupported,
+        "use rule=Projection",
+    ),
     "infinite bounds where M is inverted": (
         task(),
         replace(AID, bounds=BOX | {"m": FREE}),
@@ -315,14 +318,9 @@ def test_what_does_not_fit_is_refused_before_the_run(why):
         fp.simulate(shipped, controller, seed=0, compiled=False)
 
 
-# Learning inverse dynamics behind dead time: the regressor, the response and the error of one instant
-
-
-NONE = fp.DeadTime()
-
-
-def run(controller: Controller, late: fp.DeadTime = NONE, duration: float = 10.0, **changes: Any) -> fp.Run:
-    problem = replace(task(rich, duration), dead_time=late, **changes)
-    result = fp.simulate(problem, controller, seed=0, compiled=False)
-    assert result.stop is None
-    return result
+@pytest.mark.parametrize("late", [{"measurement": 0.01}, {"inputs": {"u": 0.01}}])
+def test_a_right_model_learns_nothing_behind_dead_time(late):
+    """A late response belongs to the state that was measured with it and to the command that acted then."""
+    right = task(rich, 0.3, believed=(1.0, 0.5, 20.0, 3.0))
+    run = fp.simulate(replace(right, dead_time=fp.DeadTime(**late)), NLMS, seed=0, compiled=False)
+    np.testing.assert_allclose(run["estimate"], run["estimate"][:1].repeat(run.cycles, axis=0), rtol=1e-12)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import casadi as ca
@@ -11,7 +11,6 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.path import measured
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.reference_model import companion
 from fpirhc.deformation.base import Deformation, Identity
@@ -20,7 +19,7 @@ from fpirhc.learning.rules import Pair, Rule
 from fpirhc.members import Example
 from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals
-from fpirhc.symbolic.layout import Expression, Signal, like
+from fpirhc.symbolic.layout import Expression, like
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
@@ -36,10 +35,10 @@ class AdaptiveInverseDynamics(Controller):
     M_hat^-1, so the bounds must keep M_hat positive definite. A deformation keeps the errors small whatever p_hat is. Then the
     Lyapunov rule learns slowly, because it learns from these errors; a Projection learns as fast as without a deformation.
 
-    Behind dead time the rule pairs the errors with the response of the same instant: state and reference are those at which the
-    response was realised, and the command is the one that acted then. Behind an estimator alone, whose response is late by a cycle
-    or two, the newest error is better (`three_link_arm`: half the rms error). The estimate reaches the plant late, so the gains of
-    a Lyapunov rule must fall as the dead time grows. A deformation needs its own pairing, `Paired`.
+    Behind dead time a Projection pairs the response with the state at which it was realised and the command that acted then; a
+    Lyapunov rule, whose function falls with the error of the instant, is refused there. Behind an estimator alone, whose response
+    is late by a cycle or two, the newest error is better (`three_link_arm`: half the rms error). A deformation needs its own
+    pairing, `Paired`.
 
     Args:
         tracking: the law that gives the desired response.
@@ -64,9 +63,9 @@ class AdaptiveInverseDynamics(Controller):
     def check(self, problem: Problem) -> None:
         """Raise if plant, bounds or rule do not fit, as `Learning.check` does, or an error of the past would have to be known."""
         require(
-            self.rule.reads_response or not (problem.dead_time.queued and problem.given_signals),
-            "AdaptiveInverseDynamics learns by this rule from the error when the response was realised, which behind dead time "
-            "nobody knows of set-points; use rule=Projection(...), or a Trajectory",
+            self.rule.reads_response or not problem.dead_time.queued,
+            "AdaptiveInverseDynamics learns by this rule from the error of the instant, which dead time makes late; "
+            "use rule=Projection(...)",
         )
         self._learning.check(problem, inverts=True)
 
@@ -91,33 +90,19 @@ class AdaptiveInverseDynamics(Controller):
         equation = equation_function(learning.regressor(built.plant))
         weights = self.lyapunov_row()
 
-        target, reads = self._target(built)
-        paired = _late(built)
+        target, integral = like(plant.output, "_target"), integral_signal(plant, "_integral_used")
+        paired = bool(built.pairs.dead_time.queued)
 
         def gradient(s: Signals, then: Expression, estimate: Expression) -> Pair:
             state = then if paired else s.state
             matrix, _ = equation(state, s.realised, s._command_before, estimate, s.parameters)
-            chains = error_chains(plant, target(s) - state)
+            chains = error_chains(plant, getattr(s, target.name) - state)
             if self.tracking.integral:
                 chains = [[s._integral_used[k], *chain] for k, chain in enumerate(chains)]
             along = [sum(w * e for w, e in zip(weights, chain, strict=True)) for chain in chains]
             return matrix, ca.vertcat(*along)
 
-        reads = (*reads, integral_signal(plant, "_integral_used"))
-        return learning.block(built, reads, gradient)
-
-    def _target(self, built: Built) -> tuple[Callable[[Signals], Expression], tuple[Signal, ...]]:
-        """The reference when the response was realised, and what it reads; no sample is older than the start."""
-        plant, pairs = built.plant, built.pairs
-        if not _late(built) or built.given:
-            target = like(plant.output, "_target")
-            return lambda s: getattr(s, target.name), (target,)
-        reference = built.motion
-
-        def then(s: Signals) -> Expression:
-            return reference(ca.fmax(s._measured_time - pairs.late, 0), *built.own_values(s))[0]
-
-        return then, (measured(plant.time), *built.own)
+        return learning.block(built, (target, integral), gradient)
 
     def lyapunov_row(self) -> np.ndarray:
         """Return B^T P: the weights of (e_int, e, e'), or of (e, e') without the integral, in w."""
@@ -125,11 +110,6 @@ class AdaptiveInverseDynamics(Controller):
         size = len(gains)
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
         return np.asarray(solve_continuous_lyapunov(companion(gains).T, -weights)[-1])
-
-
-def _late(built: Built) -> bool:
-    """Whether there is dead time, behind which state, reference and response are of other instants."""
-    return bool(built.pairs.dead_time.queued)
 
 
 EXAMPLES = (
