@@ -19,18 +19,9 @@ Value = TypeVar("Value")
 
 
 def describe(value: Any) -> Any:
-    """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name.
-
-    A dataclass field with the metadata {"setting": False} is left out: it names the value and changes nothing. So is one with
-    {"setting": "apart"}, which decides what a study draws and no single run. One with
-    {"setting": "where given"} is left out while it is empty or its default: a setting that came later makes no earlier baseline
-    stale.
-    """
+    """Return `value` as data for JSON; a dataclass becomes {"is": its class, field: ...}, a function its name."""
     if is_dataclass(value) and not isinstance(value, type):
-        facts = {
-            f.name: describe(getattr(value, f.name)) for f in fields(value) if _is_setting(f, getattr(value, f.name))
-        }
-        return {"is": type(value).__name__, **facts}
+        return {"is": type(value).__name__, **{f.name: describe(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, Mapping):
         return {str(k): describe(v) for k, v in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
@@ -99,11 +90,6 @@ def _named(value: Any) -> Iterator[object]:
         yield value
 
 
-def _is_setting(one: Field[Any], content: object) -> bool:
-    kind = one.metadata.get("setting", True)
-    return bool(content) and _differs(one, content) if kind == "where given" else kind is True
-
-
 def as_written(value: Any, prefix: str = "", width: float = math.inf) -> str:
     """Return a value as a user would write it, on lines of this width: of a dataclass those fields that differ from their defaults.
 
@@ -111,7 +97,7 @@ def as_written(value: Any, prefix: str = "", width: float = math.inf) -> str:
     """
     inner = partial(as_written, prefix=prefix, width=width - 4)
     if is_dataclass(value) and not isinstance(value, type):
-        told = [(f, getattr(value, f.name)) for f in fields(value) if f.init and f.metadata.get("setting", True)]
+        told = [(f, getattr(value, f.name)) for f in fields(value) if f.init]
         parts = [f"{f.name}={inner(content)}" for f, content in told if _differs(f, content)]
         own = prefix if type(value).__module__.startswith("fpirhc.") else ""
         begin, end = f"{own}{type(value).__name__}(", ")"

@@ -69,11 +69,9 @@ class RecedingHorizon(Controller):
     deformation: Deformation = field(default_factory=Identity)
     tracking: Tracking | None = None
     cost: Cost | None = None
-    room: Mapping[str, NotNegative] | None = field(
-        default=None, kw_only=True, hash=False, metadata={"setting": "where given"}
-    )
-    consistent: bool | None = field(default=None, kw_only=True, metadata={"setting": False})
-    follows_model: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
+    room: Mapping[str, NotNegative] | None = field(default=None, kw_only=True, hash=False)
+    consistent: bool | None = field(default=None, kw_only=True)
+    follows_model: bool = field(default=False, kw_only=True)
 
     @property
     def planner(self) -> Planner:

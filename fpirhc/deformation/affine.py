@@ -35,9 +35,7 @@ class Affine(Deformation):
     """
 
     gain: NotZero
-    weights: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = field(
-        default=None, metadata={"setting": "where given"}
-    )
+    weights: tuple[float, ...] | tuple[tuple[float, ...], ...] | None = field(default=None)
 
     def __post_init__(self) -> None:
         if self.weights is None:

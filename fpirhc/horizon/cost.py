@@ -66,13 +66,11 @@ class Horizon(Checked):
     step: Duration
     discretisation: Integrator = USUAL
     blocks: tuple[Count, ...] = ()
-    margins: Mapping[str, NotNegative] = field(default_factory=dict, hash=False, metadata={"setting": "where given"})
-    lengths: tuple[AtLeastOne, ...] = field(default=(), kw_only=True, metadata={"setting": "where given"})
-    measured: tuple[str, ...] = field(default=(), kw_only=True, metadata={"setting": False})
-    replan: Literal["stage", "cycle"] | Count = field(
-        default="stage", kw_only=True, metadata={"setting": "where given"}
-    )
-    share: float = field(default=1.0, kw_only=True, metadata={"setting": False})
+    margins: Mapping[str, NotNegative] = field(default_factory=dict, hash=False)
+    lengths: tuple[AtLeastOne, ...] = field(default=(), kw_only=True)
+    measured: tuple[str, ...] = field(default=(), kw_only=True)
+    replan: Literal["stage", "cycle"] | Count = field(default="stage", kw_only=True)
+    share: float = field(default=1.0, kw_only=True)
 
     def __post_init__(self) -> None:
         for name in ("blocks", "lengths", "measured"):
@@ -250,7 +248,7 @@ class Quadratic(Cost):
     deviation: Weights = field(default_factory=dict)
     rate: Weights = field(default_factory=dict)
     terminal: Weights | Terminal | None = None
-    outputs: Weights = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
+    outputs: Weights = field(default_factory=dict, kw_only=True)
 
     @property
     def tracked(self) -> Mapping[str, float]:

@@ -70,7 +70,7 @@ class DisturbanceKalman(ParameterEstimator):
     drift: Mapping[str, Deviation]
     measured: Mapping[str, Deviation]
     noise: Mapping[str, Deviation] = field(default_factory=dict)
-    frequencies: Sequence[Positive] = field(default=(), metadata={"setting": "where given"})
+    frequencies: Sequence[Positive] = ()
 
     def __post_init__(self) -> None:
         require_named("DisturbanceKalman", drift=self.drift, measured=self.measured)

@@ -58,7 +58,7 @@ class FixedPoint(Optimiser):
     hessian: HessianModel | None = None
     damping: NotNegative = 0.0
     most_iterations: Count = 100
-    second_start: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
+    second_start: bool = field(default=False, kw_only=True)
 
     def check(self, ocp: OptimalControl) -> None:
         """Raise if plans cannot be rolled out, the tolerance cannot be met, or the cost is not convex where the Hessian needs that.

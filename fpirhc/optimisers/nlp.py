@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import casadi as ca
@@ -263,7 +263,7 @@ class Ipopt(MultipleShooting):
 
     accuracy: Accuracy = 1e-8
     iterations: Count = 200
-    time_limit: Positive | None = field(default=None, metadata={"setting": "where given"})
+    time_limit: Positive | None = None
 
     @property
     def unbounded(self) -> str:

@@ -38,8 +38,8 @@ class Parameter(Checked):
     exact: JudgedByOwner
     unit: str
     bounds: tuple[float, float] = (-math.inf, math.inf)
-    spread: Spread | None = field(default=None, metadata={"setting": "apart"})
-    outside: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
+    spread: Spread | None = None
+    outside: bool = field(default=False, kw_only=True)
 
 
 @checked_call

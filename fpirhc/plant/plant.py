@@ -38,9 +38,6 @@ class Output(Checked):
     expression: Callable[..., Expression]
 
 
-WHERE_GIVEN = {"setting": "where given"}
-
-
 @dataclass(frozen=True, eq=False)
 class Plant(Checked):
     """A system q^(r) = f(q, q', ..., u, p); a controller has its approximate parameters only.
@@ -80,12 +77,12 @@ class Plant(Checked):
     order: int | Mapping[str, int] = 2
     controlled: Sequence[str] | None = None
     inverse: Callable[..., Mapping[str, Expression]] | None = None
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict, kw_only=True, metadata=WHERE_GIVEN)
-    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True, metadata=WHERE_GIVEN)
-    time_unit: str = field(default="s", kw_only=True, metadata={"setting": False})
-    step: float | None = field(default=None, kw_only=True, metadata=WHERE_GIVEN)
-    steps: Few = field(default=1, kw_only=True, metadata={"setting": False})
-    believed: Mapping[str, str] = field(default_factory=dict, kw_only=True, metadata={"setting": False})
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict, kw_only=True)
+    outputs: Mapping[str, Output] = field(default_factory=dict, kw_only=True)
+    time_unit: str = field(default="s", kw_only=True)
+    step: float | None = field(default=None, kw_only=True)
+    steps: Few = field(default=1, kw_only=True)
+    believed: Mapping[str, str] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         check_plant(self)

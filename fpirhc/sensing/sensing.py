@@ -47,7 +47,7 @@ class Sensor(Checked):
     noise: Disturbance | None = None
     quantum: Positive | None = None
     dropout: BelowOne = 0.0
-    range: tuple[float, float] | None = field(default=None, metadata={"setting": "where given"})
+    range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.range is not None and not self.range[0] < self.range[1]:
@@ -80,8 +80,8 @@ class Sensing(Checked):
 
     sensors: Mapping[str, Sensor] = field(default_factory=dict)
     estimator: DerivativeEstimator = field(default_factory=Measured)
-    measured: Sequence[str] | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    observer: StateObserver | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
+    measured: Sequence[str] | None = field(default=None, kw_only=True)
+    observer: StateObserver | None = field(default=None, kw_only=True)
 
     @property
     def ideal(self) -> bool:

@@ -68,11 +68,11 @@ class ExternalPlant(Checked):
     body: Body | None = None
     measures: Mapping[str, str] | Sequence[str] = field(default_factory=dict)
     holds: CountOrZero = 0
-    rest: Mapping[str, Finite] | None = field(default=None, metadata={"setting": "where given"})
-    lag: Mapping[str, NotNegative] = field(default_factory=dict, metadata={"setting": "where given"})
-    make: Make | None = field(default=None, metadata={"setting": "apart"})
-    parameters: Mapping[str, Parameter] = field(default_factory=dict, metadata={"setting": "where given"})
-    period: Positive | None = field(default=None, metadata={"setting": False})
+    rest: Mapping[str, Finite] | None = None
+    lag: Mapping[str, NotNegative] = field(default_factory=dict)
+    make: Make | None = None
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    period: Positive | None = None
 
     def __post_init__(self) -> None:
         if (self.body is None) == (self.make is None):

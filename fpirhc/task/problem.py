@@ -82,10 +82,10 @@ class Problem(Checked):
     integrator: Integrator = USUAL
     measure_from: float = 0.0
     judged: Sequence[str] | None = None
-    input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
-    reality: Reality | ExternalPlant | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    signals: Mapping[str, Exogenous] = field(default_factory=dict, kw_only=True, metadata={"setting": "where given"})
-    name: str = field(default="", kw_only=True, metadata={"setting": False})
+    input_before: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+    reality: Reality | ExternalPlant | None = field(default=None, kw_only=True)
+    signals: Mapping[str, Exogenous] = field(default_factory=dict, kw_only=True)
+    name: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
         mistakes = Mistakes("problem")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import casadi as ca
@@ -53,7 +53,7 @@ class Fractional(IntegralLaw):
     rate: Positive
     order: Annotated[float, _ORDERS]
     memory: float | None = None
-    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
+    largest: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         if self.memory is not None and not 1 <= self.rate * self.memory < math.inf:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -115,7 +115,7 @@ class Exponential(LinearLaw):
     rate: Positive
     integral: bool = True
     bumpless: bool = True
-    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
+    largest: Sequence[float] = ()
 
     def gains(self, order: int) -> tuple[float, ...]:
         degree = order + 1 if self.integral else order
@@ -148,7 +148,7 @@ class ShiftPolynomial(LinearLaw):
     step: Duration
     integral: bool = True
     bumpless: bool = True
-    largest: Sequence[float] = field(default=(), metadata={"setting": "where given"})
+    largest: Sequence[float] = ()
 
     def __post_init__(self) -> None:
         every = [self.poles] if not isinstance(self.poles, Sequence) else list(self.poles)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -113,7 +113,7 @@ class Cascade(Controller):
     deformation: Deformation
     lag: NotNegative | tuple[NotNegative, ...] | None
     dead_time: NotNegative | None = None
-    plain: bool = field(default=False, metadata={"setting": "where given"})
+    plain: bool = False
 
     deforms = "target"
 

@@ -49,8 +49,8 @@ class Estimating(ControllerWrapper):
     once: ClassVar[bool] = True
 
     estimator: ParameterEstimator
-    dead_time: DeadTime | None = field(default=None, kw_only=True, metadata={"setting": "where given"})
-    at_once: bool = field(default=False, kw_only=True, metadata={"setting": "where given"})
+    dead_time: DeadTime | None = field(default=None, kw_only=True)
+    at_once: bool = field(default=False, kw_only=True)
 
     def inner_problem(self, problem: Problem) -> Problem:
         return _MODELLED.of((self.estimator, problem), (), lambda: self._modelled(problem))
