@@ -35,7 +35,7 @@ _PACKAGE = str(Path(__file__).parents[1])
 # Of the search for bounds, in the number's size.
 _REACHES = (1.0, 1e1, 1e2, 1e4, 1e8, 1e16, 1e32, 1e64, 1e128, 1e256)
 _SMALLEST, _CLOSE = 1e-3, 1e-6
-Numbers = Mapping[str, float | Sequence[float]]  # by path; a pair for an interval
+Numbers = Mapping[str, float]  # by path
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,25 +129,15 @@ class LiveSettings:
         return True
 
     def flat(self, numbers: Numbers) -> dict[str, float]:
-        """Return numbers by path, with the ends of intervals one by one."""
+        """Return numbers of live settings by path, checked."""
         values: dict[str, float] = {}
         for path, value in numbers.items():
-            names = [path] if path in self.paths else [f"{path}.0", f"{path}.1"]
-            if not {*names} & {*self.paths}:
+            if path not in self.paths:
                 raise InvalidName(f"setting '{path}' is not live in this loop.{nearest(path, self.paths)}")
-            parts = list(value) if isinstance(value, list | tuple | np.ndarray) and len(names) > 1 else [value]
-            if len(parts) != len(names):
-                raise InvalidValue(
-                    f"setting '{path}' is an interval: expected a pair (lower, upper), got {described(value)}"
-                )
-            for name, part in zip(names, parts, strict=True):
-                number = real_number(part)
-                if number is None or math.isnan(number):
-                    raise InvalidValue(f"setting '{name}': expected a number, got {described(part)}")
-                if name in self.paths:
-                    values[name] = number
-                elif number != self._content(name):
-                    raise InvalidValue(f"setting '{path}': its end '{name}' is {self._content(name)} and not live")
+            number = real_number(value)
+            if number is None or math.isnan(number):
+                raise InvalidValue(f"setting '{path}': expected a number, got {described(value)}")
+            values[path] = number
         return values
 
     def _with(self, contents: Mapping[str, object], *, checked: bool = True) -> tuple[Problem, Controller]:

@@ -121,7 +121,7 @@ BUMPLESS: list[tuple[str, dict[str, Any]]] = [
     ("CTC+FPI (eq 6)", {"deformation.shift": 0.1}),
     ("CTC+FPI (eq 3)", {"deformation.gain": 4e-5}),
     ("RHC+FPI", {"cost.states.q1": 2e3}),
-    ("RHC+FPI", {"limits.inputs.Q1": (-200.0, 200.0)}),
+    ("RHC+FPI", {"limits.inputs.Q1.0": -200.0, "limits.inputs.Q1.1": 200.0}),
 ]
 
 
@@ -149,9 +149,9 @@ CHANGED = {0.1: {"deformation.gain": -0.9}, 0.2: {"deformation.gain": -0.9, "def
 def test_limits_count_from_when_they_are_in_force():
     """The share of cycles at a limit is that of cycles that were clipped, also where the limit comes during the run."""
     problem = replace(tasks.two_mass.problem, duration=0.2, measure_from=0.05)
-    ready = fp.simulator(problem, tasks.two_mass.controllers["CTC"], live=["limits.inputs.Q1"], compiled=False)
+    ready = fp.simulator(problem, tasks.two_mass.controllers["CTC"], live=["limits.inputs.Q1.1"], compiled=False)
     free = ready.run(seed=0)["command.Q1"]
-    run = ready.run(seed=0, changes={0.1: {"limits.inputs.Q1": (-200.0, float(free[len(free) // 2 :].min()))}})
+    run = ready.run(seed=0, changes={0.1: {"limits.inputs.Q1.1": float(free[len(free) // 2 :].min())}})
     counts = run["clipped"][np.round(run.time / problem.period) >= round(0.05 / problem.period)]
     assert fp.measure(problem, run)["at_limit"][""] == counts.mean() > 0.2
 
