@@ -69,10 +69,9 @@ def was_skipped(status: Expression) -> Expression:
 
 
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
-TAKEN = "taken"  # time stamp of a sample
 REPLAYS = Signal("replays")  # in the memory of a loop: whether its sample is that of `replayed_...`
 LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a machine is one that is not finite
-_SAMPLE = ("state", "output", "realised", "measured", "arrived", TAKEN, LOST.name)
+_SAMPLE = ("state", "output", "realised", "measured", "arrived", LOST.name)
 INNER = "controller_memory"  # in the memory: that of a graph as one signal
 
 
@@ -101,15 +100,11 @@ class Gate:
     samples: int
     simulated: bool = False  # whether clock and memory are those of a simulated loop, which are always good
     loses: bool = False  # whether the step also reads `LOST`
-    # s; where given, the step also reads 'taken', the time stamp of the sample, which must be later than the last one's,
-    # not later than the time, and not older than this. None: time stamps are not looked at.
-    max_age: float | None = None
 
     @cached_property
     def reads(self) -> Layout:
-        """What the step reads: as the controller, and the time stamp of the sample where its age counts."""
-        own = self.inner.reads + Layout((LOST,)) if self.loses else self.inner.reads
-        return own if self.max_age is None else own + Layout((scalar(TAKEN, "s"),))
+        """What the step reads: as the controller, and whether the sample is lost where it may be."""
+        return self.inner.reads + Layout((LOST,)) if self.loses else self.inner.reads
 
     @cached_property
     def sample(self) -> Layout:
@@ -119,9 +114,9 @@ class Gate:
 
     @cached_property
     def stored(self) -> Layout:
-        """The signals of the last good sample that are kept: all for a graph or a replay, and the last time stamp."""
-        every = self.inner.opaque or self.samples
-        return Layout(tuple(s for s in self.sample.signals if (every or s.name == TAKEN) and s.name != LOST.name))
+        """The signals of the last good sample that are kept: all for a graph or a replay, else none."""
+        kept = self.inner.opaque or self.samples
+        return Layout(tuple(s for s in self.sample.signals if kept and s.name != LOST.name))
 
     @property
     def memory(self) -> Layout:
@@ -132,7 +127,7 @@ class Gate:
     def kept(self) -> Layout:
         """The last command, what is kept of the last good sample, and the counts of failed steps and gaps."""
         plant = self.problem.plant
-        starts = {plant.output.name: tuple(map(float, self.problem.start_output)), TAKEN: (-FINITE,)}
+        starts = {plant.output.name: tuple(map(float, self.problem.start_output))}
         starts[plant.state.name] = tuple(map(float, self.problem.start_state))
         first = self.problem.inputs_before
         held = Signal(HELD, plant.input.elements, plant.input.units, tuple(map(float, first)))
@@ -243,7 +238,7 @@ class Gate:
             column = ca.if_else(every_finite(column), column, start)
             command = clip(column[:inputs], *self.problem.limits.input_bounds(self.problem.plant))
             last = ca.vertsplit(column, [0, inputs, column.numel()])[1]  # CasADi's empty slice is a row
-        fits = ca.logic_and(self._possible(sample, last), self._inside(sample))
+        fits = ca.logic_and(every_finite(sample), self._inside(sample))
         now = ca.vertcat(ca.SX(0, 1), *(sample[self.sample.slice(n)] for n in self.stored.names))
         stored = ca.if_else(fits, now, last)
         return [sample, own, time], _Judged(fits, command, stored)
@@ -254,17 +249,6 @@ class Gate:
         before = ca.if_else(ca.fabs(before) <= MOST_MISSING, before, -1)
         passes = ca.logic_and(before >= 0, time != AGAIN)
         return ca.if_else(passes, ca.fmin(before + 1, MOST_MISSING), before)
-
-    def _possible(self, sample: Expression, good: Expression) -> Expression:
-        """Whether every entry is finite, and the time stamp is new."""
-        possible = every_finite(sample)
-        if self.max_age is None:
-            return possible
-        time, taken = (sample[self.sample.slice(n)] for n in ("time", TAKEN))
-        fresh = ca.logic_and(
-            taken > good[self.stored.slice(TAKEN)], ca.logic_and(taken <= time, time - taken <= self.max_age)
-        )
-        return ca.logic_and(possible, fresh)
 
     def _inside(self, sample: Expression) -> Expression:
         """Whether every entry is inside its interval, and no sample is lost; NaN is inside none."""

@@ -188,9 +188,7 @@ def _count_block() -> Block:
     return Block("count", Layout((scalar("status"),)), Layout((scalar(SKIPPED),)), step, Layout((count,)))
 
 
-def composed_step(
-    live: LiveSettings, ready: Controller, max_age: float | None, monitor: RunMonitor
-) -> tuple[Composite, Layout]:
+def composed_step(live: LiveSettings, ready: Controller, monitor: RunMonitor) -> tuple[Composite, Layout]:
     """Return the step behind its gate, and the layout of its memory.
 
     Gate and monitor have the numbers of the build, and no live ones.
@@ -200,7 +198,7 @@ def composed_step(
     def compose(built: Built) -> Composite:
         inner = compose_with_sensing(built)
         samples = known_samples(live.problem)
-        gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), max_age=max_age, samples=samples))
+        gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), samples=samples))
         return machine_step(live.problem, ready, gates[-1], monitor)
 
     composite = live.composed(compose) if live.paths else compose(build(live.problem, ready))

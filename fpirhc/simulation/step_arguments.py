@@ -116,20 +116,16 @@ class StepArguments:
         evaluator: of the Function.
         settings: argument of the live settings; no entries without any.
         setpoints: argument of the set-points; no entries without any.
-        time, memory, state, realised, output, taken, command: views; `state` is that of the raw measurements where they are read.
+        time, memory, state, realised, output, command: views; `state` is that of the raw measurements where they are read.
         memory_before, memory_next, trace, command_next: arrays of the memory that is read, and of what is written.
         estimates: whether the step begins with raw measurements.
         beside: number of entries of `output`, which are read beside the sample: measured outputs, or the state where the sample is
             that of estimated outputs; 0 without any.
         sample: arguments by name.
-        ages: whether the time stamp of the sample is read.
     """
 
-    def __init__(
-        self, function: ca.Function, composite: Composite, problem: Problem, parameters: np.ndarray, *, ages: bool
-    ) -> None:
+    def __init__(self, function: ca.Function, composite: Composite, problem: Problem, parameters: np.ndarray) -> None:
         """Bind the Function of a composite."""
-        self.ages = ages
         self.evaluator = Evaluator(function)
         arguments = dict(zip(function.name_in(), self.evaluator.arguments, strict=True))
         arguments["parameters"][:] = parameters
@@ -148,7 +144,6 @@ class StepArguments:
         self.memory, self.time, self.state, *rest = (_view(arguments[n]) for n in ("memory", "time", *sample))
         self.realised = rest[0] if rest else _view(NOTHING)
         self.memory_before = arguments["memory"]
-        self.taken = _view(arguments["taken"]) if ages else self.time
         self.command = _view(self.command_next)
 
     def accept(self, time: object, state: object, realised: object, memory: object, measures: tuple[str, ...]) -> None:
@@ -165,13 +160,6 @@ class StepArguments:
         self.time[0] = one_number("time", time)
         for name, (view, _) in values.items():
             view[:] = checked_values[name]
-
-    def take_more(self, time: float, taken: float | None, output: np.ndarray | None) -> None:
-        """Take the time stamp of the sample, and measured outputs or the state beside them, where the step reads them."""
-        if self.ages:
-            self.taken[0] = one_number("taken", time if taken is None else taken)
-        if self.beside:
-            self.output[:] = numbers_of("output", output, self.beside)
 
     def hold(self, layout: Layout, signals: Layout, missing: int) -> np.ndarray:
         """Return the memory of a skipped cycle, and write status, command and count of it into the trace.

@@ -50,7 +50,6 @@ class ComposedStep:
     ready: Controller
     composite: Composite
     memory: Layout
-    ages: bool  # whether it reads time stamps
     replay: Replay
 
     @property
@@ -64,7 +63,6 @@ class ComposedStep:
         problem: Problem,
         controller: Controller,
         *,
-        max_age: float | None = None,
         monitor: RunMonitor | None = None,
         bounded: bool = True,
         live: Sequence[str] = (),
@@ -76,9 +74,9 @@ class ComposedStep:
             ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
-        composite, memory = composed_step(settings, ready, max_age, monitor or RunMonitor())
+        composite, memory = composed_step(settings, ready, monitor or RunMonitor())
         replay = Replay.of(settings.problem, composite, bridged)
-        return cls(problem, controller, settings, ready, composite, memory, max_age is not None, replay)
+        return cls(problem, controller, settings, ready, composite, memory, replay)
 
 
 class Stepper(NumbersNow, Checked):
@@ -97,7 +95,7 @@ class Stepper(NumbersNow, Checked):
 
     Where the outputs of a plant are estimated, its state stands before them, unless it is believed.
 
-    A bad sample skips the cycle: one that is not finite, outside the range of its sensor, or (with `max_age`) out of date. The
+    A bad sample skips the cycle: one that is not finite or outside the range of its sensor. Give NaN for one that is too old. The
     command is the last one, the status is BAD_SAMPLE, the signal 'skipped' counts, and every memory stays as it was. With the
     next good sample the step runs once more for every missing cycle, on samples between those around the gap, with the status
     BRIDGED; after more than `bridged` cycles for the last ones alone, as many as fill the windows of estimators, with the
@@ -131,7 +129,6 @@ class Stepper(NumbersNow, Checked):
         controller: Controller,
         *,
         compiled: bool = True,
-        max_age: float | None = None,
         monitor: RunMonitor | None = None,
         bounded: bool = True,
         live: Sequence[str] = (),
@@ -140,16 +137,12 @@ class Stepper(NumbersNow, Checked):
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
         Args:
-            max_age: oldest sample that is used, in the plant's unit of time; the time stamps of samples must then increase. None:
-                they are not looked at.
             monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
             bounded: whether an optimiser whose call may take any time is refused.
             bridged: number of missing cycles up to which each of them is run afterwards; None: 5, or 20 behind differences of
                 positions.
         """
-        step = ComposedStep.of(
-            problem, controller, max_age=max_age, monitor=monitor, bounded=bounded, live=live, bridged=bridged
-        )
+        step = ComposedStep.of(problem, controller, monitor=monitor, bounded=bounded, live=live, bridged=bridged)
         self._bind(step, compiled=compiled)
         warn_of_harm(problem, controller)
 
@@ -175,7 +168,7 @@ class Stepper(NumbersNow, Checked):
         function = backend.function if backend else self.function
         model = step.ready.plant_model(problem)
         parameters = model.parameters(model.plant)
-        arguments = StepArguments(function, composite, problem, parameters, ages=step.ages)
+        arguments = StepArguments(function, composite, problem, parameters)
         self._begin(step.settings, composite, arguments)
         self.reads: Layout = composite.reads.starting_at(np.concatenate(arguments.evaluator.arguments[1:]))
         self.estimates, self.beside = arguments.estimates, arguments.beside
@@ -188,7 +181,6 @@ class Stepper(NumbersNow, Checked):
         self._time, self._state, self._realised = arguments.time, arguments.state, arguments.realised
         self._memory, self._command = arguments.memory, arguments.command
         self._new_command, self._new_memory = arguments.command_next.copy, arguments.memory_next.copy
-        self._more = arguments.ages or bool(arguments.beside)
         self._before, self._period = self.memory.slice(CLOCK_MEMORY.name).start, float(problem.period)
         self._skipped = self.memory.slice(f"{SKIPPED}_before").start
         self._counted = self.signals.slice(SKIPPED).start
@@ -211,7 +203,6 @@ class Stepper(NumbersNow, Checked):
         memory: np.ndarray,
         *,
         output: np.ndarray | None = None,
-        taken: float | None = None,
         settings: Numbers | None = None,
         setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -225,7 +216,6 @@ class Stepper(NumbersNow, Checked):
             memory: from `start` or from the step before.
             output: the measured outputs and their derivatives of a plant that has outputs, as `Plant.output` lays them out. Where
                 they are estimated, use `step_measured`.
-            taken: time stamp of the sample, in the plant's unit of time; None: it was taken at `time`. Read with `max_age` only.
             settings: numbers of live settings from this step on, by path. They are checked in Python before the
                 step, which takes a tenth of a millisecond; see `change`.
             setpoints: set-points from this step on, by coordinate or output; see `set_reference`.
@@ -256,8 +246,8 @@ class Stepper(NumbersNow, Checked):
                 self._arguments.accept(time, state, realised, memory, self.measures)
             if self._memory[0] != self._fingerprint:
                 self._arguments.refuse_foreign_memory()
-            if self._more:
-                self._arguments.take_more(time, taken, output)
+            if self.beside:
+                self._arguments.output[:] = numbers_of("output", output, self.beside)
             failure = self._run()
             return self._failed(failure) if failure else (self._new_command(), self._new_memory())
         finally:
@@ -269,7 +259,6 @@ class Stepper(NumbersNow, Checked):
         measured: np.ndarray,
         memory: np.ndarray,
         *,
-        taken: float | None = None,
         settings: Numbers | None = None,
         setpoints: SetpointsNow | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -279,23 +268,19 @@ class Stepper(NumbersNow, Checked):
             time: in the plant's unit of time.
             measured: what the sensors show, in the order of `measures`; late by the dead time of the measurement, as it arrives.
             memory: from `start` or from the step before.
-            taken, settings, setpoints: as in `step`.
+            settings, setpoints: as in `step`.
 
         Raises:
             FpirhcError: as in `step`.
         """
         if self.estimates and not self.beside:
-            return self.step(time, measured, NOTHING, memory, taken=taken, settings=settings, setpoints=setpoints)
+            return self.step(time, measured, NOTHING, memory, settings=settings, setpoints=setpoints)
         column = numbers_of("measured", measured, len(self.measures))
         if self.estimates:
             seen, raw = np.split(column, [self.beside])
-            return self.step(
-                time, raw, NOTHING, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
-            )
+            return self.step(time, raw, NOTHING, memory, output=seen, settings=settings, setpoints=setpoints)
         state, seen, realised = np.split(column, [len(self._state), len(self._state) + self.beside])
-        return self.step(
-            time, state, realised, memory, output=seen, taken=taken, settings=settings, setpoints=setpoints
-        )
+        return self.step(time, state, realised, memory, output=seen, settings=settings, setpoints=setpoints)
 
     @property
     def skipped(self) -> int:

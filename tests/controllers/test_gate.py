@@ -13,7 +13,7 @@ import fpirhc as fp
 from fpirhc.conformance import two_masses
 from fpirhc.contracts import Block, Controller, Deformation, Layout, scalar
 
-INF, PATIENCE, AGE = np.inf, 10, 0.012
+INF, PATIENCE = np.inf, 10
 LIMITS = {"Fa": (-300.0, 300.0), "Fb": (-6000.0, 40.0)}
 TWO = two_masses()
 RANGES = {"a": (-1.0, 3.0), "b": (-INF, 5.0), "a'": (-4.0, INF), "b''": (-INF, 9.0)}
@@ -64,17 +64,16 @@ class Rules:
     """What the gate does, in plain Python."""
 
     def __init__(self):
-        self.held, self.own, self.failed, self.skipped, self.taken = BEFORE, START, 0, 0, -INF
+        self.held, self.own, self.failed, self.skipped = BEFORE, START, 0, 0
 
-    def fits(self, time, state, realised, taken):
-        """Finite, inside its ranges, and newer than the last good sample, but not from the future and not too old."""
+    def fits(self, state, realised):
+        """Finite, and inside its ranges."""
         inside = -1 <= state[0] <= 3 and state[1] <= 5 and state[2] >= -4 and realised[1] <= 9
-        new = self.taken < taken <= time and time - taken <= AGE
-        return bool(np.isfinite([*state, *realised]).all() and inside and new)
+        return bool(np.isfinite([*state, *realised]).all() and inside)
 
-    def step(self, time, state, realised, taken):
+    def step(self, state, realised):
         """Command and status."""
-        if not self.fits(time, state, realised, taken):
+        if not self.fits(state, realised):
             return self.skip(fp.Status.BAD_SAMPLE)
         trial = self.failed == PATIENCE
         count, total = START if trial else self.own
@@ -84,7 +83,7 @@ class Rules:
         status = fp.Status.NOT_CONVERGED if state[1] < 0 else fp.Status.OK
         status = fp.Status.RESTARTED if trial else status
         self.held, self.own = np.array([total + state[0], -count]), np.array([count + 1, total + state[0]])
-        self.failed, self.taken = 0, taken
+        self.failed = 0
         return self.held, status
 
     def skip(self, status):
@@ -94,21 +93,20 @@ class Rules:
 
 
 def sample(random, bad):
-    """A state, a response and the age of the sample; of the bad ones each is bad in one thing."""
-    state, realised, age = np.array([*random.uniform(-0.5, 0.5, 2), 0.0, 0.0]), np.zeros(2), random.uniform(0, 3e-3)
+    """A state and a response; of the bad ones each is bad in one thing."""
+    state, realised = np.array([*random.uniform(-0.5, 0.5, 2), 0.0, 0.0]), np.zeros(2)
     if random.uniform() < bad:
-        kind = int(random.integers(0, 15))
+        kind = int(random.integers(0, 13))
         if kind < 3:
             state[1] = (0.125, 0.25, 0.375)[kind]
         elif kind < 11:
             wrong = ((0, np.nan), (1, INF), (3, -INF), (0, 3.01), (0, -1.01), (1, 5.01), (2, -4.01), (1, np.nan))
             state[wrong[kind - 3][0]] = wrong[kind - 3][1]
         else:
-            realised[1] = {11: np.nan, 14: 9.1}.get(kind, 0.0)
-            age = {12: -1e-4, 13: 1.01 * AGE}.get(kind, age)
+            realised[1] = {11: np.nan, 12: 9.1}[kind]
     elif random.uniform() < 0.2:  # at the edge of what is good, and on the side that is open
         state[:] = ((3.0, 5.0, -4.0, 1e9), (-1.0, -1e9, 1e9, -1e9))[int(random.integers(0, 2))]
-    return state, realised, age
+    return state, realised
 
 
 def told(gated):
@@ -118,7 +116,7 @@ def told(gated):
 
 
 def stepper(opaque):
-    return fp.Stepper(PROBLEM, Counting(opaque), compiled=False, max_age=AGE, bridged=0)
+    return fp.Stepper(PROBLEM, Counting(opaque), compiled=False, bridged=0)
 
 
 both = pytest.mark.parametrize("opaque", [False, True], ids=["scalar", "graph"])
@@ -131,9 +129,9 @@ def test_a_gate_follows_its_rules(opaque, bad):
     gated, rules, random, seen = stepper(opaque), Rules(), np.random.default_rng(round(10 * bad)), set()
     memory = gated.start()
     for k in range(200):
-        (state, realised, age), time = sample(random, bad), k * PROBLEM.period
-        command, memory = gated.step(time, state, realised, memory, taken=time - age)
-        expected, status = rules.step(time, state, realised, time - age)
+        state, realised = sample(random, bad)
+        command, memory = gated.step(k * PROBLEM.period, state, realised, memory)
+        expected, status = rules.step(state, realised)
         shown, kept = gated.trace(), gated.memory.unpack(memory)
         assert told(gated) == status, k
         assert command.tolist() == expected.tolist() == shown["command"].tolist(), k
@@ -145,16 +143,16 @@ def test_a_gate_follows_its_rules(opaque, bad):
 @both
 def test_after_ten_steps_that_are_not_finite_one_is_tried_from_the_start(opaque):
     """Samples outside the domain stay so: the memory is kept. A good sample then tells that the memory was at fault."""
-    gated, rules, taken = stepper(opaque), Rules(), []
+    gated, rules, said = stepper(opaque), Rules(), []
     memory = gated.start()
     for k, b in enumerate([1.0, *[0.125] * 25, 1.0, *[0.25] * 9, 1.0, *[0.25] * 10, 1.0, 1.0, *[0.25] * 21, 1.0]):
-        time, state = k * PROBLEM.period, np.array([0.5, b, 0.0, 0.0])
-        command, memory = gated.step(time, state, np.zeros(2), memory, taken=time)
-        expected, status = rules.step(time, state, np.zeros(2), time)
+        state = np.array([0.5, b, 0.0, 0.0])
+        command, memory = gated.step(k * PROBLEM.period, state, np.zeros(2), memory)
+        expected, status = rules.step(state, np.zeros(2))
         assert (command.tolist(), told(gated)) == (expected.tolist(), status), k
         assert gated.memory.unpack(memory)["total"][0] == rules.own[1]
-        taken.append(status)
-    assert taken.count(fp.Status.RESTARTED) == 2
+        said.append(status)
+    assert said.count(fp.Status.RESTARTED) == 2
 
 
 @both
@@ -164,33 +162,30 @@ def test_a_memory_that_cannot_be_is_forgotten(opaque, bad):
     gated = stepper(opaque)
     memory = gated.start()
     for k in range(3):
-        _, memory = gated.step(
-            k * PROBLEM.period, np.array([0.5, 1.0, 0, 0]), np.zeros(2), memory, taken=k * PROBLEM.period
-        )
+        _, memory = gated.step(k * PROBLEM.period, np.array([0.5, 1.0, 0, 0]), np.zeros(2), memory)
     time = 3 * PROBLEM.period
-    for name in ("held_command", "good_taken", "not_finite", "missing_cycles", "count", "total"):
+    for name in ("held_command", "not_finite", "missing_cycles", "count", "total"):
         wrong = memory.copy()
         wrong[gated.memory.slice(name)] = bad
-        command, after = gated.step(time, np.array([0.5, 1.0, 0, 0]), np.zeros(2), wrong, taken=time)
+        command, after = gated.step(time, np.array([0.5, 1.0, 0, 0]), np.zeros(2), wrong)
         assert np.isfinite(after).all(), name
         status = told(gated)
         if name in ("count", "total") and not abs(bad) <= 1e300:
             assert (status, command.tolist()) == (fp.Status.RESTARTED, [7.5, 0.0]), name
         elif name in ("not_finite", "missing_cycles"):  # a count that cannot be is none
             assert (status, command.tolist()) == (fp.Status.OK, [9.0, -3.0]), name
-        held, after = gated.step(time, np.full(4, np.nan), np.zeros(2), wrong, taken=time)
+        held, after = gated.step(time, np.full(4, np.nan), np.zeros(2), wrong)
         counts = {n: gated.memory.unpack(after)[n][0] for n in ("not_finite", "missing_cycles")}
         gap = 1 if name != "missing_cycles" else bad + 1 if abs(bad) <= 1e6 else -1  # as before the first good sample
         assert counts == {"not_finite": 0, "missing_cycles": gap}, name
-        start = name in ("held_command", "good_taken") and not abs(bad) <= 1e300  # they are forgotten together
+        start = name == "held_command" and not abs(bad) <= 1e300
         clipped = [300.0, 40.0] if name == "held_command" else [8.5, -2.0]
         assert held.tolist() == (BEFORE.tolist() if start else clipped), name
 
 
 def test_what_is_remembered_has_names_units_and_first_values():
-    """The last good samples for whoever replays a gap; ages are looked at where they count alone."""
+    """The last good samples for whoever replays a gap."""
     one, other = stepper(False).memory, stepper(True).memory
     assert one["held_command"].start_vector().tolist() == BEFORE.tolist()
     assert one["held_command"].units == ("N", "N")
     assert other["good_state"].start_vector().tolist() == PROBLEM.start_state.tolist()
-    assert "good_taken" not in fp.Stepper(PROBLEM, Counting(False), compiled=False).memory

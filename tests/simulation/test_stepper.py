@@ -115,18 +115,6 @@ def test_settings_and_set_points_of_a_call():
     assert one.step(*again, memory)[0] == before
 
 
-def test_time_stamps_are_read_where_their_age_counts():
-    """`taken` is the time where it is not given; an old sample is a bad one."""
-    one = small(max_age=0.05)
-    _, memory = one.step(*SAMPLE, one.start())
-    one.step(0.1, *SAMPLE[1:], memory, taken=0.02)
-    assert status(one) == fp.Status.BAD_SAMPLE
-    one.step(0.01, *SAMPLE[1:], memory, taken=0.005)
-    assert status(one) == fp.Status.OK
-    one.step(0.01, *SAMPLE[1:], memory)
-    assert status(one) == fp.Status.OK
-
-
 def test_live_settings_are_named_with_the_interval_that_a_device_may_accept():
     """Gains from that at which 1 - a J = -1, with J = 1.2, up to none; an attribute that is not there is named."""
     one = small(live=["deformation.gain"])
