@@ -4,17 +4,11 @@ Offset-free predictive control is `Estimating(RecedingHorizon(...), DisturbanceK
 the filter it is the periodic one.
 """
 
-from fpirhc.controllers.rivals.acceleration_feedback import AccelerationFeedback
-from fpirhc.controllers.rivals.adaptive_inverse_dynamics import AdaptiveInverseDynamics
-from fpirhc.controllers.rivals.adrc import ADRC
-from fpirhc.controllers.rivals.force_mrac import ForceMRAC
-from fpirhc.controllers.rivals.indi import INDI
-from fpirhc.controllers.rivals.l1_adaptive import L1Adaptive
-from fpirhc.controllers.rivals.lyapunov_mrac import LyapunovMRAC
+from fpirhc.controllers.rivals.disturbance_observers import ADRC, L1Adaptive
+from fpirhc.controllers.rivals.inverse_dynamics import INDI, AccelerationFeedback, ResolvedAccelerationRate, SlidingMode
+from fpirhc.controllers.rivals.learned_dynamics import AdaptiveInverseDynamics, SlotineLi
+from fpirhc.controllers.rivals.model_reference import ForceMRAC, LyapunovMRAC
 from fpirhc.controllers.rivals.pid import PID
-from fpirhc.controllers.rivals.resolved_rate import ResolvedAccelerationRate
-from fpirhc.controllers.rivals.sliding_mode import SlidingMode
-from fpirhc.controllers.rivals.slotine_li import SlotineLi
 from fpirhc.errors import without
 
 __all__ = [

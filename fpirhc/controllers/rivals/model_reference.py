@@ -1,29 +1,146 @@
-"""Direct model reference adaptive control by Lyapunov's method: gains adapted by the rule e'PB, the classical counterpart.
-
-Theory: docs/theory.md.
-"""
+"""Model reference adaptive control: the reference model, a deformed force, gains by Lyapunov's rule. Theory: docs/theory.md."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import commanding_blocks, reference_block
+from fpirhc.controllers.base import Controller, commanding_blocks, law_blocks, reference_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives
-from fpirhc.controllers.rivals.reference_model import companion, decay_gains, model_block
-from fpirhc.errors import Mistakes
+from fpirhc.controllers.reference_states import request_of_commands
+from fpirhc.deformation.base import Deformation, automatic, scaled_for
+from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
+from fpirhc.plant.maps import step_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals, power
+from fpirhc.symbolic.expression import Signals, expression, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
+from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import error_chains
+from fpirhc.tracking.base import Tracking, error_chains
+
+
+def decay_gains(rate: float, order: int) -> tuple[float, ...]:
+    """Return the gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
+    return tuple(math.comb(order, s) * power(rate, order - s) for s in range(order))
+
+
+def companion(gains: tuple[float, ...]) -> np.ndarray:
+    """Return the matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
+    matrix = np.diag(np.ones(len(gains) - 1), 1)
+    matrix[-1] = -np.array(gains)
+    return matrix
+
+
+def model_block(plant: Plant, rate: float, period: float) -> Block:
+    """Return Block (state, reference and its response, warm_up) -> 'model', the model's state, and 'nominal', its response.
+
+    Coordinates that are not controlled follow the reference.
+    """
+    chains = [[name + "'" * s for s in range(order)] for name, order in plant.response_orders.items()]
+    gains = [decay_gains(rate, len(chain)) for chain in chains]
+    ends_of_steps = np.cumsum([0, *(len(g) ** 2 for g in gains)]).tolist()
+
+    fixed = np.concatenate([step_of(plant, companion(g), period).ravel(order="F") for g in gains])
+    memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
+    ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
+
+    def step(s: Signals) -> dict[str, Expression]:
+        first = ca.vertcat(
+            *(e for chain in error_chains(plant, s.reference - getattr(s, plant.output.name)) for e in chain)
+        )
+        deviation = ca.vertsplit(ca.if_else(s.warm_up > 0.5, s.model_deviation, first), ends)
+        spread = dict(zip(memory.signals[0].elements, ca.vertsplit(ca.vertcat(*deviation)), strict=True))
+        lag = ca.vertcat(*(spread.get(e, 0) for e in plant.output.elements))
+        pull = [ca.dot(ca.vertcat(*g), d) for g, d in zip(gains, deviation, strict=True)]
+        entries = ca.vertsplit(expression(ca.DM(fixed)), ends_of_steps)
+        steps = [ca.reshape(m, len(g), len(g)) for m, g in zip(entries, gains, strict=True)]
+        deviation_next = [ca.mtimes(m, d) for m, d in zip(steps, deviation, strict=True)]
+        return {
+            "model": s.reference - lag,
+            "nominal": s._reference_response + ca.vertcat(*pull),
+            "model_deviation_next": ca.vertcat(*deviation_next),
+        }
+
+    reads = (
+        plant.output,
+        like(plant.output, "reference"),
+        plant.response_signal("_reference_response"),
+        scalar("warm_up"),
+    )
+    writes = (like(plant.output, "model"), plant.response_signal("nominal"))
+    return Block("reference_model", Layout(reads), Layout(writes), step, memory)
+
+
+@dataclass(frozen=True, eq=False)
+class ForceMRAC(Controller):
+    """Tracking of the reference model, made true by deforming the command.
+
+    Args:
+        tracking: the law that gives the desired response.
+        deformation: the fixed-point map on commands; a scale is in units of the inputs.
+    """
+
+    tracking: Tracking
+    deformation: Deformation
+
+    def with_defaults(self, problem: Problem) -> ForceMRAC:
+        if not automatic(self.deformation):
+            return self
+        return replace(self, deformation=scaled_for(self.deformation, request_of_commands(problem)))
+
+    deforms = "command"
+
+    def check(self, problem: Problem) -> None:
+        """Raise where the response does not recalculate the last command, with which a model-referenced map compares it.
+
+        Raises:
+            NotSupported: such a map where sensing is not ideal or something is late.
+        """
+        form, late = self.deformation.form, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
+        believes = form.late or any(every(form.lag))
+        if form.modelled and (late or believes or not problem.sensing.ideal):
+            raise NotSupported(
+                "ForceMRAC cannot use a model-referenced deformation here: it compares the last command with the one recalculated "
+                "from the response, through no estimator, dead time or lag; use the map itself or Increment"
+            )
+
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return law_blocks(built, self.tracking, self._force_block(built.plant, built.warm_up))
+
+    def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
+        """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
+        memory = self.deformation.memory(plant.input.elements)
+        inverse, response = plant.equations.inverse, plant.equations.controlled_response
+
+        def step(s: Signals) -> dict[str, Expression]:
+            remembered = {m: getattr(s, m) for m in memory.names}
+            running = s.warm_up > warm_up_cycles - 0.5
+            desired = inverse(s.state, s.desired, s.parameters)
+            recalculated = ca.if_else(running, inverse(s.state, s.realised, s.parameters), desired)
+            deformed, next_memory = self.deformation.step(s._command_before, recalculated, desired, remembered)
+            next_values = {f"{m}_next": ca.if_else(running, next_memory[m], remembered[m]) for m in memory.names}
+            command = ca.if_else(running, deformed, desired)
+            return {
+                "force_desired": desired,
+                "force_recalculated": recalculated,
+                "command_unclipped": command,
+                "_deformed_unclipped": response(s.state, command, s.parameters),
+                **next_values,
+            }
+
+        responses = [plant.response_signal(n) for n in ("desired", "realised")]
+        reads = (plant.state, plant.parameter, *responses, like(plant.input, "_command_before"), scalar("warm_up"))
+        forces = [like(plant.input, n) for n in ("force_desired", "force_recalculated", "command_unclipped")]
+        writes = Layout((*forces, plant.response_signal("_deformed_unclipped")))
+        return Block("force", Layout(reads), writes, step, memory, opaque=plant.equations.inverse_opaque)
 
 
 @dataclass(frozen=True)
@@ -177,5 +294,6 @@ def _sign(problem: Problem) -> int:
 
 
 EXAMPLES = (
+    Example(problem="mrac_pendulum", controller="force MRAC", changes={"duration": 3.0, "measure_from": 0.0}),
     Example(problem="mrac_pendulum", controller="Lyapunov MRAC", changes={"duration": 3.0, "measure_from": 0.0}),
 )
