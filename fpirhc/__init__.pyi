@@ -9,8 +9,8 @@ from .controllers.receding_horizon import RecedingHorizon as RecedingHorizon
 from .controllers.rivals.pid import PID as PID
 from .controllers.slotted import Slotted as Slotted
 from .controllers.wrappers.cascade import Cascade as Cascade
-from .controllers.wrappers.estimating import Estimating as Estimating
-from .controllers.wrappers.exact_model import ExactModel as ExactModel
+from .controllers.wrappers.other_models import Estimating as Estimating
+from .controllers.wrappers.other_models import ExactModel as ExactModel
 from .controllers.wrappers.predicted import Predicted as Predicted
 from .deformation.affine import Affine as Affine
 from .deformation.base import Identity as Identity
@@ -21,8 +21,8 @@ from .deformation.rotation import Rotation as Rotation
 from .deformation.sigmoid import Sigmoid as Sigmoid
 from .deformation.wrappers.delayed import Increment as Increment
 from .deformation.wrappers.delayed import Paired as Paired
-from .deformation.wrappers.filtered import Filtered as Filtered
-from .deformation.wrappers.haar import Haar as Haar
+from .deformation.wrappers.filters import Filtered as Filtered
+from .deformation.wrappers.filters import Haar as Haar
 from .deformation.wrappers.tuned import Tuned as Tuned
 from .errors import FpirhcError as FpirhcError
 from .errors import HarmfulAdaptation as HarmfulAdaptation

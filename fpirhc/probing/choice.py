@@ -21,7 +21,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.leaky import default_pole
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
-from fpirhc.deformation.wrappers.filtered import Filtered
+from fpirhc.deformation.wrappers.filters import Filtered
 from fpirhc.errors import FpirhcError, require
 from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import outside

@@ -49,7 +49,7 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
         if problem.horizon is not None and any(length % 1 for length in problem.horizon.lengths):
             mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}")
         if problem.sensing.estimator.measures_all and not plant.at_once:
-            from fpirhc.sensing.positions import StepDifference  # of maps alone
+            from fpirhc.sensing.differences import StepDifference  # of maps alone
 
             settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
     return settled

@@ -1,8 +1,7 @@
-"""A causal, undecimated Haar denoiser on the response error of a map.
+"""Filters of the response error of a map: a low-pass, and a causal, undecimated Haar denoiser.
 
-    c_0 = f - d,   c_j(k) = (c_{j-1}(k) + c_{j-1}(k - 2^(j-1))) / 2,   d_j = c_{j-1} - c_j,   g = c_J + sum of large d_j.
-
-Theory: docs/theory.md.
+low-pass   g_k = p g_{k-1} + (1 - p) (f_k - d_k),     r_{k+1} = G(r_k, d_k + g_k, d_k)
+Haar       c_0 = f - d,   c_j(k) = (c_{j-1}(k) + c_{j-1}(k - 2^(j-1))) / 2,   d_j = c_{j-1} - c_j,   g = c_J + sum of large d_j
 """
 
 from __future__ import annotations
@@ -14,9 +13,38 @@ from typing import Annotated
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
-from fpirhc.fields.kinds import Positive, whole
+from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map, with_inner
+from fpirhc.fields.kinds import BelowOne, Positive, whole
 from fpirhc.symbolic.layout import Expression, Layout, Signal
+
+
+@dataclass(frozen=True)
+class Filtered(Wrapper):
+    """The wrapped map on a low-passed response error.
+
+    Args:
+        map: any deformation that iterates.
+        pole: p of the filter, from 0 (none) to below 1; exp(-period / time constant).
+    """
+
+    pole: BelowOne
+
+    def memory(self, elements: tuple[str, ...]) -> Layout:
+        return Layout((Signal("filter_error", elements),)) + self.map.memory(elements)
+
+    def step(
+        self, request: Expression, response: Expression, desired: Expression, memory: Mapping[str, Expression]
+    ) -> tuple[Expression, dict[str, Expression]]:
+        inner = memory_of_map(self, memory, request.numel())
+        error = self.pole * memory["filter_error"] + (1 - self.pole) * (response - desired)
+        next_request, next_memory = self.map.step(request, desired + error, desired, inner)
+        return next_request, {"filter_error": error, **next_memory}
+
+
+def with_filter(deformation: Deformation, pole: float) -> Deformation:
+    """Return a deformation whose innermost map is filtered."""
+    inner = deformation.inner
+    return Filtered(deformation, pole) if inner is None else with_inner(deformation, with_filter(inner, pole))
 
 
 @dataclass(frozen=True)
@@ -63,4 +91,4 @@ class Haar(Wrapper):
 
 def examples(inner: Deformation) -> tuple[Deformation, ...]:
     """Values for the laws, around any map."""
-    return (Haar(inner, noise=1e-12, levels=2),)  # the laws try errors of 1e-6
+    return Filtered(inner, pole=0.5), Haar(inner, noise=1e-12, levels=2)  # the laws try errors of 1e-6

@@ -1,6 +1,6 @@
-"""A controller whose model is learned on line: an estimator corrects the parameters of the wrapped controller's model.
+"""Controllers with another model than the problem's: the exact one, and one that is learned on line.
 
-    command = controller(state; p + parameter_change),      parameter_change = estimator(state, last command, response; p).
+    command = controller(state; p + parameter_change),      parameter_change = estimator(state, last command, response; p)
 
 Theory: docs/theory.md.
 """
@@ -14,7 +14,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import Built, compose_controller, dependencies_of_command, embedded
-from fpirhc.controllers.contract import ControllerWrapper, Planner, innermost, with_field
+from fpirhc.controllers.contract import ControllerWrapper, Planner, PlantModel, innermost, with_field
 from fpirhc.controllers.path import Pairs
 from fpirhc.errors import require
 from fpirhc.learning.disturbance_kalman import DisturbanceKalman
@@ -25,7 +25,41 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, like, scalar
 from fpirhc.task.dead_time import DeadTime
+from fpirhc.task.exogenous import really_known, signals_of
 from fpirhc.task.problem import Problem
+
+
+@dataclass(frozen=True)
+class ExactModel(ControllerWrapper):
+    """The wrapped controller with the exact model: the plant's exact parameters, or the reality where the problem has one.
+
+    Args:
+        controller: any controller that uses its model.
+
+    Raises:
+        NotSupported: an ExternalPlant, or a reality whose coordinates or orders are not the model's.
+    """
+
+    def inner_problem(self, problem: Problem) -> Problem:
+        model = self.plant_model(problem)
+        plant = _EXACT.of((model.plant,), (), lambda: _known(model.plant))
+        return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
+
+    def plant_model(self, problem: Problem) -> PlantModel:
+        plant = problem.moves.as_model(problem.plant)
+        return PlantModel(plant, really_known(problem.signals), exact=True)
+
+    def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
+        return self.controller.blocks(built.inner(self))
+
+
+_EXACT: Latest[Plant] = Latest(4)  # so that plans of it are built once
+
+
+def _known(plant: Plant) -> Plant:
+    named = {name: replace(one, approximate=one.exact, spread=None) for name, one in plant.parameters.items()}
+    return replace(plant, parameters=named)
+
 
 _BELIEVED = "_believed"
 _MODELS: Latest[Plant] = Latest(8)  # what is built of a model is shared by the problems of one plant
@@ -167,4 +201,4 @@ def _estimate_block(
 def examples(inner: Controller) -> tuple[Controller, ...]:
     """Values for the laws, around any controller."""
     noise = dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)
-    return (Estimating(inner, DisturbanceKalman({"a": 1.0, "b": 1.0}, noise)),)
+    return ExactModel(inner), Estimating(inner, DisturbanceKalman({"a": 1.0, "b": 1.0}, noise))
