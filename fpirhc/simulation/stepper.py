@@ -28,7 +28,7 @@ from fpirhc.simulation.step_arguments import (
     numbers_of,
     one_number,
 )
-from fpirhc.simulation.trials import warn_of_harm, with_recommended_gain
+from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
@@ -70,8 +70,7 @@ class ComposedStep:
     ) -> Self:
         """Return the step of a controller; arguments as of `Stepper`."""
         settings = live_settings(problem, controller, live)
-        with with_recommended_gain(problem, settings.controller):
-            ready = checked(problem, settings.controller)
+        ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
         composite, memory = composed_step(settings, ready, monitor or RunMonitor())

@@ -11,13 +11,12 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 
 import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task, without_deformation
-from fpirhc.errors import FpirhcError, HarmfulAdaptation, NotContractive
+from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.user_code import users_level
 from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.metrics.base import by_name
@@ -185,19 +184,6 @@ def warn_of_harm(problem: Problem, controller: Controller) -> None:
         what = ", ".join(part for part in (problem.name, name_in_task(controller)) if part)
         text = f"{what}: adaptation does harm, by runs of {CYCLES} cycles: {'; '.join(reasons)}. {_REMEDY}"
         warnings.warn(text, HarmfulAdaptation, stacklevel=users_level())
-
-
-@contextmanager
-def with_recommended_gain(problem: Problem, controller: Controller) -> Iterator[None]:
-    """Put the recommended gain in place of the limit of the iteration in a refusal of the controller's gain within it."""
-    try:
-        yield
-    except NotContractive as error:
-        # of a layer above, which is only asked when nothing else follows
-        advice = import_module("fpirhc.review.review").recommended_for(problem, controller)
-        if not advice:
-            raise
-        raise NotContractive(error.fault, advice[0].lower() + advice[1:].removesuffix(".")) from None
 
 
 @contextmanager
