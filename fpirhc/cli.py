@@ -159,7 +159,7 @@ def run(
 
 @command(
     "study two_mass --draws 100 --mismatch 20%        exact parameters within 20 % of the problem's",
-    "study anaesthesia --cases all --headline in_band",
+    "study anaesthesia --cases all --metric in_band",
     "study two_mass --over deformation.gain=-2:-0.1:40 exact.m1=0.5:2:9:log -c RHC+FPI",
     "study two_mass --limits latency noise            up to where each controller fails",
 )
@@ -168,7 +168,7 @@ def study(
     over: Annotated[list[str] | None, given("PATH=LOW:HIGH:COUNT[:log] ...", "sweep one or two settings")] = None,
     limits: Annotated[list[str] | None, given("WORD ...", "what grows: mismatch, plants, latency, noise, lost")] = None,
     mismatch: opt.Mismatch = 0.0, controllers: opt.Controllers = None,
-    headline: Annotated[str | None, given("METRIC", "number by which runs are compared [default: the error]")] = None,
+    metric: Annotated[str | None, given("NAME", "number by which runs are compared [default: the error]")] = None,
     processes: Annotated[int | None, given("N", "number of processes [default: one per core]", min=1)] = None,
     cluster: Annotated[str | None, given("ADDRESS", "run on the Dask cluster with this scheduler, tcp://HOST:PORT")] = None,
     seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
@@ -184,8 +184,8 @@ def study(
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     if sum(map(bool, (cases, draws, over, limits))) != 1:
         raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
-    if limits and (headline or (processes or 1) > 1 or cluster):
-        raise typer.BadParameter("--limits takes the error, run by run: leave out --headline, --processes, --cluster")
+    if limits and (metric or (processes or 1) > 1 or cluster):
+        raise typer.BadParameter("--limits takes the error, run by run: leave out --metric, --processes, --cluster")
     task = _task(problem)
     from fpirhc.studies.compare import select
     from fpirhc.studies.limits import limits as find_limits
@@ -214,7 +214,7 @@ def study(
             named: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
             variants = Grid.parsed(over, seed) if over else named
             facts["processes"] = processes or (None if cluster else -1)
-            result = run_study(task, variants, headline=headline, folder=folder, **facts)
+            result = run_study(task, variants, metric=metric, folder=folder, **facts)
             page = render_charted(result.view, figure_of(result))
     write_csv(result.table, folder / "study.csv")
     _publish(result.view, page, folder, json, verbose)

@@ -146,9 +146,9 @@ class Comparison(Study):
     def view(self) -> View:
         shown = columns([e.metrics for e in self.entries], in_report)
         done = [e.metrics for e in self.entries if e.run.stop is None and not e.exact]
-        best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.headline}
+        best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.main}
         best = {c: number for c, number in best.items() if number is not None}
-        heads = [Column(c.heading, c.short if c.metric.headline else None) for c in shown]
+        heads = [Column(c.heading, c.short if c.metric.main else None) for c in shown]
         heads = [Column("controller"), *heads, Column("cycle [us]"), Column("status", left=True)]
         table = Table(self.title, heads)
         for e in self.entries:

@@ -59,7 +59,7 @@ class VariantStudy(Study):
         facts = {
             "problem": self.problem,
             "variants": str(self.variants),
-            "headline": self.figure.column,
+            "metric": self.figure.column,
             "summary": self.summary.reset_index().to_dict("records"),
             "groups": {g: some.reset_index().to_dict("records") for g, some in self.groups.items()},
             "versions": self.versions,
@@ -92,7 +92,7 @@ def study(
     variants: Variants,
     *,
     controllers: Sequence[str] | None = None,
-    headline: str | None = None,
+    metric: str | None = None,
     processes: int | None = None,
     compiled: bool = True,
     folder: Path | None = None,
@@ -105,7 +105,7 @@ def study(
         task: a problem with its controllers.
         variants: `CasesOf`, `Draws` or `Grid`.
         controllers: names, the first of which the others are compared with; None: all, the headline's first.
-        headline: the number that is judged; None: the problem's, or the relative error.
+        metric: the number that is judged; None: the problem's, or the relative error.
         processes: number of processes, see `run_variants`.
         compiled: whether loops run as compiled C.
         folder: where rows are kept, so that the same call goes on after an interruption.
@@ -115,7 +115,7 @@ def study(
     first = [] if controllers else [*(task.headline or ())]
     begin, chosen = time.perf_counter(), select(task, controllers or [*dict.fromkeys([*first, *task.controllers])])
     check_gains(task, chosen)
-    aim = objective(task.headline_metric if headline is None else headline, task.metrics, task.problem)
+    aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
     how: dict[str, Any] = {"processes": processes, "compiled": compiled, "progress": progress}
     own, keep = aim.needed(task.metrics), folder and folder / "runs.jsonl"
     table = run_variants(task, variants, controllers=list(chosen), metrics=own, keep=keep, **how)

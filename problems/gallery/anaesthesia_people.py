@@ -330,6 +330,6 @@ def lowest(problem, run):
     return float(run[BIS].min())
 
 
-metrics = (fp.figures.InBand(BIS, 40.0, 60.0), fp.Metric("lowest", lowest, better="larger", headline=True))
+metrics = (fp.figures.InBand(BIS, 40.0, 60.0), fp.Metric("lowest", lowest, better="larger", main=True))
 headline_metric = "in_band"
 pictures = (fp.OverTime("Depth and infusion", panels=(BIS, "reality_state.infusion"), levels={BIS: (40.0, 60.0)}),)

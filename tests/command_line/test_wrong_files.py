@@ -326,8 +326,8 @@ review mine.py --controllers => '--controllers' requires an argument
 review mine.py --controllers RCH abc =>
     1. controller 'RCH' is unknown. Did you mean 'RHC'? ... 2. controller 'abc' is unknown. Valid: RHC, RHC+FPI.
 review mine.py --mismatch nan => expected percent of at least 0, such as 20%, got 'nan'
-study mine.py --draws 2 --headline rms_error => has a number for every coordinate; give one: rms_error.angle
-study mine.py --draws 2 --headline '' => metric '' is unknown. Valid: relative error, cycles, rms_error
+study mine.py --draws 2 --metric rms_error => has a number for every coordinate; give one: rms_error.angle
+study mine.py --draws 2 --metric '' => metric '' is unknown. Valid: relative error, cycles, rms_error
 study mine.py --draws 0 => '--draws'
 study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
 study mine.py --over deformation.map.gian=1:2:3 => has no 'gian'. Did you mean 'gain'?

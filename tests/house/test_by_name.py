@@ -104,7 +104,7 @@ def test_a_derivative_is_known_by_the_spellings_of_others(name):
     with pytest.raises(InvalidProblem, match=f"state '{name}' is unknown. Did you mean \"q1'\""):
         replace(tasks.two_mass.problem, start={**tasks.two_mass.problem.start, name: 0.0})
     with pytest.raises(InvalidName, match=r"For a derivative: .*Largest\(\"state.q1'\""):
-        fp.study(tasks.two_mass, fp.Draws(1), headline=f"rms_error.{name}")
+        fp.study(tasks.two_mass, fp.Draws(1), metric=f"rms_error.{name}")
 
 
 def test_what_a_frozen_value_holds_stays():

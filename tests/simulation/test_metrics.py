@@ -277,7 +277,7 @@ def overshoot(task, run):
     return {c: float(np.max(-run[f"true_error.{c}"])) for c in run.layout["error"].elements}
 
 
-OVERSHOOT = fp.Metric("overshoot", overshoot, by="coordinate", unit="m", headline=True, order=15)
+OVERSHOOT = fp.Metric("overshoot", overshoot, by="coordinate", unit="m", main=True, order=15)
 
 
 def test_a_metric_is_one_value():
@@ -348,7 +348,7 @@ def test_figures_have_the_value_of_their_definition(figure, value, unit, better)
     metrics = fp.measure(problem(), run(0.0, command=COMMAND), [figure])
     assert metrics[figure.name][""] == pytest.approx(value)
     assert metrics.units[figure.name][""] == unit
-    assert (figure.better, figure.headline) == (better, True)
+    assert (figure.better, figure.main) == (better, True)
     ended = fp.measure(problem(measure_from=0.0), run(0.0, command=COMMAND, stop="limits"), [figure])
     assert math.isnan(ended[figure.name][""])
 
@@ -411,6 +411,6 @@ def test_metrics_come_from_other_processes_and_say_what_they_are_for():
     assert all(again.entries[name] is metric for name, metric in metrics.entries.items())
     found = {}
     for m in dict.fromkeys(metric for metric, _, _ in metrics):
-        marks = zip("hrs", (m.headline, m.report, m.always), strict=True)
+        marks = zip("hrs", (m.main, m.report, m.always), strict=True)
         found[m.name] = "".join(letter for letter, on in marks if on)
     assert list(found.items()) == list(MEANT.items())

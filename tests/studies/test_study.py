@@ -214,16 +214,16 @@ WRONG: dict[str, tuple[Any, str]] = {
     "outside its bounds": (of_case({"exact.b": -70.0}), r"'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70"),
     "no number": (of_case({"exact.b": "1.2"}), r"'exact\.b': expected a finite number, got the text '1\.2'"),
     "a parameter twice": (of_case({"exact.b": 1.0, "known.b": 2.0}), r"'known.b' and 'exact.b' set the same number"),
-    "a misspelt headline": (
-        lambda t: fp.study(t, fp.Draws(1), headline="rms_eror.y", compiled=False),
+    "a misspelt metric": (
+        lambda t: fp.study(t, fp.Draws(1), metric="rms_eror.y", compiled=False),
         "Did you mean 'rms_error.y'",
     ),
-    "a headline without a better": (
-        lambda t: fp.study(t, fp.Draws(1), headline="effort.u", compiled=False),
+    "a metric without a better": (
+        lambda t: fp.study(t, fp.Draws(1), metric="effort.u", compiled=False),
         "no better direction",
     ),
-    "a headline of plans": (
-        lambda t: fp.study(t, fp.Draws(1), headline="cost.total", compiled=False),
+    "a metric of plans": (
+        lambda t: fp.study(t, fp.Draws(1), metric="cost.total", compiled=False),
         r"needs Problem\(horizon=",
     ),
 }
@@ -302,7 +302,7 @@ def test_the_command_of_a_worst_run_makes_it_again(task):
 
 
 def test_a_study_speaks_of_the_headline_metric(task):
-    """By hand from the rows, larger is better by the metric; another headline is another reading of the same rows."""
+    """By hand from the rows, larger is better by the metric; another metric is another reading of the same rows."""
     own_metrics = [*task.metrics, fp.figures.Nadir("state.y")]
     task = replace(task, metrics=own_metrics, headline_metric="nadir")
     found = fp.study(task, fp.CasesOf(), folder=Path("out"), compiled=False)
@@ -312,7 +312,7 @@ def test_a_study_speaks_of_the_headline_metric(task):
     assert found.summary.better["CTC+FPI"] == (own["CTC+FPI"] > own["CTC"]).sum()
     assert sentences(found)[0].startswith("CTC+FPI against CTC by nadir: larger in ")
     before = Path("out/runs.jsonl").read_bytes()
-    again = fp.study(task, fp.CasesOf(), folder=Path("out"), headline="rms_error.y", compiled=False)
+    again = fp.study(task, fp.CasesOf(), folder=Path("out"), metric="rms_error.y", compiled=False)
     assert Path("out/runs.jsonl").read_bytes() == before
     assert again.summary["median"]["CTC"] == again.table.loc[again.table.controller == "CTC", "rms_error.y"].median()
 
@@ -321,7 +321,7 @@ def test_the_cost_can_be_judged():
     """It is computed from the log of a run, which a study does only where somebody asks for it."""
     task = fp.load_problem("two_mass")
     short = replace(task, problem=replace(task.problem, duration=0.1, measure_from=0.0))
-    table = rows(short, fp.Draws(2, 10.0), controllers=["RHC", "CTC"], headline="cost.total")
+    table = rows(short, fp.Draws(2, 10.0), controllers=["RHC", "CTC"], metric="cost.total")
     for one, cost in zip(fp.Draws(2, 10.0).of(short), table["cost.total"], strict=False):
         run = fp.simulate(one.problem, task.controllers["RHC"], seed=one.seed, compiled=False)
         assert cost == pytest.approx(fp.measure(one.problem, run)["cost"]["total"], rel=1e-9)

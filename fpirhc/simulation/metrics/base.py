@@ -51,7 +51,7 @@ class Metric(Checked):
         title: heading in a report; '': the name.
         short: heading on a terminal; '': the heading in a report.
         text: function that writes a finite number.
-        headline: whether the metric stands in short tables; its best value is marked in the report.
+        main: whether the metric stands in short tables; its best value is marked in the report.
         report: whether the metric stands in the report's table.
         shown: the elements that stand in the report's table; None: all.
         floor: size of a difference up to which two numbers count as equal.
@@ -71,7 +71,7 @@ class Metric(Checked):
     title: str = ""
     short: str = ""
     text: Callable[[float], str] = written_out
-    headline: bool = False
+    main: bool = False
     report: bool = True
     shown: tuple[str, ...] | None = None
     floor: float = 1e-12
@@ -251,7 +251,7 @@ class Metrics(FoundByName):
 
     def __repr__(self) -> str:
         facts = (
-            f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.headline
+            f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.main
         )
         return line(self, *(" ".join(fact.split()) for fact in facts), f"worst {self.worst_status}")
 
@@ -321,7 +321,7 @@ class Column:
 
 def in_report(metric: Metric) -> bool:
     """Whether a metric stands in a report's table or in a short one."""
-    return metric.report or metric.headline
+    return metric.report or metric.main
 
 
 def columns(runs: Sequence[Metrics], wanted: Callable[[Metric], bool] = in_report) -> list[Column]:

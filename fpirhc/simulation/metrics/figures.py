@@ -85,7 +85,7 @@ def Overshoot(judged: str, *, name: str = "overshoot") -> Metric:
         return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
 
     unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
-    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, headline=True)
+    return Metric(name, partial(_of_whole_runs, beyond), unit=unit, main=True)
 
 
 def _figure(
@@ -107,7 +107,7 @@ def _figure(
         return float(figure(values[measured_cycles(problem, run)], problem.period))
 
     whole = partial(_of_whole_runs, function)
-    return Metric(name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), headline=True, better=better)
+    return Metric(name, whole, unit=lambda p, _: unit(_unit(p, what), p.time_unit), main=True, better=better)
 
 
 def _times(unit: str, time: str) -> str:

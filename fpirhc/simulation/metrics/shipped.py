@@ -304,7 +304,7 @@ def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shi
 
 
 METRICS = (
-    Metric("rms_error", rms_error, by="coordinate", unit=coordinate_unit, short="rms", headline=True, order=10),
+    Metric("rms_error", rms_error, by="coordinate", unit=coordinate_unit, short="rms", main=True, order=10),
     Metric("max_error", max_error, by="coordinate", unit=coordinate_unit, order=20),
     Metric("settling", settling, by="coordinate", unit=lambda problem, _: problem.time_unit, title="settled", order=40),
     Metric("effort", effort, by="input", unit=input_unit, better="neither", title="rms", order=50),
@@ -315,10 +315,10 @@ METRICS = (
         unit=lambda problem, name: derivative_unit(input_unit(problem, name), 1, problem.time_unit),
         better="neither",
         title="variation",
-        headline=True,
+        main=True,
         order=50,
     ),
-    Metric("at_limit", at_limit, better="neither", title="at limit", text=in_percent, headline=True, order=50),
+    Metric("at_limit", at_limit, better="neither", title="at limit", text=in_percent, main=True, order=50),
     Metric("cycles", cycles, better="neither", report=False, order=5),
     Metric("status", status, by="status", better="neither", report=False, order=80),
     Metric(
@@ -349,7 +349,7 @@ METRICS = (
         predicted,
         short="contr. factor",
         better="neither",  # the smallest factor is not the best gain
-        headline=True,
+        main=True,
         floor=1e-4,
         order=85,
         always=False,

@@ -107,5 +107,5 @@ def distance(_problem, run):
     return float(np.sqrt(sum(np.mean(run[f"error.{n}"] ** 2) for n in AXES))) if run.stop is None else math.nan
 
 
-metrics = (fp.Metric("distance", distance, unit="m", headline=True),)
+metrics = (fp.Metric("distance", distance, unit="m", main=True),)
 headline_metric = "distance"
