@@ -105,17 +105,14 @@ class HidesNaN(Softsign):
         return super().step(request, ca.fmax(-1e3, ca.fmin(1e3, response)), desired, memory)
 
 
-class TellsHalfItsGain(Softsign):
-    """Has twice the gain that it tells, and takes one as it tells it."""
+class TellsTwiceItsGain(Softsign):
+    """Has half of the gain that it tells, and takes one as it tells it."""
 
     def effective_gain(self):
-        return 0.5 * self.gain
-
-    def secant_gain(self):
-        return self.gain
+        return 2 * self.gain
 
     def with_effective_gain(self, gain):
-        return replace(self, gain=2 * gain)
+        return replace(self, gain=0.5 * gain)
 
 
 class SaysItIsLate(Softsign):

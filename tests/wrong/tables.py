@@ -32,7 +32,7 @@ MAPS = {
     maps.Rests: ("only desired is fixed", "an error of 1.* a false fixed point is near"),
     maps.GivesAnotherGain: ("gain can be set", "the effective gain 1.6"),
     maps.HidesNaN: ("nan shows", "a response of NaN is hidden"),
-    maps.TellsHalfItsGain: ("gain and pairs are told", "a pair takes 2 times the gain off"),
+    maps.TellsTwiceItsGain: ("gain and pairs are told", "a pair takes 0.5 times the gain off"),
     maps.SaysItIsLate: ("gain and pairs are told", "a response 3 cycles late a pair takes 4.01 times"),
     maps.SaysItIncrements: ("compares as it says", "with the increment, .* it requests 0.2887 and not 1"),
     maps.FiltersTwice: ("gain and pairs are told", "a pair takes 2 times the gain off"),
