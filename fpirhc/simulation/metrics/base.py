@@ -250,9 +250,7 @@ class Metrics(FoundByName):
         return max((Status[name] for name in self.statuses), default=Status.OK, key=lambda s: s.severity).name
 
     def __repr__(self) -> str:
-        facts = (
-            f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.main
-        )
+        facts = (f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.main)
         return line(self, *(" ".join(fact.split()) for fact in facts), f"worst {self.worst_status}")
 
 
