@@ -48,7 +48,10 @@ def compare(
     seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
-    """Run controllers side by side and write a report. It names the winner, by how much, and at what price."""
+    """Run controllers side by side and write a report. It names the winner, by how much, and at what price.
+
+    Exit code 1: no controller finishes. With -c, --set or --optimisers the report goes to results/PROBLEM/part.
+    """
     task = _task(problem, set_, controllers)
     from fpirhc.report.html import render
     from fpirhc.report.terminal import announce_backend, progress_bars
@@ -56,7 +59,8 @@ def compare(
     from fpirhc.studies.compare import select
     from fpirhc.studies.open_loop import first_plans, with_optimisers
 
-    named, folder = list(select(task, controllers)) if controllers else None, opt.folder_of(out, task.name)
+    named = list(select(task, controllers)) if controllers else None
+    folder = opt.folder_of(out, task.name, *["part"] * bool((controllers or set_ or optimisers) and not plans))
     if plans:
         with progress_bars() as progress:
             progress("first plans", 0, 1)
@@ -69,7 +73,8 @@ def compare(
     announce_backend(entry.run for entry in result.entries)
     _publish(result.view, render(result), folder, json, verbose)
     interrupted = any(why.startswith("interrupted") for why in result.skipped.values())
-    raise typer.Exit(130 if interrupted else 0 if result.entries else 2)
+    finished = any(entry.run.stop is None for entry in result.entries)
+    raise typer.Exit(130 if interrupted else 0 if finished else 1 if result.entries else 2)
 
 
 def _show_plans(task: Any, solved: Any, folder: Path) -> None:
@@ -282,9 +287,10 @@ def tune(
 ) -> None:  # fmt: skip
     """Search better settings, at equal cost for every controller. The problem file says what is searched: tuning = {...}."""
     task = _task(problem)
-    from fpirhc.report.terminal import progress_bars, show_harm
+    from fpirhc.report.terminal import progress_bars, show_sentences
     from fpirhc.studies.tune import tune as ask
     from fpirhc.studies.variants import CasesOf, Draws
+    from fpirhc.studies.verdict import Outcome
 
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
@@ -294,7 +300,7 @@ def tune(
     with progress_bars() as progress:
         found = ask(task, variants=variants, folder=opt.folder_of(out, task.name, "tuning"), progress=progress, **facts)
     for sentences in found.harm.values():
-        show_harm(sentences)
+        show_sentences((one, Outcome.WORSE) for one in sentences)
     table = found.table
     print(table.to_json(orient="records") if json else f"{table.to_string(index=False)}\n\n{found.python()}")
 
@@ -403,7 +409,7 @@ def export(
 ) -> None:  # fmt: skip
     """Write a controller for use without Python. C99 for a device, a unit of FMI 2, WebAssembly, or a page with sliders."""
     task = _task(problem)
-    from fpirhc.errors import InvalidName, nearest
+    from fpirhc.errors import InvalidName
     from fpirhc.export.device import device_of, targets, write
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.compare import select
@@ -419,7 +425,7 @@ def export(
         print(f"wrote {page}")
         return
     if to not in targets():
-        raise InvalidName(f"the target '{to}' is unknown.{nearest(to, [*targets(), 'lab'])}")
+        raise InvalidName(f"the target '{to}' is unknown; one of {', '.join([*targets(), 'lab'])}")
     with progress_bars() as progress:
         progress(controller, 0, 1)  # bounds of many live settings take a minute
         device = device_of(task.problem, chosen, controller, name=name, live=live or [])

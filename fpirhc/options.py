@@ -22,10 +22,10 @@ To begin:
 
 \b
 Exit codes:
-  0  finished                      1  review answered no, or probe proposes nothing
+  0  finished                      1  the answer is no: of review, of probe, or of compare, where
+                                      no controller finishes
   2  bad input                     3  a file or folder cannot be written
-  4  the run of fpirhc run ended early, or a plan of compare --plans did not converge; comparisons
-     and studies tell such runs as results, with 0
+  4  the run of fpirhc run ended early, or a plan of compare --plans did not converge
   5  a metric changed (check)      6  a baseline is missing or unusable (check)
   7  a faulty installation (doctor)
   70 an error inside fpirhc        130 interrupted from the keyboard

@@ -53,6 +53,7 @@ _IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, a
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
 _DRAWN = 0.1  # s from one picture of a bar to the next
+_QUIET = 2.0  # s in which a command without a terminal says nothing
 _EDGES = 2  # columns left and right of a table
 
 
@@ -70,7 +71,7 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
 
     `verbose`: print every sentence, every column and everything else that is said of a study.
     """
-    say(view.title, "bold", f" {view.conditions}")
+    say(view.study.title, "bold", f" {view.conditions}")
     sentences = list(view.sentences)
     show_sentences(shown := sentences if verbose else sentences[:1])
     if others := sentences[len(shown) :]:
@@ -81,10 +82,10 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
         show_sentences(one for one in others if one[1] in IN_FULL)
     for table in view.tables:
         if table.rows:
-            narrow = replace(table.narrow, title="" if table.title == view.title else table.title)
+            narrow = replace(table.narrow, title="" if table.title == view.study.title else table.title)
             show_table(narrow) if verbose else show_brief(narrow)
     for heading, texts in view.lists.items() if verbose else ():
-        say(heading, "bold")
+        say(heading, "bold") if texts else None
         for text in texts:
             say(f"- {text}")
     notes = sum(map(len, view.lists.values()))
@@ -120,11 +121,6 @@ def show_sentences(sentences: Iterable[tuple[str, Outcome | None]]) -> None:
     """Print sentences in the colours of the outcomes that they state."""
     for text, outcome in sentences:
         say(f"- {text}", STYLES[outcome])
-
-
-def show_harm(harm: Iterable[str]) -> None:
-    """Print what speaks against a controller's adaptation, in red."""
-    show_sentences((sentence, Outcome.WORSE) for sentence in harm)
 
 
 def show_table(table: Table, console: Console | None = None) -> None:
@@ -181,29 +177,35 @@ def _grid(table: Table, part: Sequence[int]) -> Grid:
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
-    """Yield a function (name, done, total) that shows on standard error how far each controller is, its rate and the time left."""
+    """Yield a function (name, done, total) that shows bars on standard error; or, without a terminal, a line per controller."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.completed:.0f} of {task.total:.0f}"),
-        TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
-    out, told, known = Console(stderr=True), dict[str, float](), dict[str, TaskID]()
-    bars = Progress(*columns, console=out, transient=True, disable=not out.is_terminal)
+    out, told, known, begin = Console(stderr=True), dict[str, float](), dict[str, TaskID](), time.monotonic()
+    bars = Progress(*columns, console=out, transient=True)
 
     def report(name: str, done: int, total: int) -> None:
         now = time.monotonic()
+        if not out.is_terminal:
+            if done >= total and now - begin > _QUIET:
+                print(
+                    f"fpirhc: {printable(name)}: {total} of {total} after {now - begin:.0f} s",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            return
         if done < total and now - told.get(name, -math.inf) < _DRAWN:
-            return  # the rate is computed anew from all that was told, which takes longer than a short run
+            return  # the time left is computed anew from all that was told, which takes longer than a short run
         told[name] = now
         bars.start()
         if name not in known:
-            known[name] = bars.add_task(printable(name), total=total, rate="")
-        speed = bars.tasks[bars.task_ids.index(known[name])].speed
-        bars.update(known[name], completed=done, total=total, rate=f"{speed:.3g}/s" if speed else "")
+            known[name] = bars.add_task(printable(name), total=total)
+        bars.update(known[name], completed=done, total=total)
 
     try:
         yield report
@@ -222,7 +224,7 @@ def announce_backend(runs: Iterable[Run]) -> None:
 
 def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Path]) -> None:
     """Print what speaks against its adaptation, one run's metrics and the paths of its files."""
-    show_harm(harm)
+    show_sentences((sentence, Outcome.WORSE) for sentence in harm)
     for column in columns([metrics]):
         say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:

@@ -165,7 +165,7 @@ class Comparison(Study):
         lists = {"Notes": notes, f"Null tests: {NULL}": null}
         lost = {f.pair[1] for f in self.findings if f.pair and f.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)}
         lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run, lost)}" for e in self.entries if e.contraction]
-        return self.viewed(sentences, about, (table.filled,), self._facts(), lists=lists, skipped=self.skipped)
+        return View(self, sentences, about, (table.filled,), self._facts(), lists)
 
     def _facts(self) -> dict[str, Any]:
         rows = {

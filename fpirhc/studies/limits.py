@@ -186,7 +186,7 @@ class Limits(Study):
             f"{in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the reference's range."
         )
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
-        return self.viewed([(text, None) for text in said if text], about, (shown,), facts)
+        return View(self, [(text, None) for text in said if text], about, (shown,), facts)
 
 
 def _most(quantity: str, rows: pd.DataFrame) -> str:

@@ -66,7 +66,7 @@ class VariantStudy(Study):
         }
         shares = "" if self.figure.metric else " Errors are rms, in % of the range of the reference."
         lists = {"Worst runs": [*_commands(self)]}
-        return self.viewed([*_sentences(self)], f"{self.variants}.{shares}", tables, facts, lists=lists)
+        return View(self, [*_sentences(self)], f"{self.variants}.{shares}", tables, facts, lists)
 
     def _shown(self, title: str, summary: pd.DataFrame) -> Table:
         noun, first, units = self.figure.column, summary.index[0], self.table.attrs["units"]

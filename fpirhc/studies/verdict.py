@@ -289,14 +289,20 @@ def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     return [one for one in raised if not (chatter and one[0].measure is _moves)]
 
 
+def by_reason(reasons: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return the names of controllers by the reason that they have in common."""
+    return {why: [name for name, one in reasons.items() if one == why] for why in reasons.values()}
+
+
 def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     """Return what adaptation does to one pair."""
     names = plain.name, adaptive.name
-    ended = [e for e in (plain, adaptive) if e.run.stop is not None]
+    ended = {e.name: e.run.stop for e in (plain, adaptive) if e.run.stop is not None}
     if ended:
-        lost = Outcome.WORSE if ended == [adaptive] else Outcome.BETTER
+        lost = Outcome.WORSE if adaptive.name in ended else Outcome.BETTER
         outcome = Outcome.NOT_COMPARABLE if len(ended) == 2 else lost
-        return Finding("; ".join(f"{e.name} does not finish: {e.run.stop}" for e in ended) + ".", outcome, names)
+        texts = [f"{' and '.join(n)} do{'es' * (len(n) == 1)} not finish: {why}" for why, n in by_reason(ended).items()]
+        return Finding(f"{'; '.join(texts)}.", outcome, names)
     before, after, run = plain.errors, adaptive.errors, adaptive.run
     counted = [n for n in before if adaptive.weighed is None or n in adaptive.weighed] or list(before)
     if not all(math.isfinite(before[n] + after[n]) for n in counted):
@@ -372,7 +378,7 @@ def findings(
     judged += [Finding(leaves(e), Outcome.LIMIT_LEFT) for e in entries if e.left and e.name not in told]
     judged += [e.noise for e in entries if e.noise is not None]
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
-    return (*judged, *(Finding(f"Not run: {name} ({why}).") for name, why in skipped.items()))
+    return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 
 
 def relative_error(entry: Entry, yard: Yardstick, names: Collection[str]) -> float:

@@ -26,58 +26,37 @@ Progress = Callable[[str, int, int], None]  # of (controller, what is done, what
 class View:
     """What is said of a study; all texts are as they are in a user's file, and every output escapes them."""
 
-    title: str
-    about: str  # the problem's description
+    study: Study
     # the verdict, with the outcome that each sentence states; None for a remark
     sentences: Sequence[tuple[str, Outcome | None]]
     conditions: str  # what the numbers of the first table are measured on
     tables: Sequence[Table]  # its tables, the controllers first; those without rows are not shown
-    settings: Mapping[str, str]  # settings, as Python, of the problem and of every controller, by name
-    versions: Mapping[str, str]  # versions of fpirhc and of what its numbers depend on
-    command: str  # the command that reproduces it; '' where there is none
-    elapsed: float  # wall time, s
     facts: Mapping[str, Any] = field(repr=False)  # what the JSON object holds
     # sentences by the heading under which a page has them
     lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    skipped: Mapping[str, str] = field(default_factory=dict)  # reasons why controllers did not run, by name
 
     def html(self) -> str:
         """Return the verdict and the first table for a notebook."""
         notes = [*(text for text, _ in self.sentences), *(text for texts in self.lists.values() for text in texts)]
-        return replace(self.tables[0].narrow, title=self.title).html(notes)
+        return replace(self.tables[0].narrow, title=self.study.title).html(notes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Study(ABC):
-    """The result of a study: its problem, settings as Python by name, versions, command line, wall time in s."""
+    """The result of a study, and the circumstances in which it was made."""
 
     problem: str
     title: str
     description: str
-    settings: Mapping[str, str]
-    versions: Mapping[str, str]
-    command: str
-    elapsed: float
+    settings: Mapping[str, str]  # as Python, of the problem and of every controller, by name
+    versions: Mapping[str, str]  # of fpirhc and of what its numbers depend on
+    command: str  # that reproduces it; '' where there is none
+    elapsed: float  # wall time, s
 
     @property
     @abstractmethod
     def view(self) -> View:
         """What every output says of it."""
-
-    def viewed(
-        self,
-        sentences: Sequence[tuple[str, Outcome | None]],
-        conditions: str,
-        tables: Sequence[Table],
-        facts: Mapping[str, Any],
-        *,
-        lists: Mapping[str, Sequence[str]] | None = None,
-        skipped: Mapping[str, str] | None = None,
-    ) -> View:
-        """Return the view of these sentences, tables, lists and facts under the study's circumstances, see `View`."""
-        own = self.settings, self.versions, self.command, self.elapsed
-        filled = {heading: texts for heading, texts in (lists or {}).items() if texts}
-        return View(self.title, self.description, sentences, conditions, tables, *own, facts, filled, skipped or {})
 
     def _repr_html_(self) -> str:
         """Verdict and first table, for notebooks."""

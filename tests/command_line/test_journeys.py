@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -125,7 +126,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
         (HARMS, "run line.py CTC+FPI --no-compile", 0, f"{RUN} {HARMED}"),
         (DIVERGING, "run line.py CTC --no-compile", 4, ""),
-        (None, "compare line.py --no-compile -c CTC CTC+FPI", 0, MASS),  # a comparison tells it as a result
+        (None, "compare line.py --no-compile -c CTC CTC+FPI", 1, f"{MASS}\n- CTC does not finish: "),
     ],
     "study": [
         (None, "study line.py --draws 2 --mismatch 20% --no-compile", 0, "A mass on a line"),
@@ -208,6 +209,17 @@ def test_run_saves_every_signal_and_compare_writes_what_it_prints(folder, capsys
     errors = {name: one["metrics"]["rms_error"]["y"] for name, one in facts["controllers"].items()}
     assert errors["CTC+FPI"] < 0.9 * errors["CTC"]
     assert facts["seed"] == 3
+    assert main(["compare", "line.py", "--no-compile", "-c", "CTC"]) == 0  # a part, which leaves the whole as it was
+    assert "results/line/part/report.html" in capsys.readouterr().out
+    assert json.loads((folder / "results/line/results.json").read_text()) == facts
+
+
+@pytest.mark.parametrize("step", [0, 3])
+def test_progress_without_a_terminal_is_a_line_per_controller(step, folder, capsys, monkeypatch):
+    monkeypatch.setattr("time.monotonic", count(0, step).__next__)  # a command that takes no time says nothing
+    assert main(["compare", "line.py", "--no-compile"]) == 0
+    told = re.findall(r"fpirhc: (\S+): 500 of 500 after \d+ s", capsys.readouterr().err)
+    assert told == ["CTC", "CTC+FPI"] * (step > 0)
 
 
 def test_plans_are_certified_side_by_side(folder, capsys, monkeypatch):
@@ -233,8 +245,6 @@ def test_short_output_has_the_verdict_first_and_fits(folder, capsys, monkeypatch
     assert short[1].startswith("- CTC+FPI against CTC: ")
     assert len(short) <= 20
     assert max(map(len, short[:-1])) <= 80
-    assert main(["compare", "line.py", "--no-compile", "--verbose"]) == 0
-    assert not any("status" in line and "ok" in line for line in capsys.readouterr().out.splitlines())
 
 
 @pytest.mark.parametrize(

@@ -347,7 +347,7 @@ check mine.py --ignore-below -1 => expected percent of at least 0, such as 20%, 
 accept mine.py --reason '' => say why the new numbers are right
 accept two_mass --reason x --seeds 1 => '--seeds'
 export mine.py RHC --live optimiser.iterations => decides what the loop is made of
-export two_mass RHC --to matlab => the target 'matlab' is unknown. ... Valid: arduino, c, fmu2, library, wasm, lab
+export two_mass RHC --to matlab => the target 'matlab' is unknown; one of arduino, c, fmu2, library, wasm, lab
 export two_mass CTC --name int => 'int' cannot be the name of a controller in C: expected at most 40 letters,
 export two_mass CTC --live gain =>
     setting 'gain': neither the controller nor the problem's cost, limits, reference

@@ -14,7 +14,7 @@ controllers = {"ipopt": fp.RecedingHorizon(fp.Ipopt(1e-6), fp.Sigmoid(gain=-0.5,
 """
 ROWS = messages_of("""
 two_mass RHC+FPI --to cc =>
-    the target 'cc' is unknown. Did you mean 'c'? Valid: arduino, c, fmu2, library, wasm, lab.
+    the target 'cc' is unknown; one of arduino, c, fmu2, library, wasm, lab
 two_mas RHC+FPI =>
     problem 'two_mas' is unknown. Did you mean 'two_mass'? Give the path of a problem file, or a name from 'fpirhc list'
 own.py ipopt =>

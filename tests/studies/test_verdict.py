@@ -115,7 +115,7 @@ OUTCOMES: dict[str, tuple[Facts, Facts, str, dict[str, float] | None]] = {
     "one beyond the motion": (Facts(2.5), Facts(0.6, 0.2), "better", {"z": 0.4, "y": 0.24}),
     "plain does not finish": (Facts(ends=2.0), Facts(), "better", {}),
     "adaptive does not finish": (Facts(), Facts(0.1, ends=2.0), "worse", {}),
-    "neither finishes": (Facts(ends=2.0), Facts(ends=3.0), "not comparable", {}),
+    "neither finishes": (Facts(ends=2.0), Facts(ends=2.0), "not comparable", {}),
 }
 
 
@@ -124,6 +124,7 @@ def test_outcomes_and_ratios():
     found = findings(compared({name: row[:2] for name, row in OUTCOMES.items()}))
     said = {name: (str(one.outcome), list(one.ratios)) for name, one in found.items()}
     assert said == {n: (row[2], list(row[3]) if row[3] is not None else said[n][1]) for n, row in OUTCOMES.items()}
+    assert "neither finishes and neither finishes+FPI do not finish: " in found["neither finishes"].text
     for name, (*_, ratios) in OUTCOMES.items():
         assert ratios is None or dict(found[name].ratios) == pytest.approx(ratios, rel=1e-3)
 
