@@ -88,9 +88,7 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
         say(heading, "bold") if texts else None
         for text in texts:
             say(f"- {text}")
-    notes = sum(map(len, view.lists.values()))
-    told = f"{notes} note{'s' * (notes > 1)} there, or by --verbose" if notes else "more by --verbose"
-    more = "" if verbose else f" ({told})"
+    more = "" if verbose else " (more there, or by --verbose)"
     say(f"report: {report}", more=more, wrap=False)
 
 
