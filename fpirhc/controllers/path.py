@@ -30,7 +30,7 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, is_finite, left_after, left_in_mean
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import DeadTime, Queue, every, whole
-from fpirhc.task.exogenous import Exogenous, known_places, model_values, rows_of
+from fpirhc.task.exogenous import Exogenous, model_values, rows_of, signals_of
 from fpirhc.task.problem import Problem
 
 ACTED, NOW = "_signals_acted", "_parameters_now"  # what a model is told of the last cycle, and of this one
@@ -47,7 +47,8 @@ class Told:
     @cached_property
     def places(self) -> list[int]:
         """Places among the parameters of the signals of which it is told something."""
-        return list(known_places(self.plant, self.signals))
+        every = signals_of(self.plant, self.signals)
+        return [self.plant.parameter.elements.index(name) for name, one in every.items() if one.told]
 
     @property
     def reads(self) -> tuple[Signal, ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.path import believe_block, stated_path
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
 from fpirhc.errors import NoAnswer
-from fpirhc.plant.maps import growth_of
+from fpirhc.plant.maps import growth_rates
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import members, slowest, unobservable, values_of
 from fpirhc.symbolic.block import Block, Delay
@@ -109,7 +109,7 @@ def check_observed(problem: Problem) -> None:
     size[size == 0] = 1.0
     scaled = [a * size / size[:, None] for a in slopes]
     basis = unobservable(scaled, [c * size for c in shown])
-    pole = slowest(scaled, basis, growth_of(plant))
+    pole = slowest(scaled, basis, partial(growth_rates, plant))
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     if pole >= -_STAYS * fastest:
         hidden = [plant.state.elements[k] for k in members(basis)]

@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import Mistakes, NotSupported, refuse
+from fpirhc.errors import Mistakes, refuse
 from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import (
@@ -204,28 +204,14 @@ def require_derivatives(plant: Plant, who: str, *, of_time: bool, instead: str) 
     refuse(f"{who} needs derivatives below the response, and {why}; {instead}" for why in reasons)
 
 
-def require_rates(plant: Plant, refusal: str) -> None:
-    """Raise where the states have no derivatives with respect to time."""
-    if plant.step is not None:
-        raise NotSupported(refusal)
+def zero_dynamics(plant: Plant, state: np.ndarray, command: np.ndarray) -> float:
+    """Return the largest real part of the rates at which states of the plant move at a point while its outputs are held."""
+    a, b, c, d, y = (np.asarray(m.full()) for m in _slopes(plant)(state, command, plant.exact))
+    free = np.linalg.svd(y)[2][np.linalg.matrix_rank(y) :].T if len(y) else np.eye(len(a))
+    return float(np.linalg.eigvals(free.T @ (a - b @ np.linalg.pinv(d) @ c) @ free).real.max())
 
 
-class StateSlopes(NamedTuple):
-    """A (nx, nx), B (nx, nu), C (n, nx), D (n, nu), Y (sum of relative orders, nx), of the controlled coordinates or outputs."""
-
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    d: np.ndarray
-    y: np.ndarray
-
-
-def state_slopes(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> StateSlopes:
-    """Return the slopes at a point; those of a map are of its divided differences."""
-    return StateSlopes(*(np.asarray(m.full()) for m in _slopes(plant)(state, command, parameters)))
-
-
-@lru_cache(maxsize=8)  # several questions of a review need it
+@lru_cache(maxsize=8)  # it is asked at several points
 def _slopes(plant: Plant) -> ca.Function:
     x, u, p = plant.symbols()
     rates, responses = plant.equations.rate(x, u, p), plant.equations.controlled_response(x, u, p)
@@ -234,9 +220,3 @@ def _slopes(plant: Plant) -> ca.Function:
     chain = ca.vertcat(ca.SX(0, 1), *(shown[k] for k in below))
     pairs = ((rates, x), (rates, u), (responses, x), (responses, u), (chain, x))
     return ca.Function("fpirhc_state_slopes", [x, u, p], [ca.densify(ca.jacobian(one, by)) for one, by in pairs])
-
-
-def zero_dynamics(s: StateSlopes) -> float:
-    """Return the largest real part of the rates at which states move while the outputs are held."""
-    free = np.linalg.svd(s.y)[2][np.linalg.matrix_rank(s.y) :].T if len(s.y) else np.eye(len(s.a))
-    return float(np.linalg.eigvals(free.T @ (s.a - s.b @ np.linalg.pinv(s.d) @ s.c) @ free).real.max())

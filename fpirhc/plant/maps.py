@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -86,42 +86,22 @@ def step_of(plant: Plant, matrix: np.ndarray, time: float) -> np.ndarray:
     return np.linalg.matrix_power(np.eye(len(matrix)) + sampling(plant) * matrix, round(time / sampling(plant)))
 
 
-def growth_of(plant: Plant) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function from eigenvalues s of the rates to the growth rates of modes: Re s, or log|1 + T s| / T of a map."""
+def growth_rates(plant: Plant, modes: np.ndarray) -> np.ndarray:
+    """Return with which rates modes grow whose eigenvalues of the rates are s: Re s, or log|1 + T s| / T of a map."""
     if plant.step is None:
-        return np.real
-    cycle = sampling(plant)
-
-    def rates(modes: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore"):  # a mode that ends has the rate -inf
-            return np.asarray(np.log(np.abs(1 + cycle * modes)) / cycle)
-
-    return rates
+        return np.real(modes)
+    with np.errstate(divide="ignore"):  # a mode that ends has the rate -inf
+        return np.asarray(np.log(np.abs(1 + sampling(plant) * modes)) / sampling(plant))
 
 
-def time_derivatives(plant: Plant) -> Callable[[Expression, Expression, int], list[Expression]]:
-    """Return the function (motion, time, order) -> (y, y', ..., y^(order)), of a map its divided forward differences."""
-    if plant.step is None:
-        return differentiated
-    cycle = sampling(plant)
-
-    def differences(value: Expression, t: Expression, order: int) -> list[Expression]:
-        nodes = [value] + [ca.substitute(value, t, t + k * cycle) for k in range(1, order + 1)]
-        column = []
-        for k in range(order + 1):
-            column.append(nodes[0] / cycle**k)
-            nodes = [later - earlier for earlier, later in pairwise(nodes)]
-        return column
-
-    return differences
-
-
-def differentiated(value: Expression, t: Expression, order: int) -> list[Expression]:
-    """Return an expression of the time and its first derivatives."""
-    derivatives = [value]
-    for _ in range(order):
-        derivatives.append(ca.jacobian(derivatives[-1], t))
-    return derivatives
+def time_derivatives(plant: Plant, value: Expression, t: Expression, order: int) -> list[Expression]:
+    """Return (y, y', ..., y^(order)) of an expression of the time, of a map its divided forward differences."""
+    cycle, column = sampling(plant), [value]
+    nodes = [value, *(ca.substitute(value, t, t + k * cycle) for k in range(1, order + 1) if plant.step is not None)]
+    for k in range(1, order + 1):
+        nodes = [later - earlier for earlier, later in pairwise(nodes)]
+        column.append(ca.jacobian(column[-1], t) if plant.step is None else nodes[0] / cycle**k)
+    return column
 
 
 def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:

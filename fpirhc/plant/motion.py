@@ -86,12 +86,6 @@ def outside_names(plant: Plant) -> tuple[str, ...]:
     return tuple(name for name, one in plant.parameters.items() if one.outside)
 
 
-def outside_of(plant: Plant, parameters: Expression) -> Named:
-    """Return the signals from outside among the symbols of all parameters, by name."""
-    names, every = outside_names(plant), list(plant.parameters)
-    return Named(names, ca.vertcat(*(parameters[every.index(name)] for name in names)), "signal from outside")
-
-
 def controlled_places(plant: Plant) -> list[int]:
     """Return the places of the controlled quantities among all outputs, or without any among all coordinates."""
     names = list(followed_units(plant))

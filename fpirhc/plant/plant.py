@@ -104,19 +104,11 @@ class Plant(Checked):
         """Return the plant x' = f(x, u, p), y = h(x, p): every state is a coordinate of order one, and the outputs have references.
 
         Args:
-            states: name -> unit of every state.
-            inputs: name -> unit of every input.
-            parameters: name -> Parameter(approximate, exact, unit).
+            states: name -> unit of every state; what is not named here is as in `Plant`.
             rates: function of (x, u, p) that returns {state: its derivative with respect to time}.
             outputs: name -> Output(unit, function of (x, p)).
-            controlled: outputs on which a tracking law and a deformation act, as many as there are inputs; None: all.
             inverse: optional function of (x, r, p) that returns {input: command} for wanted highest derivatives r of the controlled
-                outputs; see `Plant`.
-            ranges: physical range (lowest, highest) of states by name.
-            time_unit: unit of time of the equations.
-
-        Raises:
-            InvalidProblem: all mistakes together.
+                outputs.
         """
         given = (states, inputs, parameters, rates, 1, controlled, inverse)
         return cls(*given, ranges=ranges or {}, outputs=outputs, time_unit=time_unit)
@@ -143,27 +135,13 @@ class Plant(Checked):
         `fpirhc.plant.maps`. A map has no use for an integrator, and the period of its `Problem` is a whole number of steps.
 
         Args:
-            states: name -> unit of every state.
-            inputs: name -> unit of every input.
-            parameters: name -> Parameter(approximate, exact, unit), or outside(nominal, unit).
+            states: name -> unit of every state; what is not named here is as in `Plant`.
             next: function of (x, u, p) that returns {state: its value one step later}.
             step: time from one state to the next.
             outputs: name -> Output(unit, function of (x, p)); None: the states follow a reference.
-            controlled: outputs, or states, on which a tracking law and a deformation act, as many as there are inputs; None: all.
-            ranges: physical range (lowest, highest) of states by name.
-            time_unit: unit of time of the step.
-
-        Raises:
-            InvalidProblem: all mistakes together.
         """
-        given = (states, inputs, parameters, next, 1, controlled)
-        return cls(
-            *given,
-            ranges=ranges or {},
-            outputs=outputs or {},
-            time_unit=time_unit,
-            step=math.nan if step is None else step,
-        )
+        given, every = (states, inputs, parameters, next, 1, controlled), math.nan if step is None else step
+        return cls(*given, ranges=ranges or {}, outputs=outputs or {}, time_unit=time_unit, step=every)
 
     def __repr__(self) -> str:
         return line(self, *plant_facts(self))

@@ -23,7 +23,6 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.deformation.wrappers.delayed import Paired
 from fpirhc.deformation.wrappers.filters import Filtered
 from fpirhc.errors import FpirhcError, require
-from fpirhc.plant.chain import require_rates
 from fpirhc.plant.parameter import outside
 from fpirhc.plant.plant import Plant
 from fpirhc.probing.identification import Estimates
@@ -235,7 +234,7 @@ def estimated_problem(
 
 def _plant(model: Plant, gains: np.ndarray) -> tuple[Plant, tuple[str, ...]]:
     """The plant without its lags, and the names of its drifts."""
-    require_rates(model, "the estimated plant of a map has no equations yet")
+    require(model.step is None, "the estimated plant of a map has no equations yet")
     direct = set(model.controlled_names) == set(model.coordinates)  # else what else the inputs move has to follow
     opaque = "the estimated plant of outputs of a model that is not affine in its inputs has no equations yet"
     require(direct or not model.equations.inverse_opaque, opaque)

@@ -16,7 +16,7 @@ from fpirhc.controllers.contract import with_field
 from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
-from fpirhc.plant.chain import state_slopes, zero_dynamics
+from fpirhc.plant.chain import zero_dynamics
 from fpirhc.review.experiments import BUSY, GOOD, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, with_gain
 from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.ranges import TOLERANCE, hard_limits
@@ -239,8 +239,8 @@ def _inner(case: Case) -> Fact | None:
     same = run["plant_state"].shape[1] == plant.state.size and run.cycles
     require(same, "What moves has other states than the model.")
     at = np.linspace(0, run.cycles - 1, 9).astype(int)
-    slopes = (state_slopes(plant, run["plant_state"][k], run["command"][k], plant.exact) for k in at)
-    rate, left = max(map(zero_dynamics, slopes)), bench.back.left
+    rate = max(zero_dynamics(plant, run["plant_state"][k], run["command"][k]) for k in at)
+    left = bench.back.left
     rate = 0.0 if abs(rate) * problem.duration < ROUNDING else rate
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
     numbers = {"rate_with_outputs_held": rate}

@@ -217,7 +217,7 @@ def slowest(
 ) -> float:
     """Return the largest real part of the poles with which these errors move, in 1 / unit of time; negative: all decay.
 
-    `growth`: of poles; of a map's divided differences it is not the real part (`fpirhc.plant.maps.growth_of`).
+    `growth`: of poles; of a map's divided differences it is not the real part (`fpirhc.plant.maps.growth_rates`).
     """
     if not basis.shape[1]:
         return -np.inf

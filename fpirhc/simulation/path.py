@@ -40,7 +40,7 @@ _RAW, HELD = "_foreign", "_foreign_held"
 def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
     problem, plant, late = mover.problem, mover.problem.plant, mover.problem.dead_time
-    known = problem.equations_known  # a body outside has the dead time of its inputs itself
+    known = not problem.foreign  # a body outside has the dead time of its inputs itself
     queued = [name for name in plant.inputs if name in late.queued and known]
     if not queued:
         return [mover.advance(disturbed, plant.input)]

@@ -159,7 +159,7 @@ def experiment(problem: Problem, controller: Controller, cycles: int) -> tuple[E
     loops = loop_of(short, without_deformation(controller)), loop_of(short, controller)
     names = weighed(short, loops[1].controller)
     null = errors_of(*ModelAsPlant(short, seed=0).pair(loops), names)
-    if not short.equations_known:
+    if short.foreign:
         return None, null
     return errors_of(short, [loop.run(seed=0, variant=short) for loop in loops], names), null
 

@@ -1,7 +1,7 @@
 """Named cases of a problem: under each name, what is different from the problem there.
 
-A path says what a case changes: 'exact.NAME', 'approximate.NAME' and 'known.NAME' a parameter, 'start.NAME' the first value of a
-state, and any other one a field of the problem or a number inside it, 'limits.inputs.Q1.1', 'dead_time.measurement', 'reality'.
+A path says what a case changes: 'exact.NAME' and 'approximate.NAME' a parameter, 'start.NAME' the first value of a state,
+and any other one a field of the problem or a number inside it, 'limits.inputs.Q1.1', 'dead_time.measurement', 'reality'.
 """
 
 from __future__ import annotations
@@ -22,12 +22,8 @@ from fpirhc.task.problem import Problem
 
 EVERY = "all"  # names every case
 _GROUP, _SEED = "group", "seed"  # what a case has beside its changes
-_EXACT, _APPROXIMATE, _KNOWN, START = "exact", "approximate", "known", "start"
-PARAMETERS = {
-    _EXACT: "what moves",
-    _APPROXIMATE: "what the controllers know",
-    _KNOWN: "both: what moves has it, and the controllers know it",
-}
+_EXACT, _APPROXIMATE, START = "exact", "approximate", "start"
+PARAMETERS = {_EXACT: "what moves", _APPROXIMATE: "what the controllers know"}
 _WORDS = (*PARAMETERS, START)
 _OWN = ("plant", "start", "name")  # fields of a problem that no path begins with: they have words of their own
 
@@ -44,7 +40,7 @@ class Cases(Checked):
 
     Args:
         changes: by name of the case and path. The path is 'exact.NAME' (the parameter of what moves), 'approximate.NAME' (of the
-            controllers' model), 'known.NAME' (of both), 'start.NAME', or begins with another field of the problem: 'reference',
+            controllers' model), 'start.NAME', or begins with another field of the problem: 'reference',
             'reality', 'signals', 'dead_time.inputs.Q1', 'limits.inputs.Q1' (a pair) or 'limits.inputs.Q1.1' (its upper end).
             'group' is a text by which cases are summed up, 'seed' the seed of the case's noise.
 
@@ -128,10 +124,9 @@ class Cases(Checked):
         mistakes.raise_if_any()
 
     def exactly(self, name: str, built: Problem) -> Problem:
-        """Return what `build` returned, with the exact parameters of a case; what is known is exact where what moves has it too."""
-        before, changes = {name: one.exact for name, one in built.moves.parameters.items()}, self.changes[name]
-        known = {one: value for one, value in _named(changes, _KNOWN).items() if one in before}
-        exact = {n: float(value) for n, value in {**before, **known, **_named(changes, _EXACT)}.items()}
+        """Return what `build` returned, with the exact parameters of a case."""
+        before = {name: one.exact for name, one in built.moves.parameters.items()}
+        exact = {n: float(value) for n, value in {**before, **_named(self.changes[name], _EXACT)}.items()}
         return built if exact == before else built.with_exact(np.array(list(exact.values())))
 
     def key(self, name: str) -> tuple[object, ...]:
@@ -148,8 +143,7 @@ def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     for path, value in changes.items():
         if path.partition(".")[0] not in (*_WORDS, _GROUP, _SEED):
             problem = changed_at(problem, path, as_declared(problem, path, value))
-    model = {**_named(changes, _APPROXIMATE), **_named(changes, _KNOWN)}
-    start = _named(changes, START)
+    model, start = _named(changes, _APPROXIMATE), _named(changes, START)
     if model:
         parameters = {
             name: replace(one, approximate=float(model[name])) if name in model else one
@@ -186,10 +180,8 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
         yield f"'{_SEED}' is a whole number of at least 0, got {described(seed)}"
     for path in changes:
-        word, _, rest = path.partition(".")
-        both = [f"{_KNOWN}.{rest}"] if word in (_EXACT, _APPROXIMATE) else []
         above = [path[:at] for at, mark in enumerate(path) if mark == "."]
-        for other in (one for one in (*both, *above) if one in changes):
+        for other in (one for one in above if one in changes):
             yield f"'{other}' and '{path}' set the same number; leave one of them out"
 
 

@@ -25,7 +25,7 @@ from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.task.exogenous import check_signals, not_held
+from fpirhc.task.exogenous import check_signals
 from fpirhc.task.limits import Limits
 from fpirhc.task.reference import pairs
 
@@ -85,7 +85,8 @@ def check_problem(problem: Problem) -> None:
     parts = plant, problem.cost, problem.limits  # which problems share
     mistakes.join(_STAGES.of(parts, (), lambda: _of_stage(*parts)))
     _check_inverse(problem, mistakes)
-    smooth = not_held(problem.signals, differentiated_signals(plant))
+    courses = {name: problem.signals[name].values for name in differentiated_signals(plant) if name in problem.signals}
+    smooth = [name for name, one in courses.items() if callable(one) and not getattr(one, "held", False)]
     if smooth:
         mistakes.add(
             f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state "

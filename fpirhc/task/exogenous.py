@@ -72,11 +72,6 @@ def model_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function 
     return real_values(plant, {name: one for name, one in signals.items() if one.told})
 
 
-def known_places(plant: Plant, signals: Mapping[str, Exogenous]) -> tuple[int, ...]:
-    """Places of the signals among the parameters of which the model is told something."""
-    return tuple(plant.parameter.elements.index(n) for n, one in signals_of(plant, signals).items() if one.told)
-
-
 def signals_of(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogenous]:
     """Return the signals that a plant has."""
     return {name: signals[name] for name in outside_names(plant) if name in signals}
@@ -92,12 +87,6 @@ def as_known(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogen
     """Return signals that are what the model believes: the world of a null test."""
     nominal = {name: Known(plant.parameters[name].approximate) for name in outside_names(plant)}
     return {name: one if one.told else nominal[name] for name, one in signals_of(plant, signals).items()}
-
-
-def not_held(signals: Mapping[str, Exogenous], names: Sequence[str]) -> tuple[str, ...]:
-    """Return those of some signals that change between jumps, as functions of time do."""
-    courses = {name: signals[name].values for name in names if name in signals}
-    return tuple(name for name, one in courses.items() if callable(one) and not getattr(one, "held", False))
 
 
 def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndarray) -> np.ndarray:

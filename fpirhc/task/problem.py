@@ -96,7 +96,8 @@ class Problem(Checked):
         check_problem(nominal(self))
 
     def __repr__(self) -> str:
-        return line(self, *problem_facts(self))
+        named = (self.name,) if self.name else ()
+        return line(self, *named, f"{self.cycles} cycles of {self.period:g} {self.time_unit}", *plant_facts(self.plant))
 
     @property
     def time_unit(self) -> str:
@@ -119,13 +120,8 @@ class Problem(Checked):
 
     @property
     def foreign(self) -> ExternalPlant | None:
-        """The reality where it is an object outside."""
+        """The reality where it is an object outside, which has no equations and cannot be run again to answer a question."""
         return self.reality.foreign if self.reality is not None else None
-
-    @property
-    def equations_known(self) -> bool:
-        """Whether what moves has equations, so that it can be run again to answer a question."""
-        return self.foreign is None
 
     @property
     def moves(self) -> Reality | ExternalPlant:
@@ -289,9 +285,3 @@ class Problem(Checked):
     def warm_up_cycles(self) -> float:
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
         return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
-
-
-def problem_facts(problem: Problem) -> tuple[str, ...]:
-    """Return what sums up a problem: its name, its cycles, its quantities."""
-    named = (problem.name,) if problem.name else ()
-    return *named, f"{problem.cycles} cycles of {problem.period:g} {problem.time_unit}", *plant_facts(problem.plant)

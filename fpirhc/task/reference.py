@@ -62,8 +62,7 @@ class Reference(Checked, ABC):
         what, t = followed(plant), ca.SX.sym("t")
         motion = {name: ca.SX(value) for name, value in self.coordinates(t).items()}
         _check(plant, motion, what)
-        by = time_derivatives(plant)
-        chains = {c: by(motion[c], t, r) for c, r in plant.chains.items()}
+        chains = {c: time_derivatives(plant, motion[c], t, r) for c, r in plant.chains.items()}
         state, response = _arranged(plant, chains)
         return ca.Function("fpirhc_reference", [t], [state, response], ["t"], ["state", "response"])
 
