@@ -95,6 +95,7 @@ class Simulator:
         """Return problem and controller of a run; arguments as in `run`."""
         return in_force(self.live, self.loop, variant or self.problem, settings or {}, {})
 
+    @checked_call
     def run(
         self,
         *,

@@ -10,8 +10,7 @@ import numpy as np
 
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.errors import InvalidField, InvalidValue
-from fpirhc.fields.kinds import described, finite_number, named_entries
+from fpirhc.errors import InvalidValue
 from fpirhc.simulation.step_arguments import Setpoints, set_point_table
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.layout import Expression, Signal
@@ -106,8 +105,9 @@ class InForce:
 
 def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
     """Return the settings of a run, checked before it starts."""
-    named_entries("settings", settings)
-    _check_changes(problem, changes)
+    for time in changes:
+        if not 0 <= time < problem.duration:
+            raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
     first = replace(live, problem=problem)
     if not settings and not changes:  # a variant of the problem runs as it does without live settings
         return InForce(problem, live.controller, first.start, (), [(0.0, first.start)] if live.paths else [])
@@ -121,16 +121,3 @@ def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Nu
         patches.append((cycle, places, np.array(list(values.values()), dtype=float)))
         record.append((cycle * problem.period, values))
     return InForce(ready, controller, numbers, patches, record if numbers else [])
-
-
-def _check_changes(problem: Problem, changes: Changes) -> None:
-    """Raise for anything but numbers by a time of the run."""
-    if not isinstance(changes, Mapping):
-        raise InvalidField([f"changes: expected a mapping {{time: {{name: number}}}}, got {described(changes)}"])
-    wrong = [f"changes: the time of a change is a number, got {described(t)}" for t in changes if not finite_number(t)]
-    if wrong:
-        raise InvalidField(wrong)
-    for time, numbers in changes.items():
-        named_entries(f"changes at {time:g}", numbers)
-        if not 0 <= time < problem.duration:
-            raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
