@@ -44,25 +44,22 @@ def reference_block(built: Built) -> Block:
 
 
 def closing_blocks(
-    built: Built, deformation: Deformation, judged: Sequence[Signal] = ()
+    built: Built, deformation: Deformation | None = None, judged: Sequence[Signal] = ()
 ) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks deform, invert, limit, judge and running with what they remember; `judged` are solver statuses."""
-    plant, path = built.plant, built.path(deformation)
-    closing, delays = commanding_blocks(built, judged)
-    deform = deform_block(plant, deformation, built.warm_up, built.largest)
-    last = plant.response_signal(_REQUEST)
-    before, remembered = ([], [Delay(last, "deformed")]) if last.name in deform.reads else ([model_block(path)], [])
-    return [*before, deform, invert_block(plant), *closing], [*delays, *remembered]
+    """Return the blocks deform, invert, limit, judge and running with what they remember; `judged` are solver statuses.
 
-
-def commanding_blocks(built: Built, judged: Sequence[Signal] = ()) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks limit, judge and running with what they remember, for a controller that writes 'command_unclipped'.
-
-    The controller also writes 'desired', and '_deformed_unclipped': the response that its model expects of this command.
-    `judged` are solver statuses.
+    A controller writes 'desired'. Without a deformation there is neither deform nor invert, and it also writes 'command_unclipped'
+    and '_deformed_unclipped': the response that its model expects of this command.
     """
     delays = [Delay(scalar("warm_up"), "_warm_up_now"), Delay(built.before, "command")]
-    return [_limit_block(built), judge_block(judged), warm_up_block(built.warm_up)], delays
+    closing = [_limit_block(built), judge_block(judged), warm_up_block(built.warm_up)]
+    if deformation is None:
+        return closing, delays
+    deform = deform_block(built.plant, deformation, built.warm_up, built.largest)
+    last = built.plant.response_signal(_REQUEST)
+    paired = last.name in deform.reads
+    before, remembered = ([], [Delay(last, "deformed")]) if paired else ([model_block(built.path(deformation))], [])
+    return [*before, deform, invert_block(built.plant), *closing], [*delays, *remembered]
 
 
 def warm_up_block(warm_up_cycles: float) -> Block:
@@ -205,35 +202,18 @@ def judge_block(judged: Sequence[Signal] = ()) -> Block:
     return Block("judge", reads, Layout((scalar("status"),)), step)
 
 
-def desired_blocks(built: Built, tracking: Tracking) -> list[Block]:
-    """Return the blocks reference, target, nominal and tracking: together they write 'desired'."""
+def nominal_blocks(built: Built) -> list[Block]:
+    """Return the blocks of the reference and of 'nominal', which is its response."""
     plant = built.plant
-    return [
-        reference_block(built),
-        rename("target", like(plant.output, "reference"), like(plant.output, "_target")),
-        rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal")),
-        tracking.within(built.largest).law(plant, built.period),
-    ]
+    follows = rename("nominal", plant.response_signal("_reference_response"), plant.response_signal("nominal"))
+    return [reference_block(built), follows]
 
 
-def tracked_blocks(built: Built, tracking: Tracking, deformation: Deformation) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks reference, tracking, deform, invert, limit, judge, running, tracking update, and what they remember."""
-    return _between(built, tracking, closing_blocks(built, deformation))
-
-
-def law_blocks(built: Built, tracking: Tracking, *law: Block) -> tuple[list[Block], list[Delay]]:
-    """Return the blocks reference, tracking, those of a law without a deformation, limit, judge, running and tracking update.
-
-    The law reads 'desired' and writes 'command_unclipped' and '_deformed_unclipped'; see `commanding_blocks`.
-    """
-    closing, delays = commanding_blocks(built)
-    return _between(built, tracking, ([*law, *closing], delays))
-
-
-def _between(
-    built: Built, tracking: Tracking, closing: tuple[list[Block], list[Delay]]
+def tracked_blocks(
+    built: Built, tracking: Tracking, *law: Block, deformation: Deformation | None = None
 ) -> tuple[list[Block], list[Delay]]:
-    """The blocks between those of the desired response and the update of the tracking law."""
-    plant, (blocks, delays) = built.plant, closing
-    update = tracking.within(built.largest).update(plant, built.period)
-    return [*desired_blocks(built, tracking), *blocks, update], [*delays, *tracking.delays(plant)]
+    """Return the blocks of a tracking law, those of another law on what it desires, the closing ones, and the law's update."""
+    plant, (closing, delays), tracks = built.plant, closing_blocks(built, deformation), tracking.within(built.largest)
+    target = rename("target", like(plant.output, "reference"), like(plant.output, "_target"))
+    blocks = [*nominal_blocks(built), target, tracks.law(plant, built.period), *law, *closing]
+    return [*blocks, tracks.update(plant, built.period)], [*delays, *tracks.delays(plant)]

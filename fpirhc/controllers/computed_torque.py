@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 
-from fpirhc.controllers.base import Controller, commanding_blocks, reference_block, tracked_blocks
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
@@ -38,7 +38,7 @@ class ComputedTorque(Controller):
     deformation: Deformation = field(default_factory=Identity)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        return tracked_blocks(built, self.tracking, self.deformation)
+        return tracked_blocks(built, self.tracking, deformation=self.deformation)
 
 
 _SEEN = "_seen_status"
@@ -67,7 +67,7 @@ class FeedforwardOnly(Undeformed):
             )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        closing, delays = commanding_blocks(built, [scalar(_SEEN)])
+        closing, delays = closing_blocks(built, judged=[scalar(_SEEN)])
         return [reference_block(built), self._block(built), *closing], delays
 
     def _block(self, built: Built) -> Block:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller, commanding_blocks, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built, build, compose_with_sensing
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.gate import INNER, Gate
@@ -104,7 +104,7 @@ class HeldInput(Undeformed):
     """Sends the input before the run, within the limits."""
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        plant, (closing, delays), held = built.plant, commanding_blocks(built), ca.DM(built.before.start_vector())
+        plant, (closing, delays), held = built.plant, closing_blocks(built), ca.DM(built.before.start_vector())
         responses = [plant.response_signal(name) for name in ("nominal", "desired", "_deformed_unclipped")]
 
         def step(s: Signals) -> dict[str, Expression]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import commanding_blocks, invert_block, law_blocks, reference_block
+from fpirhc.controllers.base import closing_blocks, invert_block, nominal_blocks, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.rivals.model_reference import decay_gains
@@ -17,7 +17,7 @@ from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes, step_of
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay, rename
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_in_mean, power, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.problem import Problem
@@ -44,15 +44,8 @@ class ADRC(OfDerivatives):
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant
-        closing, delays = commanding_blocks(built)
-        response = plant.response_signal("_reference_response")
-        blocks = [
-            reference_block(built),
-            rename("nominal", response, plant.response_signal("nominal")),
-            self._observer_block(built),
-            *closing,
-            _prediction_block(built),
-        ]
+        closing, delays = closing_blocks(built)
+        blocks = [*nominal_blocks(built), self._observer_block(built), *closing, _prediction_block(built)]
         return blocks, [*delays, Delay(_states(plant, "_predicted"), "_predicted_later")]
 
     def corrections(self, plant: Plant, order: int, period: float) -> list[float]:
@@ -163,7 +156,7 @@ class L1Adaptive(OfDerivatives):
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant
-        blocks, delays = law_blocks(built, self.tracking, self._predictor_block(built), invert_block(plant))
+        blocks, delays = tracked_blocks(built, self.tracking, self._predictor_block(built), invert_block(plant))
         expected = plant.response_signal("_expected")
         return [*blocks, _expected_block(plant)], [*delays, Delay(expected, "_expected_now")]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from fpirhc.controllers.base import closing_blocks, commanding_blocks, invert_block, law_blocks, reference_block
+from fpirhc.controllers.base import closing_blocks, invert_block, nominal_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives, Undeformed
 from fpirhc.controllers.rivals.model_reference import decay_gains
@@ -17,7 +17,7 @@ from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
-from fpirhc.symbolic.block import Block, Delay, rename
+from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_after, power
 from fpirhc.symbolic.layout import Expression, Layout, like, scalar, vector
 from fpirhc.task.problem import Problem
@@ -47,7 +47,7 @@ class AccelerationFeedback(Undeformed):
         return (1 + self.pole(period)) / (1 - self.pole(period))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(built, self.tracking, self._feedback_block(built), invert_block(built.plant))
+        return tracked_blocks(built, self.tracking, self._feedback_block(built), invert_block(built.plant))
 
     def _feedback_block(self, built: Built) -> Block:
         """Block (desired, realised) -> request; before the first response the request is the desired response."""
@@ -94,7 +94,7 @@ class INDI(Undeformed):
         return 2 * decay * ca.cos(self.frequency * period * ca.sqrt(1 - _DAMPING * _DAMPING)), -decay * decay
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(built, self.tracking, self._increment_block(built))
+        return tracked_blocks(built, self.tracking, self._increment_block(built))
 
     def _increment_block(self, built: Built) -> Block:
         """Block (state, last command, realised, desired) -> command; before the first response it is the model's inverse."""
@@ -160,7 +160,7 @@ class ResolvedAccelerationRate(OfDerivatives):
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant
-        closing, delays = commanding_blocks(built)
+        closing, delays = closing_blocks(built)
         blocks = [
             reference_block(built),
             _nominal_block(built),
@@ -276,15 +276,8 @@ class SlidingMode(OfDerivatives):
             check_modes(self, problem.plant, decay_gains(self.rate, order - 1))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        response = built.plant.response_signal("_reference_response")
         closing, delays = closing_blocks(built, self.deformation)
-        blocks = [
-            reference_block(built),
-            rename("nominal", response, built.plant.response_signal("nominal")),
-            self._surface_block(built.plant),
-            *closing,
-        ]
-        return blocks, delays
+        return [*nominal_blocks(built), self._surface_block(built.plant), *closing], delays
 
     def _surface_block(self, plant: Plant) -> Block:
         """Block (state, reference, nominal) -> (S, desired)."""

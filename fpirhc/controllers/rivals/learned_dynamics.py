@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, closing_blocks, desired_blocks, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
 from fpirhc.controllers.rivals.model_reference import companion
@@ -73,16 +73,11 @@ class AdaptiveInverseDynamics(Controller):
         self._learning.check(problem, inverts=True)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        plant = built.plant
-        closing, delays = closing_blocks(built, self.deformation)
-        believed = like(plant.parameter, "_believed")
-        blocks = [
-            *desired_blocks(built, self.tracking),
-            self._learn_block(built),
-            *(fed(block, "parameters", believed) for block in closing),
-            self.tracking.within(built.largest).update(plant, built.period),
-        ]
-        return blocks, [*delays, *learning_delays(), *self.tracking.delays(plant)]
+        believed, learn = like(built.plant.parameter, "_believed"), self._learn_block(built)
+        blocks, delays = tracked_blocks(built, self.tracking, learn, deformation=self.deformation)
+        after = blocks.index(learn) + 1
+        following = [fed(block, "parameters", believed) for block in blocks[after:]]
+        return [*blocks[:after], *following], [*delays, *learning_delays()]
 
     @property
     def _learning(self) -> Learning:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
-from fpirhc.controllers.base import Controller, commanding_blocks, law_blocks, reference_block
+from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives
 from fpirhc.controllers.reference_states import request_of_commands
@@ -113,7 +113,7 @@ class ForceMRAC(Controller):
             )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        return law_blocks(built, self.tracking, self._force_block(built.plant, built.warm_up))
+        return tracked_blocks(built, self.tracking, self._force_block(built.plant, built.warm_up))
 
     def _force_block(self, plant: Plant, warm_up_cycles: float) -> Block:
         """Block (state, desired, realised, last command) -> Q^Des, Q^Rec, Q^Def, and the model's response to it."""
@@ -185,7 +185,7 @@ class LyapunovMRAC(OfDerivatives):
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant
-        closing, delays = commanding_blocks(built)
+        closing, delays = closing_blocks(built)
         blocks = [
             reference_block(built),
             model_block(plant, self.rate, built.period),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import commanding_blocks, reference_block
+from fpirhc.controllers.base import closing_blocks, nominal_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.errors import Mistakes
@@ -87,10 +87,9 @@ class PID(Undeformed):
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         plant = built.plant
         response = plant.response_signal("_reference_response")
-        closing, delays = commanding_blocks(built)
+        closing, delays = closing_blocks(built)
         blocks = [
-            reference_block(built),
-            rename("nominal", response, plant.response_signal("nominal")),
+            *nominal_blocks(built),
             rename("desired", response, plant.response_signal("desired")),
             self._law(built),
             *closing,
