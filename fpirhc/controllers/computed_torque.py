@@ -49,12 +49,7 @@ class FeedforwardOnly(Undeformed):
     """The model's inverse at the reference's state and response; no error is fed back."""
 
     def check(self, problem: Problem) -> None:
-        """Raise if the model has no inverse, or a derivative is prescribed where states have no reference.
-
-        Raises:
-            NotInvertible: inputs and controlled coordinates differ in number.
-            NotSupported: without feedback an output would drift.
-        """
+        """Raise if the model has no inverse, or a derivative is prescribed where states have no reference."""
         plant = problem.plant
         if len(plant.controlled_names) != len(plant.inputs):
             raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")

@@ -228,8 +228,6 @@ class OfDerivatives(Undeformed, ABC):
 class ControllerWrapper(Controller, ABC):
     """Contract: a controller around another one, with its deformation."""
 
-    once: ClassVar[bool] = False  # whether it cannot stand around another one of its kind: its signals have fixed names
-
     controller: Controller
 
     @property
@@ -267,26 +265,16 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
 
 
 def resolved(problem: Problem, controller: Controller) -> Controller:
-    """Return the controller with every automatic setting replaced by its value for this problem.
-
-    Raises:
-        NotSupported: a wrapper stands around another one of its kind; both would have the same signals.
-    """
+    """Return the controller with every automatic setting replaced by its value for this problem."""
     if controller.inner is not None:
-        _require_once(controller)
+        name = type(controller).__name__
+        require(  # both would have the same signals
+            type(controller) not in map(type, _chain(controller.inner)),
+            f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both",
+        )
         inner = resolved(controller.inner_problem(problem), controller.inner)
         controller = controller if inner is controller.inner else with_inner(controller, inner)
     return controller.with_defaults(problem)
-
-
-def _require_once(wrapper: Controller) -> None:
-    name, inside = type(wrapper).__name__, wrapper.inner
-    while inside is not None:
-        require(
-            type(inside) is not type(wrapper) or not getattr(wrapper, "once", False),
-            f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both",
-        )
-        inside = inside.inner
 
 
 def tracking_law(controller: Controller) -> Tracking | None:
@@ -299,11 +287,7 @@ _Own = TypeVar("_Own", bound=Controller)
 
 
 def with_field(controller: _Own, name: str, value: object) -> _Own:
-    """Return the controller with another content of a field, its own or that of an inner one.
-
-    Raises:
-        NotSupported: nobody has the field.
-    """
+    """Return the controller with another content of a field, its own or that of an inner one."""
     changed = replaced(controller, name, value)
     if changed is not None:
         return changed
@@ -311,11 +295,17 @@ def with_field(controller: _Own, name: str, value: object) -> _Own:
     return with_inner(controller, with_field(cast(Controller, controller.inner), name, value))
 
 
+def _chain(controller: Controller | None) -> Iterator[Controller]:
+    """Yield a controller and those inside it, the outermost first."""
+    while controller is not None:
+        yield controller
+        controller = controller.inner
+
+
 def innermost(controller: Controller) -> Controller:
     """The controller inside all others."""
-    while controller.inner is not None:
-        controller = controller.inner
-    return controller
+    *_, own = _chain(controller)
+    return own
 
 
 def named_in_task(controller: Controller, name: str) -> Controller:

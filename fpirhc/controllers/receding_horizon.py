@@ -82,12 +82,7 @@ class RecedingHorizon(Controller):
         return (text,) if given and planner.consistent is None and planner.starts_consistent(problem.plant) else ()
 
     def check(self, problem: Problem) -> None:
-        """Raise if the problem has no horizon or cost, or the optimiser does not support it.
-
-        Raises:
-            InvalidProblem: horizon or cost missing.
-            NotSupported: the optimiser cannot keep the problem's bounds; references of states are needed that no output gives.
-        """
+        """Raise if the problem has no horizon or cost, or the optimiser does not support it."""
         if problem.horizon is None:
             raise InvalidProblem("RecedingHorizon needs Problem(horizon=...), which this problem does not have")
         if self.cost is None and problem.cost is None:

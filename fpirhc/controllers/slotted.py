@@ -75,11 +75,7 @@ class Slotted(Controller):
         return self if same else replace(self, slots=slots)
 
     def check(self, problem: Problem) -> None:
-        """Raise if the slots or their durations do not fit the problem.
-
-        Raises:
-            InvalidProblem: mistakes of slots and durations, all together.
-        """
+        """Raise if the slots or their durations do not fit the problem."""
         self._check_names(problem)
         mistakes = Mistakes("Slotted")
         for name, slot in self.slots.items():

@@ -256,13 +256,7 @@ class SlidingMode(OfDerivatives):
     width: Positive
 
     def check(self, problem: Problem) -> None:
-        """Raise if the loop chatters even with an exact model.
-
-        Raises:
-            InvalidProblem: K period / w is 2 or more.
-            NotSupported: an output of order 0.
-            InvalidValue: an error on the surface that does not decay in the steps of a map.
-        """
+        """Raise if the loop chatters even with an exact model."""
         super().check(problem)
         mistakes, product = Mistakes("SlidingMode"), self.gain * problem.period / self.width
         if product >= 2:

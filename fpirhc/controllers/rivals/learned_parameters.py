@@ -54,11 +54,6 @@ class Learning:
 
         Args:
             inverts: whether the controller inverts the mass matrix.
-
-        Raises:
-            NotSupported: the plant is not fully actuated, not of order 2, or has no symmetric mass matrix.
-            InvalidValue: parameters enter nonlinearly, a first estimate is outside its bounds, or the bounds admit a mass matrix
-                that is not positive definite where the controller inverts it.
         """
         refuse(_against(problem.plant))
         regressor = self.regressor(problem.plant)

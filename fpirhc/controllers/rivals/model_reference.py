@@ -99,11 +99,7 @@ class ForceMRAC(Controller):
     deforms = "command"
 
     def check(self, problem: Problem) -> None:
-        """Raise where the response does not recalculate the last command, with which a model-referenced map compares it.
-
-        Raises:
-            NotSupported: such a map where sensing is not ideal or something is late.
-        """
+        """Raise where the response does not recalculate the last command, with which a model-referenced map compares it."""
         form, late = self.deformation.form, any((problem.dead_time.measurement, *problem.dead_time.inputs.values()))
         believes = form.late or any(every(form.lag))
         if form.modelled and (late or believes or not problem.sensing.ideal):
@@ -164,12 +160,7 @@ class LyapunovMRAC(OfDerivatives):
         return np.asarray(solve_continuous_lyapunov(companion(decay_gains(1.0, order)).T, -np.eye(order)))
 
     def check(self, problem: Problem) -> None:
-        """Raise if the proof of the rule does not cover the plant.
-
-        Raises:
-            NotSupported: a map, or an output of order 0.
-            InvalidProblem: not fully actuated, or the inputs' effect on the response is not of one sign at the start.
-        """
+        """Raise if the proof of the rule does not cover the plant."""
         super().check(problem)
         plant, mistakes = problem.plant, Mistakes("LyapunovMRAC")
         followed = plant.chains

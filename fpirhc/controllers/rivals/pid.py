@@ -55,11 +55,7 @@ class PID(Undeformed):
         return (self.integral.get(name, 0.0), self.proportional[name], *padded)
 
     def check(self, problem: Problem) -> None:
-        """Raise if the gains do not fit the plant.
-
-        Raises:
-            InvalidProblem: mistakes in the gains, all together; inputs that do not bring their coordinates back.
-        """
+        """Raise if the gains do not fit the plant."""
         plant, mistakes = problem.plant, Mistakes("PID")
         names = plant.controlled_names
         for what in ("proportional", "integral", "derivative"):

@@ -134,14 +134,7 @@ class Cascade(Controller):
         return self
 
     def check(self, problem: Problem) -> None:
-        """Raise if the inner controller, the map or the pairing does not fit the problem.
-
-        Raises:
-            NotContractive: a gain of the wrong sign.
-            NotSupported: a model-referenced map, or one with a pairing of its own; a controller that predicts over the dead time
-                inside.
-            InvalidValue: a wrong number of lags; more than 1000 cycles of dead time; a scale that is not stated.
-        """
+        """Raise if the inner controller, the map or the pairing does not fit the problem."""
         self.controller.check(self.inner_problem(problem))
         form, name = self.deformation.form, type(self.deformation).__name__
         if automatic(self.deformation):

@@ -8,7 +8,6 @@ Theory: docs/theory.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import casadi as ca
 
@@ -80,8 +79,6 @@ class Estimating(ControllerWrapper):
             plan, which uses the estimate of the cycle in which it was made.
     """
 
-    once: ClassVar[bool] = True
-
     estimator: ParameterEstimator
     dead_time: DeadTime | None = field(default=None, kw_only=True)
     at_once: bool = field(default=False, kw_only=True)
@@ -113,13 +110,7 @@ class Estimating(ControllerWrapper):
         return (*notes, f"{text}from the measurement; name states: {', '.join(problem.plant.coordinates)}")
 
     def check(self, problem: Problem) -> None:
-        """Raise if the estimator or the wrapped controller does not fit the problem.
-
-        Raises:
-            FpirhcError: a check of the estimator or of the wrapped controller fails.
-            NotSupported: a controller that reads a response of its own; a response that nobody measures. `blocks` raises it for a
-                controller whose command does not depend on the model.
-        """
+        """Raise if the estimator or the wrapped controller does not fit the problem."""
         modelled = self.inner_problem(problem)
         self.estimator.check(modelled)
         self.controller.check(modelled)

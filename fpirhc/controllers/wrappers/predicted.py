@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import Literal
 
 import casadi as ca
 import numpy as np
@@ -55,8 +55,6 @@ class Predicted(ControllerWrapper):
         InvalidValue: a dead time that is negative or not finite.
     """
 
-    once: ClassVar[bool] = True
-
     inputs: NotNegative
     measurement: NotNegative = 0.0
     by: Literal["model", "desired"] = "model"
@@ -75,13 +73,7 @@ class Predicted(ControllerWrapper):
         return (*notes, f"Predicted follows set-points {late} late; give one that is known ahead so much earlier")
 
     def check(self, problem: Problem) -> None:
-        """Raise if the wrapped controller, the prediction or the dead time does not fit the problem.
-
-        Raises:
-            FpirhcError: the check of the wrapped controller fails.
-            NotSupported: desired responses do not move every state, or the controller's responses are others in turn.
-            InvalidValue: a dead time of more than 1000 cycles, or a residual of what is desired.
-        """
+        """Raise if the wrapped controller, the prediction or the dead time does not fit the problem."""
         self.controller.check(problem)
         plant, cycles = problem.plant, self._cycles(problem.period)
         free = (e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names)
