@@ -77,9 +77,14 @@ class Built:
         return Told(self.model.plant, self.model.signals, self.period)
 
     @cached_property
-    def seeing(self) -> tuple[list[Block], list[Delay]]:
-        """Blocks from the raw measurements to state, outputs and response, and what they remember."""
-        return seeing_blocks(self.problem)
+    def step(self) -> Composite:
+        """Sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
+
+        Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
+        """
+        (blocks, delays), (seeing, seen) = _blocks_of(self), seeing_blocks(self.problem)
+        reads, own = _reads(self, *self.sample), [*seeing, *_measuring(self, blocks), *blocks]
+        return _informed(self, reads, own, [*delays, *seen])
 
     def own_values(self, s: Signals) -> list[Expression]:
         """Return the reference's own signals inside a step."""
@@ -192,23 +197,6 @@ def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
     if plant.step is not None and any(every(form.lag)):
         yield f"{type(deformation).__name__}: a map has no lag; write an actuator as a state of the map"
-
-
-_COMPOSED: Latest[Composite] = Latest(4)
-
-
-def compose_with_sensing(built: Built) -> Composite:
-    """Return sensing and controller as one step: (memory, time, raw measurements, parameters) -> (memory, trace, command).
-
-    Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
-    """
-    return _COMPOSED.of((built,), (), lambda: _composed(built))
-
-
-def _composed(built: Built) -> Composite:
-    (blocks, delays), (seeing, seen) = _blocks_of(built), built.seeing
-    reads, own = _reads(built, *built.sample), [*seeing, *_measuring(built, blocks), *blocks]
-    return _informed(built, reads, own, [*delays, *seen])
 
 
 def _reads(built: Built, *seen: Signal) -> Layout:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
-from fpirhc.controllers.built import Built, build, compose_with_sensing
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
@@ -43,7 +43,7 @@ def close_loop(problem: Problem, controller: Controller, live: LiveSettings | No
 
 def _closed(built: Built) -> Composite:
     problem = built.problem
-    mover, inner = moving(problem), compose_with_sensing(built)
+    mover, inner = moving(problem), built.step
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
     samples = known_samples(problem) if lost or ranges else 0
     acting = Gate(problem, inner, simulated=True, ranges=ranges, loses=bool(lost), samples=samples)
@@ -73,7 +73,7 @@ def start_memory(
     signals = [signal for block in blocks for signal in block.memory.signals]
     signals += [*(delay.now for delay in mover.delays), controller.plant_model(problem).parameter]
     if INNER in loop.memory and plans_exactly(loop, problem, controller):
-        whole[loop.memory.slice(INNER)] = compose_with_sensing(build(problem, controller)).memory.start()
+        whole[loop.memory.slice(INNER)] = build(problem, controller).step.memory.start()
     # A graph has the estimator's memory inside the controller's one signal.
     places = {column.removeprefix(f"{INNER}."): k for k, column in enumerate(loop.memory.columns)}
     for signal in signals:

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built, build, compose_with_sensing
+from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import sensor_ranges
@@ -196,9 +196,8 @@ def composed_step(live: LiveSettings, ready: Controller, monitor: RunMonitor) ->
     gates: list[Gate] = []
 
     def compose(built: Built) -> Composite:
-        inner = compose_with_sensing(built)
         samples = known_samples(live.problem)
-        gates.append(Gate(live.problem, inner, ranges=sensor_ranges(live.problem), samples=samples))
+        gates.append(Gate(live.problem, built.step, ranges=sensor_ranges(live.problem), samples=samples))
         return machine_step(live.problem, ready, gates[-1], monitor)
 
     composite = live.composed(compose) if live.paths else compose(build(live.problem, ready))
