@@ -96,7 +96,6 @@ from .studies.variants import Grid as Grid
 from .symbolic.expression import signed_power as signed_power
 from .task.cases import Cases as Cases
 from .task.dead_time import DeadTime as DeadTime
-from .task.disturbance import ColouredNoise as ColouredNoise
 from .task.disturbance import Formula as Formula
 from .task.disturbance import Noise as Noise
 from .task.disturbance import Step as Step

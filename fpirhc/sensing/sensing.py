@@ -32,7 +32,7 @@ class Sensor(Checked):
     """Noise, quantisation, lost samples and range of one measured quantity.
 
     Args:
-        noise: signal that adds to the true value, in its unit: Noise, ColouredNoise, Step (bias), Formula (drift, hum);
+        noise: signal that adds to the true value, in its unit: Noise, Step (bias), Formula (drift, hum);
             None: no noise.
         quantum: Q, the resolution (of an encoder, for example), in the quantity's unit; None: no quantisation.
         dropout: probability that a cycle's sample is lost. A cycle in which one quantity is lost is skipped, as on a machine: the

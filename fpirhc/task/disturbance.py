@@ -11,14 +11,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import AboveZero, NotNegative, Range
+from fpirhc.fields.kinds import AboveZero, NotNegative
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.symbolic.layout import Expression
 
@@ -58,45 +57,26 @@ class Step(Disturbance):
 
 @dataclass(frozen=True)
 class Noise(Disturbance):
-    """White Gaussian noise, drawn from the run's seed.
-
-    Args:
-        deviation: standard deviation, in the unit of the disturbed signal.
-    """
-
-    deviation: NotNegative
-
-    def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        return random.normal(0.0, self.deviation, times.shape)
-
-
-_CORRELATION = Range(
-    "a positive number of seconds (for noise without correlation use Noise(deviation=...))", lambda v: 0 < v < math.inf
-)
-
-
-@dataclass(frozen=True)
-class ColouredNoise(Disturbance):
-    """Gaussian noise with the correlation exp(-|t - t'| / correlation_time).
+    """Gaussian noise, drawn from the run's seed: white, or with the correlation exp(-|t - t'| / correlation_time).
 
         v_k = c v_{k-1} + sqrt(1 - c^2) deviation w_k,     c = exp(-T / correlation_time),
 
-    begun in its stationary distribution. It needs equally spaced times.
+    begun in its stationary distribution; with correlation it needs equally spaced times.
 
     Args:
         deviation: standard deviation, in the unit of the disturbed signal.
-        correlation_time: s.
+        correlation_time: s; 0: white.
     """
 
     deviation: NotNegative
-    correlation_time: Annotated[float, _CORRELATION]
+    correlation_time: NotNegative = 0.0
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        white = random.normal(0.0, self.deviation, times.shape)
+        if not self.correlation_time or times.size < 2:
+            return white
         from scipy.signal import lfilter  # it takes longer to import than all the rest of a problem
 
-        white = random.normal(0.0, self.deviation, times.shape)
-        if times.size < 2:
-            return white
         decay = math.exp(-float(times[1] - times[0]) / self.correlation_time)
         white[1:] *= math.sqrt(1 - decay**2)
         return np.asarray(lfilter([1.0], [1.0, -decay], white))

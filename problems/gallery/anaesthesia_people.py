@@ -275,7 +275,7 @@ problem = fp.Problem(
     limits=fp.Limits(inputs={"target": (LEAST, MOST)}),
     input_before={"target": LEAST},
     signals={"surgery": fp.Unknown(surgery)},
-    sensing=fp.Sensing(sensors={"bis": fp.Sensor(noise=fp.ColouredNoise(3.0, correlation_time=0.1))}),
+    sensing=fp.Sensing(sensors={"bis": fp.Sensor(noise=fp.Noise(3.0, correlation_time=0.1))}),
     horizon=fp.Horizon(stages=20, step=0.25),
     cost=fp.Quadratic(states={"bis": 1.0}, rate={"target": 6000.0}),
     measure_from=10.0,

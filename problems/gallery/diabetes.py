@@ -258,7 +258,7 @@ problem = fp.Problem(
     signals={"carbs": fp.Unknown(carbs)},
     sensing=fp.Sensing(
         measured=("sensor",),
-        sensors={"sensor": fp.Sensor(noise=fp.ColouredNoise(11.7, correlation_time=8.1))},
+        sensors={"sensor": fp.Sensor(noise=fp.Noise(11.7, correlation_time=8.1))},
         observer=fp.KalmanFilter(measured={"sensor": 10.0}, noise={"gut": 1000.0, "Gp": 0.3}),
     ),
     horizon=fp.Horizon(stages=36, step=CYCLE),

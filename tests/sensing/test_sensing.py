@@ -68,7 +68,7 @@ def test_noise_gain_of_the_closed_loop(gain):
 def test_coloured_noise_has_its_deviation_and_memory():
     """Standard deviation and correlation exp(-T / correlation time), within four standard deviations."""
     times = 1e-3 * np.arange(200_000)
-    values = fp.ColouredNoise(deviation=2.0, correlation_time=5e-3).values(times, np.random.default_rng(0))
+    values = fp.Noise(deviation=2.0, correlation_time=5e-3).values(times, np.random.default_rng(0))
     decay = math.exp(-0.2)
     spread = 4 * math.sqrt(2 / times.size * (1 + decay**2) / (1 - decay**2))
     assert np.var(values) == pytest.approx(4.0, rel=spread)

@@ -38,7 +38,6 @@ def stepped(call: str, *arguments: Any) -> None:
 WRONG: dict[str, tuple[Any, str]] = {
     "deviation": (lambda: fp.Noise(-1.0), "Noise.deviation: expected a finite number of at least 0"),
     "no deviation": (lambda: fp.Noise(math.nan), "got nan"),
-    "correlation": (lambda: fp.ColouredNoise(1.0, 0.0), "correlation_time: expected a positive number"),
     "a number for noise": (lambda: fp.Sensor(noise=0.1), "Sensor.noise: expected a Disturbance or None, got 0.1"),  # type: ignore[arg-type]
     "quantum": (lambda: fp.Sensor(quantum=0.0), "Sensor.quantum: expected a finite number above 0"),
     "two mistakes": (lambda: fp.Sensor(quantum=-1.0, dropout=1.0), "dropout: expected a number from 0 to below 1"),

@@ -48,7 +48,7 @@ def sensed(estimator: Any, lost: float = 0.0) -> Callable[[], Loop]:
 
     def make() -> Loop:
         problem = fp.load_problem("two_mass").problem
-        sensor = fp.Sensor(noise=fp.ColouredNoise(1e-5, 1e-2), quantum=1e-5, dropout=lost)
+        sensor = fp.Sensor(noise=fp.Noise(1e-5, 1e-2), quantum=1e-5, dropout=lost)
         late = fp.DeadTime(inputs={"Q1": 0.002, "Q2": 0.001}, measurement=0.0015)
         return replace(problem, sensing=fp.Sensing({"q1": sensor, "q2": sensor}, estimator), dead_time=late), REFERENCED
 
