@@ -169,7 +169,7 @@ class Comparison(Study):
 
     def _facts(self) -> dict[str, Any]:
         rows = {
-            e.name: {"metrics": e.metrics.values, "cycle_us": e.cycle, "notes": e.notes, "stop": e.run.stop}
+            e.name: {"metrics": e.metrics.numbers, "cycle_us": e.cycle, "notes": e.notes, "stop": e.run.stop}
             for e in self.entries
         }
         found = [{"text": f.text, "outcome": f.outcome, "pair": f.pair, "ratios": f.ratios} for f in self.findings]
@@ -283,7 +283,7 @@ class _Rows:
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:
-    if not metrics.values.get("contraction.predicted"):
+    if not metrics.numbers.get("contraction.predicted"):
         return None
     spectrum, late = sampled_spectrum(problem, run), problem.response_delay
     growing, measured = (metrics[f"contraction.{n}"][""] for n in ("growing", "measured"))

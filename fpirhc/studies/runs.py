@@ -79,7 +79,7 @@ class Runner:
         errors = metrics.rms_error
         error = math.inf if run.stop else relative(errors, self._ranges)
         outcome = "ended early" if run.stop else "finished" if self._follows(one, errors, error) else "diverged"
-        flat = {m.key(element): value for m, element, value in metrics}
+        flat = {m.key(element): value for m, element, value in metrics.rows()}
         lasted = run.cycles / one.problem.cycles
         return {"outcome": outcome, "error": error, "lasted": lasted, **flat, "why": run.stop or ""}
 

@@ -120,7 +120,7 @@ def test_statuses_are_counted_and_the_worst_is_told():
 
 def of_plans(metrics) -> dict[str, float]:
     """The numbers of the optimiser by name."""
-    return {m.name.removeprefix("solve."): value for m, _, value in metrics if m.name.startswith("solve.")}
+    return {m.name.removeprefix("solve."): value for m, _, value in metrics.rows() if m.name.startswith("solve.")}
 
 
 def test_solves_are_summed_up_over_the_whole_run():
@@ -131,9 +131,10 @@ def test_solves_are_summed_up_over_the_whole_run():
     wanted = {"median_iterations": 5.5, "worst_iterations": 10, "median_stationarity": 5.5 / 9}
     assert of_plans(metrics) == pytest.approx({**wanted, "worst_stationarity": 10 / 9, "worst_feasibility": 10 / 81})
     assert metrics["plans"][""] == 10
-    assert [metrics.text(f"solve.{name}") for name in ("worst_iterations", "median_stationarity")] == ["10", "0.6"]
-    assert of_solves(np.zeros(CYCLES)).text("solve.worst_iterations") == "-"  # an optimiser that tells none
-    assert metrics.entries["solve.worst_iterations"].text(0.0) == "0"
+    said = {m.name: m.text(value) for m, _, value in metrics.rows()}
+    assert [said[f"solve.{name}"] for name in ("worst_iterations", "median_stationarity")] == ["10", "0.6"]
+    text = metrics.entries["solve.worst_iterations"].text
+    assert (text(0.0), text(of_solves(np.zeros(CYCLES))["solve.worst_iterations"][""])) == ("0", "-")  # it tells none
     assert of_plans(fp.measure(problem(), run(0.0))) == {}
 
 
@@ -215,7 +216,7 @@ def cut(source, cycles: int):
 def test_a_run_that_ended_at_once_has_no_numbers():
     solve = (Signal("solve", SOLVE), np.ones((CYCLES, 5)))
     metrics = fp.measure(problem(), cut(run(1.0, stop="signal 'x' is not finite", solve=solve), 0))
-    assert np.isnan([value for m, _, value in metrics if m.order < 70 and m.name != "cycles"]).all()
+    assert np.isnan([value for m, _, value in metrics.rows() if m.order < 70 and m.name != "cycles"]).all()
     assert of_plans(metrics) == {}
     assert metrics.statuses == {"NON_FINITE": 1}
     assert metrics["cycles"] == {"": 0}
@@ -257,7 +258,7 @@ def test_contraction_needs_ten_cycles(adaptive):
     task, result = adaptive
     for cycles, names in ((9, set()), (10, {"contraction.predicted", "contraction.growing", "contraction.measured"})):
         metrics = fp.measure(task, cut(result, cycles))
-        assert {m.name for m, _, _ in metrics if m.name.startswith("contraction")} == names
+        assert {m.name for m, _, _ in metrics.rows() if m.name.startswith("contraction")} == names
 
 
 def test_contraction_is_that_of_an_adapting_controller(adaptive):
@@ -284,7 +285,7 @@ def test_a_metric_is_one_value():
     """Measured, with its unit, and as it writes itself."""
     metrics = fp.measure(problem(), run(np.linspace(1.0, -0.25, CYCLES)), [OVERSHOOT])
     assert metrics["overshoot"] == {"y": 0.25}
-    assert metrics.text("overshoot", "y") == "0.25"
+    assert ("overshoot", "y", "0.25") in [(m.name, element, m.text(value)) for m, element, value in metrics.rows()]
     assert metrics.units["overshoot"]["y"] == "m"
     with pytest.raises(InvalidName, match="Did you mean 'overshoot'"):
         metrics["overshot"]
@@ -407,10 +408,10 @@ def test_metrics_come_from_other_processes_and_say_what_they_are_for():
     problem = replace(task.problem, duration=0.05, measure_from=0.0)
     metrics = fp.measure(problem, fp.simulate(problem, task.controllers["RHC+FPI"], seed=0, compiled=False))
     again = pickle.loads(pickle.dumps(metrics))
-    assert [(m.name, e, repr(v)) for m, e, v in again] == [(m.name, e, repr(v)) for m, e, v in metrics]
+    assert repr(dict(again)) == repr({name: metrics[name] for name in metrics}) == repr(dict(metrics.items()))
     assert all(again.entries[name] is metric for name, metric in metrics.entries.items())
     found = {}
-    for m in dict.fromkeys(metric for metric, _, _ in metrics):
+    for m in dict.fromkeys(metric for metric, _, _ in metrics.rows()):
         marks = zip("hrs", (m.main, m.report, m.always), strict=True)
         found[m.name] = "".join(letter for letter, on in marks if on)
     assert list(found.items()) == list(MEANT.items())

@@ -31,7 +31,6 @@ Better = Literal["smaller", "larger", "neither"]
 Function = Callable[[Problem, Run], float | Mapping[str, float] | None]
 
 RELATIVE_ERROR = "relative error"  # by which controllers are compared where no metric is named
-
 _NAME = re.compile(r"[a-z][a-z0-9_]*(\.[a-z][a-z0-9_]*)?")
 
 
@@ -156,8 +155,7 @@ def input_unit(problem: Problem, name: str) -> str:
 
 
 GROUP = "fpirhc.metrics"  # of entry points; each leads to a Metric or to a tuple of them
-# Files hold other facts of a run under these names.
-_TAKEN = frozenset({"compiled", "cycle_us", "notes", "optimality", "outcome", "plan", "statuses", "stop"})
+_TAKEN = frozenset({"compiled", "cycle_us", "notes", "optimality", "outcome", "plan", "statuses", "stop"})  # by files
 
 
 @cache
@@ -197,37 +195,39 @@ def _ordered(metrics: Iterable[Metric]) -> tuple[Metric, ...]:
 
 
 @dataclass(frozen=True)
-class Metrics(FoundByName):
-    """The metrics of one run.
+class Metrics(FoundByName, Mapping[str, Mapping[str, float]]):
+    """The metrics of one run: numbers by metric and element; a single number has the element ''.
 
         metrics["overshoot"]["q1"], metrics["at_limit"][""], metrics.rms_error["q1"]
 
     Args:
-        values: numbers by metric and element; a single number has the element ''. Metrics that the run does not have are left out.
+        numbers: what it is a mapping of. Metrics that the run does not have are left out.
         units: units by metric and element.
         entries: the metrics that were measured, by name.
         broken: sentences about those whose function raised an error, by name; they have no numbers.
     """
 
-    values: Mapping[str, Mapping[str, float]]
+    numbers: Mapping[str, Mapping[str, float]]
     units: Mapping[str, Mapping[str, str]]
     entries: Mapping[str, Metric]
     broken: Mapping[str, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Mapping[str, float]:
         if isinstance(name, str) and name in self.entries:
-            return self.values.get(name) or ByName({}, f"Metrics[{name!r}]")
+            return self.numbers.get(name) or ByName({}, f"Metrics[{name!r}]")
         raise InvalidName(f"metric '{name}' is unknown.{nearest(name, self.entries)}")
 
-    def __iter__(self) -> Iterator[tuple[Metric, str, float]]:
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.numbers)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def rows(self) -> Iterator[tuple[Metric, str, float]]:
         """Yield every number as (metric, element, number)."""
-        for name, numbers in self.values.items():
+        for name, numbers in self.items():
             for element, value in numbers.items():
                 yield self.entries[name], element, value
-
-    def text(self, name: str, element: str = "") -> str:
-        """Return one number as text, as its metric writes it."""
-        return self.entries[name].text(self[name][element])
 
     @property
     def rms_error(self) -> Mapping[str, float]:
@@ -250,7 +250,7 @@ class Metrics(FoundByName):
         return max((Status[name] for name in self.statuses), default=Status.OK, key=lambda s: s.severity).name
 
     def __repr__(self) -> str:
-        facts = (f"{metric.heading} {element} {metric.text(value)}" for metric, element, value in self if metric.main)
+        facts = (f"{m.heading} {element} {m.text(value)}" for m, element, value in self.rows() if m.main)
         return line(self, *(" ".join(fact.split()) for fact in facts), f"worst {self.worst_status}")
 
 
@@ -326,7 +326,7 @@ def columns(runs: Sequence[Metrics], wanted: Callable[[Metric], bool] = in_repor
     """Return the columns of a table of these runs and of the wanted metrics, without numbers that no run has."""
     shown: dict[tuple[str, str], Column] = {}
     for metrics in runs:
-        for metric, element, _ in metrics:
+        for metric, element, _ in metrics.rows():
             if wanted(metric) and (metric.shown is None or element in metric.shown):
                 shown.setdefault((metric.name, element), Column(metric, element, metrics.units[metric.name][element]))
     return sorted(shown.values(), key=lambda column: column.metric.order)
