@@ -42,7 +42,7 @@ from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status
-from fpirhc.symbolic.paths import entry, names_in
+from fpirhc.symbolic.dotted import entry, names_in
 from fpirhc.task.exogenous import really_known
 from fpirhc.task.problem import Problem
 

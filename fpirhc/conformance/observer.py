@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.conformance.laws import Array, Broken, Draw, keep, two_masses, within
-from fpirhc.controllers.path import observed_model
+from fpirhc.controllers.believed import observed_model
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.base import Evidence, Measured, Model, StateObserver, unobservable, values_of
 from fpirhc.sensing.sensing import Sensing

@@ -11,9 +11,9 @@ from functools import reduce
 
 import casadi as ca
 
+from fpirhc.controllers.believed import model_block
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Controller as Controller
-from fpirhc.controllers.path import model_block
 from fpirhc.deformation.base import Deformation, Form
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.plant import Plant

@@ -17,8 +17,8 @@ from functools import cached_property
 import casadi as ca
 
 from fpirhc.contraction.delayed import require_converging
+from fpirhc.controllers.believed import ACTED, NOW, Pairs, Path, Told, believed_path, measured
 from fpirhc.controllers.contract import Controller, PlantModel, resolved
-from fpirhc.controllers.path import ACTED, NOW, Pairs, Path, Told, believed_path, measured
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers

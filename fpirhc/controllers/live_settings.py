@@ -21,10 +21,10 @@ from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.kinds import described, real_number
 from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.dotted import changed_at, content_at, entry, levels, meant, names_in, paths_to
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.open import ANEW, Opened, not_live
-from fpirhc.symbolic.paths import changed_at, content_at, entry, levels, meant, names_in, paths_to
 from fpirhc.task.cases import is_whole
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem

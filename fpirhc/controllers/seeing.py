@@ -12,8 +12,8 @@ from functools import lru_cache, partial
 import casadi as ca
 import numpy as np
 
+from fpirhc.controllers.believed import believe_block, stated_path
 from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.path import believe_block, stated_path
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
 from fpirhc.errors import NoAnswer
 from fpirhc.plant.maps import growth_rates

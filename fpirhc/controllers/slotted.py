@@ -16,9 +16,9 @@ from typing import NamedTuple
 import casadi as ca
 
 from fpirhc.controllers.base import Controller, judge_block, reference_block, warm_up_block
+from fpirhc.controllers.believed import measured
 from fpirhc.controllers.built import Built, build, checked, with_aim
 from fpirhc.controllers.contract import resolved
-from fpirhc.controllers.path import measured
 from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import Mistakes, NotSupported

@@ -27,15 +27,15 @@ from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.loop import start_memory
-from fpirhc.simulation.path import moving
+from fpirhc.simulation.moved import moving
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.sensed import loses
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables
 from fpirhc.simulation.trials import warn_of_harm
+from fpirhc.symbolic.dotted import changed_at, paths_to
 from fpirhc.symbolic.driver import SIGNATURE
-from fpirhc.symbolic.paths import changed_at, paths_to
 from fpirhc.task.problem import Problem
 from fpirhc.whole_file import write_whole
 

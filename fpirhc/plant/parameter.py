@@ -17,7 +17,7 @@ from typing import Annotated
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked, checked_call
 from fpirhc.fields.kinds import JudgedByOwner, Range, finite_number, real_number
-from fpirhc.symbolic.paths import copied
+from fpirhc.symbolic.dotted import copied
 
 
 @dataclass(frozen=True)

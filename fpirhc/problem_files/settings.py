@@ -11,7 +11,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
-from fpirhc.symbolic.paths import changed_at, content_at, mapped, names_in
+from fpirhc.symbolic.dotted import changed_at, content_at, mapped, names_in
 from fpirhc.task.cases import PARAMETERS, START, Cases, check_change
 from fpirhc.task.problem import Problem
 

@@ -22,8 +22,8 @@ from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.ranges import TOLERANCE, hard_limits
 from fpirhc.status import Status
 from fpirhc.summary import written_out
+from fpirhc.symbolic.dotted import paths_to
 from fpirhc.symbolic.driver import compiled_plans
-from fpirhc.symbolic.paths import paths_to
 
 MINOR, ROUNDING, NEAR, BAD = 1e-3, 1e-6, 0.2, 1.0  # added error as a share of the largest; errors as shares of the task
 MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loop; push that latency leaves; of a limit

@@ -18,7 +18,7 @@ from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.gate import INNER, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
-from fpirhc.simulation.path import acting_blocks, moving, outside_blocks
+from fpirhc.simulation.moved import acting_blocks, moving, outside_blocks
 from fpirhc.simulation.replay import known_samples
 from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
 from fpirhc.simulation.tables import disturbance_signals

@@ -14,7 +14,7 @@ from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import followed_units
 from fpirhc.sensing.base import backward_difference, combine
-from fpirhc.simulation.path import HELD, Mover, moving, real_signals
+from fpirhc.simulation.moved import HELD, Mover, moving, real_signals
 from fpirhc.symbolic.block import Block, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector

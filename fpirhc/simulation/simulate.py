@@ -21,7 +21,7 @@ from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.loop import close_loop, plans_exactly, start_memory
-from fpirhc.simulation.path import Exchange, moving
+from fpirhc.simulation.moved import Exchange, moving
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns

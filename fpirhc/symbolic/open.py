@@ -19,8 +19,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, NotSupported
+from fpirhc.symbolic.dotted import copied
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.paths import copied
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 SETTINGS = "settings"  # the signal of all open numbers of a loop

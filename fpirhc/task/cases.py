@@ -17,7 +17,7 @@ from fpirhc.errors import InvalidName, InvalidValue, Mistakes, nearest
 from fpirhc.fields.checked import Checked, checked_call, expects_whole_number
 from fpirhc.fields.kinds import described, finite_number
 from fpirhc.summary import line
-from fpirhc.symbolic.paths import changed_at, content_at, mapped
+from fpirhc.symbolic.dotted import changed_at, content_at, mapped
 from fpirhc.task.problem import Problem
 
 EVERY = "all"  # names every case

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.believed import Pairs
 from fpirhc.controllers.built import Built, compose_controller, dependencies_of_command, embedded
 from fpirhc.controllers.contract import ControllerWrapper, Planner, PlantModel, innermost, with_field
-from fpirhc.controllers.path import Pairs
 from fpirhc.errors import require
 from fpirhc.learning.disturbance_kalman import DisturbanceKalman
 from fpirhc.learning.estimators import ParameterEstimator, Seen
@@ -69,7 +69,7 @@ _MODELLED: Latest[Problem] = Latest(8)
 class Estimating(ControllerWrapper):
     """The wrapped controller with the parameters of its model corrected every cycle.
 
-    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.path`.
+    Behind dead time or an estimator, a response belongs to an older state and command; see `fpirhc.controllers.believed`.
 
     Args:
         controller: any controller that uses its model.

@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.believed import measured
 from fpirhc.controllers.built import Built, compose_controller, embedded
 from fpirhc.controllers.contract import ControllerWrapper
-from fpirhc.controllers.path import measured
 from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example

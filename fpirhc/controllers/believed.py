@@ -9,7 +9,7 @@
 | a learner | the state and the command of a response | `Pairs` |
 
 A model is compared with a response that ends a cycle, so it is given the signals from outside of the last cycle. Its dead times are
-whole cycles, those of the plant may be any. What really moves is in `fpirhc.simulation.path`. Theory: docs/theory.md.
+whole cycles, those of the plant may be any. What really moves is in `fpirhc.simulation.moved`. Theory: docs/theory.md.
 """
 
 from __future__ import annotations
