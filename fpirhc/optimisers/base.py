@@ -133,23 +133,16 @@ def stationarity(ocp: OptimalControl, inputs: ca.MX, gradient: ca.MX, lower: ca.
     return _largest(inputs - clip(inputs - scale * gradient, lower, upper))
 
 
-def _state_violation(ocp: OptimalControl, states: ca.MX, factors: np.ndarray | None = None) -> ca.MX:
-    """Return the largest violation of a hard state bound by s_1 ... s_N, times its factor; zero without bounds."""
-    times = np.ones(ocp.state.size) if factors is None else factors
+def state_violation(ocp: OptimalControl, states: ca.MX, units: np.ndarray) -> ca.MX:
+    """Return the largest violation of a hard state bound by s_1 ... s_N in these units (ns,); zero without bounds."""
     worst: ca.MX = ca.MX(0)
     for k in np.flatnonzero(ocp.hard).tolist():
         row = states[k, 1:]
         if ocp.state_lower[k] > -FINITE:
-            worst = ca.fmax(worst, times[k] * ca.mmax(ocp.state_lower[k] - row))
+            worst = ca.fmax(worst, ca.mmax(ocp.state_lower[k] - row) / units[k])
         if ocp.state_upper[k] < FINITE:
-            worst = ca.fmax(worst, times[k] * ca.mmax(row - ocp.state_upper[k]))
+            worst = ca.fmax(worst, ca.mmax(row - ocp.state_upper[k]) / units[k])
     return worst
-
-
-def counted(ocp: OptimalControl, violation: ca.MX, states: ca.MX) -> ca.MX:
-    """Return the violation that the status counts, as a multiple of what is kept of limits of size one."""
-    times = FEASIBLE / feasible_to(ocp)
-    return violation if (times == 1).all() else _state_violation(ocp, states, times)
 
 
 def feasible_to(ocp: OptimalControl) -> np.ndarray:
@@ -191,7 +184,11 @@ def judge(ocp: OptimalControl) -> ca.Function:
     if ocp.bounds_states:
         valid = _valid_multipliers(ocp, rollout(ocp)(s0, inputs, data)[0], multipliers)
     value, slope, states, _ = reduced_gradient(ocp)(s0, inputs, data, valid)
-    results = [value, stationarity(ocp, inputs, slope, lower, upper), _state_violation(ocp, states)]
+    results = [
+        value,
+        stationarity(ocp, inputs, slope, lower, upper),
+        state_violation(ocp, states, np.ones(ocp.state.size)),
+    ]
     return ca.Function("fpirhc_judge", [inputs, s0, data, lower, upper, multipliers], results)
 
 
@@ -225,7 +222,7 @@ def status_of(finite: Matrix, residual: Matrix, violation: Matrix | float, toler
 
     Args:
         finite: whether the plan and its numbers are finite.
-        violation: the largest violation of a state bound, as `counted`.
+        violation: the largest violation of a state bound, in the units of the states.
     """
     converged = ca.if_else(residual <= tolerance, int(Status.OK), int(Status.NOT_CONVERGED))
     feasible = ca.if_else(violation <= FEASIBLE, converged, int(Status.INFEASIBLE))
@@ -261,17 +258,16 @@ def improved(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Improve a plan until it is OK or its violation stays; return the plan, diagnostics of all calls, memory, number of calls."""
     fixed = np.asarray(ca.DM(data).full()), ocp.input_lower, ocp.input_upper
-    status, count, iterations, violation, stuck = Status.NOT_CONVERGED, 0, 0.0, np.inf, 0
-    inputs, diagnostics = np.zeros((ocp.input.size, ocp.stages)), np.zeros(5)
-    while status in (Status.NOT_CONVERGED, Status.INFEASIBLE) and stuck < _PATIENCE and count < calls:
-        results = worked(optimiser, ocp, (state, *fixed, memory))
-        inputs, diagnostics, memory = results[0], results[1].ravel(), results[2].ravel()
-        iterations += diagnostics[3]
-        status, count = Status(int(diagnostics[4])), count + 1
+    count, iterations, violation, stuck = 0, 0.0, np.inf, 0
+    while True:
+        inputs, numbers, remembered = worked(optimiser, ocp, (state, *fixed, memory))
+        diagnostics, memory = numbers.ravel(), remembered.ravel()
+        count, iterations, status = count + 1, iterations + diagnostics[3], Status(int(diagnostics[4]))
         better = status == Status.NOT_CONVERGED or diagnostics[2] < _SHRINKING * violation
         stuck, violation = (0 if better else stuck + 1), min(violation, diagnostics[2])
-    diagnostics[3] = iterations if diagnostics[3] >= 0 else diagnostics[3]
-    return inputs, diagnostics, memory, count
+        if status not in (Status.NOT_CONVERGED, Status.INFEASIBLE) or stuck >= _PATIENCE or count >= calls:
+            diagnostics[3] = max(iterations, UNKNOWN_ITERATIONS)
+            return inputs, diagnostics, memory, count
 
 
 def worked(optimiser: Optimiser, ocp: OptimalControl, call: Columns) -> Columns:

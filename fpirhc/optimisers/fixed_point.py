@@ -109,9 +109,7 @@ class FixedPoint(Optimiser):
     def improve(self, ocp: OptimalControl, call: Columns) -> Columns:
         """Return the results of a call of `converging`, or better ones where it does not end OK."""
         results: Columns = [np.asarray(v.full()) for v in built(self, ocp, self.converging)(*call)]
-        state, data, lower, upper, _ = call
-        posed = np.isfinite(state).all() and np.isfinite(data).all() and (lower <= upper).all()
-        if results[1][4, 0] != Status.OK and posed and not ocp.bounds_states:
+        if results[1][4, 0] != Status.OK and not ocp.bounds_states:
             with contextlib.suppress(NotInstalled, CompileError):
                 limited = limited_step(ocp, self._limited(ocp, _MOST_LIMITED))
                 return _better(ocp, self.memory(ocp), limited, call, results)
@@ -152,8 +150,7 @@ def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Col
     Where a plan was remembered, that of the plain iteration is the first guess of the other one, which else has its own.
     """
     before, after, own, ns = call[4], first[2].ravel(), limited_memory(ocp), ocp.state.size
-    evaluated, begin = first[1][4, 0] < Status.INFEASIBLE, own.start()
-    warm = evaluated and before[layout.slice("plan_step")][0] > 0
+    warm, begin = first[1][4, 0] < Status.INFEASIBLE and before[layout.slice("plan_step")][0] > 0, own.start()
     begin[own.slice("plan_inputs")] = (after if warm else before)[layout.slice("plan_inputs")]
     if warm:
         states = after[layout.slice("plan_states")]
@@ -161,8 +158,7 @@ def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Col
         begin[own.slice("plan_gains")] = after[layout.slice("plan_gains")]
         begin[own.slice("plan_barrier")] = MU_WARM
     inputs, numbers, remembered = (np.asarray(v.full()) for v in limited(*call[:4], begin))
-    closer = numbers[4, 0] == Status.OK or not evaluated or numbers[1, 0] < first[1][1, 0]
-    if numbers[4, 0] >= Status.INFEASIBLE or not closer:
+    if (numbers[4, 0], numbers[1, 0]) >= (first[1][4, 0], first[1][1, 0]):  # status, then stationarity
         return first
     numbers[3, 0] += first[1][3, 0]
     memory = layout.start()

@@ -23,12 +23,13 @@ from fpirhc.optimisers.base import (
     Optimiser,
     call_arguments,
     clip,
-    counted,
     judge,
     refuse_limits,
     remembered_plan,
     sane,
     shift,
+    state_units,
+    state_violation,
     status_of,
 )
 from fpirhc.optimisers.state_limits import scales
@@ -141,7 +142,7 @@ class MultipleShooting(Optimiser):
         finite = is_finite(ca.vertcat(ca.vec(inputs), cost, residual, violation, solution["lam_x"], solution["lam_g"]))
         plan = ca.if_else(finite, inputs, start)
         numbers = ca.if_else(finite, ca.vertcat(cost, residual, violation), ca.MX.zeros(3))
-        counts = counted(ocp, violation, rollout(ocp)(s0, inputs, data)[0])
+        counts = state_violation(ocp, rollout(ocp)(s0, inputs, data)[0], state_units(ocp))
         status = status_of(finite, residual, counts, self.tolerance)
         next_parts = {
             "plan_inputs": ca.vec(plan),

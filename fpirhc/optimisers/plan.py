@@ -173,10 +173,8 @@ def solve(
     return Plan(
         inputs,
         states,
-        float(diagnostics[0]) if known else None,
-        float(diagnostics[1]) if known else None,
-        float(diagnostics[2]) if known else None,
-        float(diagnostics[3]) if diagnostics[3] >= 0 else -1.0,
+        *(float(v) if known else None for v in diagnostics[:3]),
+        float(diagnostics[3]),
         count,
         status,
         ocp,
@@ -224,7 +222,7 @@ def _fit_multipliers(ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray,
     near, least, most = _AT_BOUND * (1 + np.abs(inputs)), ocp.input_lower[:, None], ocp.input_upper[:, None]
     free = ~((inputs <= least + near) | (inputs >= most - near)).ravel(order="F")
     # Rows in the units of the stationarity, so that the fit weighs what is judged.
-    weight = np.tile(1 / (ocp.step * ocp.curvature), ocp.stages)[free]
+    weight = np.tile(ocp.scale, ocp.stages)[free]
     columns = weight[:, None] * sensitivity.T[free]
     signed = np.hstack([columns[:, upper], -columns[:, lower]])
     if not signed.size or not np.isfinite(sensitivity).all():
