@@ -84,8 +84,7 @@ class Contraction:
         one, factor = self.report, f"Measured factor {written_out(self.measured)}"
         if one.admissible:  # a fit is right within two hundredths
             factor += ": the bound does not hold in this run" * (self.measured > one.predicted + 0.02)
-            held = run.stop is None and run.controller not in lost
-            factor = f"Admissible: {one.admissible}. {factor}" if held else factor
+            factor = factor if run.controller in lost else f"Admissible: {one.admissible}. {factor}"
         return f"{one.text}. {factor}; realised - desired, rms: {', '.join(each)}."
 
 
@@ -164,6 +163,7 @@ class Comparison(Study):
         null = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
         lists = {"Notes": notes, f"Null tests: {NULL}": null}
         lost = {f.pair[1] for f in self.findings if f.pair and f.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)}
+        lost |= {e.name for e in self.entries if e.run.stop}
         lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run, lost)}" for e in self.entries if e.contraction]
         return View(self, sentences, about, (table.filled,), self._facts(), lists)
 
