@@ -169,11 +169,13 @@ def solve(
         inputs, diagnostics, _, count = improved(optimiser, ocp, state, data, memory, calls=calls)
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     status = Status(int(diagnostics[4]))
-    known = status != Status.NON_FINITE
+    cost, residual, violation = (float(v) if status != Status.NON_FINITE else None for v in diagnostics[:3])
     return Plan(
         inputs,
         states,
-        *(float(v) if known else None for v in diagnostics[:3]),
+        cost,
+        residual,
+        violation,
         float(diagnostics[3]),
         count,
         status,
