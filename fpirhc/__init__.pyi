@@ -1,7 +1,7 @@
 """The public names; `__init__.py` imports each when it is first used."""
 
 from .baselines.baseline import check as check
-from .certificate.limits import certify_limits as certify_limits
+from .certificate import certify_limits as certify_limits
 from .controllers import rivals as rivals
 from .controllers.computed_torque import ComputedTorque as ComputedTorque
 from .controllers.computed_torque import FeedforwardOnly as FeedforwardOnly
@@ -71,9 +71,9 @@ from .sensing.kalman_filter import KalmanFilter as KalmanFilter
 from .sensing.sensing import Sensing as Sensing
 from .sensing.sensing import Sensor as Sensor
 from .simulation.machine import RunMonitor as RunMonitor
+from .simulation.metrics import Metric as Metric
 from .simulation.metrics import figures as figures
-from .simulation.metrics.base import Metric as Metric
-from .simulation.metrics.base import measure as measure
+from .simulation.metrics import measure as measure
 from .simulation.pictures import OverTime as OverTime
 from .simulation.pictures import Planar as Planar
 from .simulation.pictures import Portrait as Portrait

@@ -26,7 +26,7 @@ def _task(problem: str, settings: Sequence[str] | None = None, controllers: Sequ
 
 def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -> None:
     from fpirhc.report.terminal import show
-    from fpirhc.studies.view import to_json
+    from fpirhc.studies import to_json
     from fpirhc.whole_file import write_whole
 
     facts = to_json(view.facts)
@@ -102,8 +102,8 @@ def review(
 
     from fpirhc.report.terminal import show_review
     from fpirhc.review.review import review as ask
+    from fpirhc.studies import to_json
     from fpirhc.studies.compare import select
-    from fpirhc.studies.view import to_json
 
     found = ask(task.problem, select(task, controllers), mismatch=mismatch, seed=seed)
     if json:
@@ -140,7 +140,7 @@ def run(
     from fpirhc.controllers.contract import resolved
     from fpirhc.report.html import save_figure
     from fpirhc.report.terminal import announce_backend, progress_bars, say, show_run
-    from fpirhc.simulation.metrics.base import measure
+    from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
     from fpirhc.studies.variants import Draws
 
@@ -255,8 +255,8 @@ def probe(
     from fpirhc.errors import NotSupported, require
     from fpirhc.probing import probe as probing
     from fpirhc.report.terminal import progress_bars, show_probe
+    from fpirhc.studies import to_json
     from fpirhc.studies.compare import select
-    from fpirhc.studies.view import to_json
 
     able = list[str]()
     for name, one in select(task, [controller] if controller else None).items():
@@ -410,7 +410,7 @@ def export(
     """Write a controller for use without Python. C99 for a device, a unit of FMI 2, WebAssembly, or a page with sliders."""
     task = _task(problem)
     from fpirhc.errors import InvalidName
-    from fpirhc.export.device import device_of, targets, write
+    from fpirhc.export import device_of, targets, write
     from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.compare import select
 

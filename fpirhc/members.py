@@ -40,7 +40,7 @@ FAMILIES: Mapping[str, Family] = {
     "tracking laws": Family("fpirhc.tracking.base:Tracking", ("fpirhc.tracking",)),
     "derivative estimators": Family("fpirhc.sensing.base:DerivativeEstimator", ("fpirhc.sensing",)),
     "observers": Family("fpirhc.sensing.base:StateObserver", ("fpirhc.sensing",)),
-    "optimisers": Family("fpirhc.optimisers.base:Optimiser", ("fpirhc.optimisers",)),
+    "optimisers": Family("fpirhc.optimisers:Optimiser", ("fpirhc.optimisers",)),
     "controllers": Family("fpirhc.controllers.base:Controller", ("fpirhc.controllers",)),
     "estimators": Family("fpirhc.learning.estimators:ParameterEstimator", ("fpirhc.learning",)),
     "adaptation rules": Family("fpirhc.learning.rules:Rule", ("fpirhc.learning",)),

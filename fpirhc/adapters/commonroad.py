@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, counterparts, derivatives, steps_per_cycle
+from fpirhc.adapters import adapter, counterparts, derivatives, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.chain import quantities

@@ -11,7 +11,7 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-from fpirhc.adapters.names import adapter, counterparts, other_types, require
+from fpirhc.adapters import adapter, counterparts, other_types, require
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, counterparts, derivatives, from_path_or_text, require, steps_per_cycle
+from fpirhc.adapters import adapter, counterparts, derivatives, from_path_or_text, require, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant

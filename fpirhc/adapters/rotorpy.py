@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, finite_numbers, require_seconds
+from fpirhc.adapters import adapter, finite_numbers, require_seconds
 from fpirhc.errors import Mistakes, package
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.plant.chain import quantities

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters.names import adapter, require, require_seconds
+from fpirhc.adapters import adapter, require, require_seconds
 from fpirhc.errors import Mistakes, package
 from fpirhc.fields.kinds import Finite
 from fpirhc.plant.plant import Plant

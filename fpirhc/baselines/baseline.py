@@ -22,10 +22,10 @@ from fpirhc.errors import BaselineError, not_writable
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.shipped import missing
+from fpirhc.studies import Progress, versions
 from fpirhc.studies.compare import select
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import Variant, Variants
-from fpirhc.studies.view import Progress, versions
 from fpirhc.whole_file import write_whole
 
 FACTOR, TIGHT, SEEDS = 3.0, 1e-6, 8  # of the spread, of the value, and of noise

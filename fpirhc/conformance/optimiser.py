@@ -17,7 +17,7 @@ from fpirhc.fields.kinds import Range, Seed
 from fpirhc.horizon.cost import Horizon, LQRTerminal, Quadratic
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser, worked
+from fpirhc.optimisers import FEASIBLE, UNKNOWN_ITERATIONS, Optimiser, worked
 from fpirhc.plant.plant import Parameter, Plant
 from fpirhc.status import Status
 from fpirhc.symbolic.layout import Layout

@@ -32,7 +32,7 @@ from fpirhc.tracking.base import Tracking
 
 if TYPE_CHECKING:
     from fpirhc.controllers.built import Built
-    from fpirhc.optimisers.base import Optimiser
+    from fpirhc.optimisers import Optimiser
 
 Deforms = Literal["response", "command", "target", "turns"]
 

@@ -16,11 +16,10 @@ from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.horizon.cost import Cost
-from fpirhc.horizon.nominal import consistent_state
+from fpirhc.horizon.nominal import consistent_state, offset_limits, shifted_reference
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import offset_limits, shifted_reference
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.optimisers.base import Optimiser, built, first_memory
+from fpirhc.optimisers import Optimiser, built, first_memory
 from fpirhc.optimisers.fixed_point import FixedPoint
 from fpirhc.plant.chain import without_disturbances
 from fpirhc.plant.integrators import USUAL

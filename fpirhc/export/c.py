@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
 from fpirhc.errors import InvalidValue, NotInstalled
-from fpirhc.export.device import Device, Target, identifiers, in_comment, literal, recorded, shared_library
+from fpirhc.export import Device, Target, identifiers, in_comment, literal, recorded, shared_library
 from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.replay import CLOCK_MEMORY, LONGEST

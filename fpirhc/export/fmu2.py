@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from fpirhc.errors import package
+from fpirhc.export import Device, Target, shared_library
 from fpirhc.export.c import data_of, filled, sources
-from fpirhc.export.device import Device, Target, shared_library
 from fpirhc.symbolic.layout import Layout
 
 

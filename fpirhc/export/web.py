@@ -20,8 +20,8 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, package, require
+from fpirhc.export import Device, Target, c_of, literal, recorded, web_module
 from fpirhc.export.c import data_of, filled, layout_of, sources, template
-from fpirhc.export.device import Device, Target, c_of, literal, recorded, web_module
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset

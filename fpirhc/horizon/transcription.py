@@ -18,9 +18,8 @@ import numpy as np
 from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.cost import Cost, Horizon, Linearisation, View, outputs_of, reads_feedforward, view_of
-from fpirhc.horizon.nominal import nominal_motion, reference_state
+from fpirhc.horizon.nominal import data_layout, hastened, nominal_motion, reference_state, setting_rows, stage_data
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
-from fpirhc.horizon.stage_data import data_layout, hastened, setting_rows, stage_data
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.integrators import spurious_growth
 from fpirhc.plant.maps import by_single_steps, steps_in

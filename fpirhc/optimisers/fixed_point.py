@@ -1,13 +1,14 @@
 """Fixed-point iteration on the reduced gradient, preconditioned by one Riccati sweep: the default optimiser.
 
 U+ = G(U, h, 0) with h = M^-1 g deforms the plan as a control loop deforms its request (docs/theory.md). With limits of
-states the iteration is that of `fpirhc.optimisers.state_limits`; it ends where the plan is solved, in a loop as in open loop.
+states, and where its plain iteration does not contract, it is that of state_limits.c, which ends where the plan is solved.
 """
 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib import resources
 
 import casadi as ca
 import numpy as np
@@ -17,13 +18,189 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import CompileError, InvalidValue, NotInstalled, require
 from fpirhc.fields.kinds import Count, NotNegative, Positive
-from fpirhc.horizon.hessian_models import GaussNewton, HessianModel
+from fpirhc.horizon.hessian_models import (
+    ExactHessian,
+    GaussNewton,
+    HessianModel,
+    hessian_end,
+    hessian_stage,
+    partial_count,
+    split_hessian,
+    split_stage,
+)
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import Columns, Optimiser, built, paid, require_compiler
+from fpirhc.optimisers import (
+    FEASIBLE,
+    KEPT,
+    LAST,
+    Columns,
+    Optimiser,
+    Scales,
+    built,
+    compiled_plan,
+    paid,
+    require_compiler,
+    scales,
+    shift,
+    shift_gains,
+    with_last,
+)
 from fpirhc.optimisers.plain import CLOSE, PlainSettings, plain_memory, plain_step, shifted_plain
-from fpirhc.optimisers.state_limits import MU_WARM, LimitedSettings, limited_memory, limited_step, shifted_limited
+from fpirhc.optimisers.search import deformed_move
 from fpirhc.status import Status
-from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.driver import Driver
+from fpirhc.symbolic.evaluate import Latest
+from fpirhc.symbolic.expression import FINITE
+from fpirhc.symbolic.layout import Layout, Signal, scalar
+
+MU_WARM = 1e-4  # barrier parameter of a remembered plan, in units of the cost
+_TEXTS = ("kernels", "state_limits_sweep", "state_limits")
+
+
+@dataclass(frozen=True)
+class LimitedSettings:
+    """Settings of one Function."""
+
+    tolerance: float  # of the stationarity, in the unit of the inputs
+    map: Deformation  # the deformation of pure steps
+    hessian: (
+        HessianModel | None
+    )  # second derivatives; None: exact, and Gauss-Newton first where a remembered plan is improved
+    damping: float  # added to the curvature of the inputs, in units of it
+    iterations: int  # most iterations of one call
+
+
+def limited_memory(ocp: OptimalControl) -> Layout:
+    """Return the layout of plan, states, costates, feedback, multipliers, mu (zero: no plan is remembered) and damping."""
+    n, states, inputs = range(ocp.stages), ocp.state.elements, ocp.input.elements
+    rows = (*inputs, *(states[k] for k in scales(ocp).bounded))
+    later = tuple(f"{e}@{k + 1}" for k in n for e in states)
+    multipliers = tuple(f"{side} {e}@{k}" for side in ("lower", "upper") for k in n for e in rows)
+    return Layout(
+        (
+            Signal("plan_inputs", tuple(f"{e}@{k}" for k in n for e in inputs)),
+            Signal("plan_states", later),
+            Signal("plan_costates", later),
+            Signal("plan_gains", tuple(f"{e}/{x}@{k}" for k in n for x in states for e in inputs)),
+            Signal("plan_multipliers", multipliers),
+            scalar("plan_barrier"),
+            scalar("plan_damping"),
+        )
+    )
+
+
+def limited_step(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
+    """Function (s0, data, lower, upper, memory) -> (U, diagnostics, memory); it raises as `compiled_plan` does."""
+    # The number of iterations is an argument of the loops: one library serves a loop and plans in open loop.
+    alike = replace(settings, iterations=0)
+    plan = _PLANS.of((ocp, settings.map), (alike,), lambda: _compiled(ocp, alike))
+    return with_last(ocp, plan, settings.iterations)
+
+
+def _compiled(ocp: OptimalControl, settings: LimitedSettings) -> ca.Function:
+    return compiled_plan(ocp, "fpirhc_limited", _driver(ocp, settings), limited_memory(ocp).size)
+
+
+_PLANS: Latest[ca.Function] = Latest(8)
+
+
+def shifted_limited(ocp: OptimalControl, memory: ca.MX) -> ca.MX:
+    """Return the memory one stage later; the last stage, which is repeated, has no feedback."""
+    layout, n, nu, ns = limited_memory(ocp), ocp.stages, ocp.input.size, ocp.state.size
+    parts = layout.split(memory)
+    rows = layout["plan_multipliers"].size // (2 * n)
+    sides = ca.horzsplit(ca.reshape(parts["plan_multipliers"], rows, 2 * n), n)
+    shifted_parts: dict[str, ca.MX] = {
+        name: ca.vec(shift(ca.reshape(parts[name], size, n), ocp, node))
+        for name, size, node in (("plan_inputs", nu, 0), ("plan_states", ns, 1), ("plan_costates", ns, 1))
+    }
+    shifted_parts["plan_gains"] = shift_gains(parts["plan_gains"], nu * ns, ocp)
+    shifted_parts["plan_multipliers"] = ca.vec(ca.horzcat(*(shift(side, ocp) for side in sides)))
+    return layout.join({**parts, **shifted_parts})
+
+
+def _driver(ocp: OptimalControl, settings: LimitedSettings) -> Driver:
+    """The loops in C with what they call."""
+    measures = scales(ocp)
+    leaves = {
+        "evaluate": split_stage(ocp)["evaluate"],
+        "linearise": split_stage(ocp)["linearise"],
+        **split_hessian(ocp, settings.hessian or ExactHessian()),
+        "plain": hessian_stage(ocp, GaussNewton()),
+        "end": hessian_end(ocp),
+        "deformed": deformed_move(settings.map, ocp.input.size * ocp.stages),
+        "guess": _guess(ocp),
+    }
+    folder = resources.files("fpirhc.optimisers")
+    texts = [folder.joinpath(f"{name}.c").read_text(encoding="utf-8") for name in _TEXTS]
+    sizes = {"NM": partial_count(ocp), "NH": leaves["curve"].numel_in(0), **_sizes(ocp, measures)}
+    constants = {**sizes, **_constants(settings, measures), "ITERATIONS": LAST}
+    return Driver("\n".join(texts), leaves, constants, _room(ocp, measures))
+
+
+def _room(ocp: OptimalControl, measures: Scales) -> int:
+    """Numbers of the struct Room of state_limits.c."""
+    nu, ns, n = ocp.input.size, ocp.state.size, ocp.stages
+    inputs, states, limits = n * nu, (n + 1) * ns, n * (nu + len(measures.bounded))
+    point = 2 * inputs + states + n * ns * (2 + ns + nu) + ns + ns * ns + 1
+    direction = 2 * inputs + inputs * ns + 2 * states
+    kept = 2 * inputs + 2 * states + 6 * limits + n * ns
+    shared = max(states * (ns + 1) + 6 * limits, n * partial_count(ocp))
+    return 2 * point + 2 * 6 * limits + direction + kept + shared
+
+
+def _sizes(ocp: OptimalControl, measures: Scales) -> dict[str, object]:
+    places = list(measures.bounded)
+    return {
+        "NS": ocp.state.size,
+        "NU": ocp.input.size,
+        "NT": ocp.data.size,
+        "N": ocp.stages,
+        "NB": len(places),
+        "MEMORY": limited_memory(ocp).size,
+        "PLACES": _row(np.array([*places, 0])),
+        "CURVATURE": _row(ocp.step * ocp.curvature),
+        "UNITS": _row(np.append(measures.rows, 1.0)),
+        "SPREADS": _row(measures.states),
+        "CAPACITIES": _row(np.append(measures.capacity, 0.0)),
+        "HARD": _row(np.append(measures.hard.astype(float), 0.0)),
+        "STATE_LOWER": _row(np.append(ocp.state_lower[places], 0.0)),
+        "STATE_UPPER": _row(np.append(ocp.state_upper[places], 0.0)),
+    }
+
+
+def _constants(settings: LimitedSettings, measures: Scales) -> dict[str, object]:
+    statuses = {
+        "CONVERGED": Status.OK,
+        **{s.name: s for s in (Status.NOT_CONVERGED, Status.INFEASIBLE, Status.NON_FINITE)},
+    }
+    return {
+        **{name: int(status) for name, status in statuses.items()},
+        "COST": repr(float(measures.cost)),
+        "NEAR_LIMIT": FEASIBLE,
+        "KEPT_SHARE": KEPT,
+        "DAMPING": repr(float(settings.damping)),
+        "TOLERANCE": repr(float(settings.tolerance)),
+        "SCALED_TOLERANCE": repr(float(max(settings.tolerance / measures.inputs.min(), 1e-12))),
+        "PLAIN_FIRST": int(settings.hessian is None),
+    }
+
+
+def _guess(ocp: OptimalControl) -> ca.Function:
+    """Function theta -> (reference as a stage's state (ns), that of the nodes where there is none, feedforward (nu))."""
+    theta = ca.SX.sym("theta", ocp.data.size)
+    reference, forward = (theta[ocp.data.slice(name)] for name in ("reference", "feedforward"))
+    reference = ocp.state_of(reference)
+    rest = ocp.state.size - reference.numel() - ocp.written
+    state = ca.vertcat(reference, *([forward] if rest else []), ca.SX.zeros(ocp.written))
+    return ca.Function("fpirhc_guess", [theta], [ca.densify(state), ca.densify(forward)])
+
+
+def _row(values: np.ndarray) -> str:
+    """A C initialiser; infinities become numbers beyond every finite one."""
+    texts = (repr(v) if abs(v) <= FINITE else "-10 * FINITE" if v < 0 else "10 * FINITE" for v in values.tolist())
+    return "{" + ", ".join(texts) + "}"
+
 
 _DIGITS = 1e-15  # relative rounding of a number
 _MOST_LIMITED = 1000  # iterations of one open-loop call with limits of states

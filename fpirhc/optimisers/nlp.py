@@ -18,7 +18,7 @@ import numpy as np
 
 from fpirhc.fields.kinds import Accuracy, Count, Positive
 from fpirhc.horizon.problem import OptimalControl, rollout
-from fpirhc.optimisers.base import (
+from fpirhc.optimisers import (
     UNKNOWN_ITERATIONS,
     Optimiser,
     call_arguments,
@@ -27,12 +27,12 @@ from fpirhc.optimisers.base import (
     refuse_limits,
     remembered_plan,
     sane,
+    scales,
     shift,
     state_units,
     state_violation,
     status_of,
 )
-from fpirhc.optimisers.state_limits import scales
 from fpirhc.status import Status
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Layout, Signal

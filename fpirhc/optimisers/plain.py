@@ -13,18 +13,8 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.errors import CompileError, NotInstalled
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, partial_count, split_stage
 from fpirhc.horizon.problem import OptimalControl
+from fpirhc.optimisers import LAST, clip, compiled_plan, sane, shift, shift_gains, stationarity, status_of, with_last
 from fpirhc.optimisers import search as line_search
-from fpirhc.optimisers.base import (
-    LAST,
-    clip,
-    compiled_plan,
-    sane,
-    shift,
-    shift_gains,
-    stationarity,
-    status_of,
-    with_last,
-)
 from fpirhc.optimisers.search import BOX_PIVOT, Anchor, Arguments, Search, deformed_move, first_gamma, rounds
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import Driver, plans_are_compiled, with_driver

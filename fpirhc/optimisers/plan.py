@@ -13,8 +13,7 @@ import numpy as np
 from fpirhc.errors import InvalidShape, InvalidValue
 from fpirhc.fields.checked import ByName, checked_call
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
-from fpirhc.optimisers.base import Optimiser, feasible_to, first_plan, improved, judge
-from fpirhc.optimisers.state_limits import tolerated
+from fpirhc.optimisers import Optimiser, feasible_to, first_plan, improved, judge, tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number
 
@@ -30,7 +29,7 @@ class Plan:
         inputs: U, shape (nu, N).
         states: X, shape (ns, N + 1).
         cost: V; None where the status is NON_FINITE, because what was tried has no such number.
-        stationarity: as defined in `fpirhc.optimisers.base`; None like the cost.
+        stationarity: as defined in `fpirhc.optimisers`; None like the cost.
         feasibility: as defined there; None like the cost.
         iterations: of the optimiser; -1: not known.
         calls: of the optimiser's step.

@@ -21,7 +21,7 @@ from fpirhc.deformation.model_referenced import require_map_of_plan
 from fpirhc.errors import NotContractive
 from fpirhc.fields.kinds import Count, Positive
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout, steepest_curvature
-from fpirhc.optimisers.base import Optimiser, call_arguments, clip, judged_plan, refuse_limits, remembered_plan, shift
+from fpirhc.optimisers import Optimiser, call_arguments, clip, judged_plan, refuse_limits, remembered_plan, shift
 from fpirhc.symbolic.expression import TINY, expression, graph, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 

@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.deformation.base import Deformation
 from fpirhc.horizon.hessian_models import HessianModel, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.optimisers.base import clip, sane
+from fpirhc.optimisers import clip, sane
 from fpirhc.symbolic.expression import FINITE, TINY, is_finite, kind
 
 SHARE = 0.95  # gamma L, and the share of the guaranteed decrease that is required

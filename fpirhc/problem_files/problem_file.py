@@ -30,7 +30,7 @@ from fpirhc.problem_files.settings import (
     with_settings,
 )
 from fpirhc.problem_files.shipped import find_problem
-from fpirhc.simulation.metrics.base import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
+from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, known_metrics, with_own_metrics
 from fpirhc.simulation.pictures import Picture
 from fpirhc.summary import line
 from fpirhc.task.cases import Cases, as_declared

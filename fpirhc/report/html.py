@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from fpirhc.simulation.picture import Drawing
+    from fpirhc.studies import View
     from fpirhc.studies.compare import Comparison, Contraction
     from fpirhc.studies.open_loop import Solved
-    from fpirhc.studies.view import View
     from fpirhc.task.problem import Problem
 
 

@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fpirhc.simulation.metrics.base import columns
+from fpirhc.simulation.metrics import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.studies.verdict import IN_FULL, Outcome
@@ -33,11 +33,11 @@ from fpirhc.summary import Column, Table, number, printable, written_out
 if TYPE_CHECKING:
     from fpirhc.probing.probe import Probe
     from fpirhc.review.review import Review
-    from fpirhc.simulation.metrics.base import Metrics
+    from fpirhc.simulation.metrics import Metrics
     from fpirhc.simulation.run import Run
+    from fpirhc.studies import Progress as Report
+    from fpirhc.studies import View
     from fpirhc.studies.open_loop import Solved
-    from fpirhc.studies.view import Progress as Report
-    from fpirhc.studies.view import View
 
 STYLES = {
     Outcome.BETTER: "green",

@@ -19,7 +19,7 @@ from fpirhc.controllers.contract import name_in_task, without_deformation
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.user_code import users_level
 from fpirhc.plant.motion import followed_units, with_space
-from fpirhc.simulation.metrics.base import by_name
+from fpirhc.simulation.metrics import by_name
 from fpirhc.simulation.metrics.shipped import at_limit, rms_error
 from fpirhc.simulation.model_as_plant import ModelAsPlant, loop_of, shortened
 from fpirhc.simulation.run import Run, judged_motion

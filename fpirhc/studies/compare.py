@@ -23,7 +23,7 @@ from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
-from fpirhc.simulation.metrics.base import Metrics, columns, in_report, measure
+from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
 from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.pictures import Picture
@@ -33,8 +33,8 @@ from fpirhc.simulation.simulate import ComposedLoop, Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
+from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, objective
-from fpirhc.studies.view import Progress, Study, View, circumstances, status_shares
 from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compiling_ahead

@@ -21,14 +21,14 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import AboveZero, Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.sensing.sensing import Sensor
-from fpirhc.simulation.metrics.base import Metric, measured_cycles
+from fpirhc.simulation.metrics import Metric, measured_cycles
 from fpirhc.simulation.ranges import hard_limits
 from fpirhc.simulation.run import Run
+from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import Kept, Row, Runner, header_of
 from fpirhc.studies.variants import Draws, Variant
 from fpirhc.studies.verdict import ranges
-from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, number
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem

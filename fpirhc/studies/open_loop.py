@@ -22,7 +22,7 @@ from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stag
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.members import member_modules
-from fpirhc.optimisers.base import Optimiser
+from fpirhc.optimisers import Optimiser
 from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.summary import line, number

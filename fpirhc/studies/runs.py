@@ -24,13 +24,13 @@ from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
-from fpirhc.simulation.metrics.base import Metric, measure
+from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator
+from fpirhc.studies import Progress, versions
 from fpirhc.studies.compare import select
 from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.verdict import left_alone, ranges
-from fpirhc.studies.view import Progress, versions
 from fpirhc.summary import in_units
 from fpirhc.task.cases import as_declared
 from fpirhc.task.problem import Problem

@@ -15,11 +15,11 @@ import pandas as pd
 
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task
+from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import CasesOf, Draws, Variants
 from fpirhc.studies.verdict import Objective, Outcome, objective
-from fpirhc.studies.view import Progress, Study, View, circumstances
 from fpirhc.summary import Column, Table, in_percent, written_out
 
 _TAIL, _MOVES = 0.025, "total_variation."  # on either side of an interval; the metric of movement

@@ -18,11 +18,11 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting, with_settings
+from fpirhc.studies import Progress
 from fpirhc.studies.compare import check_gains, harm_of_adaptation, select
 from fpirhc.studies.runs import Runner
 from fpirhc.studies.variants import Draws, Variant, Variants
 from fpirhc.studies.verdict import Objective, objective
-from fpirhc.studies.view import Progress
 from fpirhc.summary import written_out
 from fpirhc.task.cases import is_whole
 

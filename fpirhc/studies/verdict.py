@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, derivative_of, nearest
 from fpirhc.plant.motion import followed_units, with_space
 from fpirhc.simulation.loop import HeldInput
-from fpirhc.simulation.metrics.base import RELATIVE_ERROR, Metric
+from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric
 from fpirhc.simulation.metrics.shipped import rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status

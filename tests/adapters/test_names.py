@@ -7,10 +7,10 @@ import pytest
 from helpers.tank import TANK
 
 import fpirhc as fp
+from fpirhc.adapters import derivatives, finite_numbers, steps_per_cycle
 from fpirhc.adapters.commonroad import commonroad_body
 from fpirhc.adapters.fmu import fmu_body
 from fpirhc.adapters.mujoco import mujoco_body
-from fpirhc.adapters.names import derivatives, finite_numbers, steps_per_cycle
 from fpirhc.adapters.rotorpy import rotorpy_body
 from fpirhc.adapters.tclab import tclab_body
 from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue, Mistakes

@@ -14,7 +14,7 @@ import numpy as np
 from fpirhc.errors import InvalidValue, without
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.motion import followed_units
-from fpirhc.simulation.metrics.base import Better, Metric, measured_cycles
+from fpirhc.simulation.metrics import Better, Metric, measured_cycles
 from fpirhc.simulation.pictures import Quantity, numbers
 from fpirhc.simulation.run import Run
 from fpirhc.task.problem import Problem

@@ -15,11 +15,11 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.contraction.spectrum import Spectrum, identified_factor, jacobians_along, predicted_factor
+from fpirhc.horizon.nominal import stage_data
 from fpirhc.horizon.problem import OptimalControl
-from fpirhc.horizon.stage_data import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.motion import derivative_unit
-from fpirhc.simulation.metrics.base import Function, Metric, by_name, coordinate_unit, input_unit, measured_cycles
+from fpirhc.simulation.metrics import Function, Metric, by_name, coordinate_unit, input_unit, measured_cycles
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.tables import LOGGED
 from fpirhc.status import Status
