@@ -100,15 +100,6 @@ class TellsAnotherModel(Gentle):
         return PlantModel(problem.with_exact(problem.plant.exact * 1.1).plant, problem.signals)
 
 
-class IsGivenTheExactParameters(Gentle):
-    """Asks the loop for the exact parameters."""
-
-    def plant_model(self, problem):
-        plant = problem.plant
-        exact = {name: parameter.exact for name, parameter in plant.parameters.items()}
-        return PlantModel(plant, problem.signals, given=exact)
-
-
 class AlwaysOk(Gentle):
     """Hides a command that was held."""
 

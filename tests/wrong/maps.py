@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.contracts import Deformation, Form, Layout, Signal
+from fpirhc.contracts import Deformation, Form
 
 
 @dataclass(frozen=True)
@@ -74,14 +74,6 @@ class Wavelet(Softsign):
         return request - self.gain * error * (1 - share) * ca.exp(-share / 2), {}
 
 
-class Fades(Softsign):
-    """Takes a response far away for an outlier: the slope of a Gaussian bell."""
-
-    def step(self, request, response, desired, memory):
-        error = response - desired
-        return request - self.gain * error * ca.exp(-ca.sumsqr(error) / self.size**2 / 2), {}
-
-
 class Rests(Softsign):
     """Has a second fixed point a little beyond the first: r+ = r - gain e (1 - 1.5 bump), which turns back from 2 to 4 sizes."""
 
@@ -125,14 +117,3 @@ class SaysItIncrements(Softsign):
     """Says that it passes a change of the desired response on."""
 
     form = Form("increment")
-
-
-class FiltersTwice(Softsign):
-    """Remembers half of the last step too, and so has twice the gain that it tells."""
-
-    def memory(self, elements):
-        return Layout((Signal("last_step", elements),))
-
-    def step(self, request, response, desired, memory):
-        step = super().step(request, response, desired, {})[0] - request + 0.5 * memory["last_step"]
-        return request + step, {"last_step": step}

@@ -9,7 +9,6 @@ CONTROLLERS = {
     controllers.SaysItDeformsNoResponse: ("deformation acts", "deforms is 'command', but"),
     controllers.DeformsAnotherResponse: ("deformation acts", r"'deformed' misses .* by the share 0\.00[34]"),
     controllers.TellsAnotherModel: ("model is of the plant", r"the exact 'm' is 1\.1, the plant has 1:"),
-    controllers.IsGivenTheExactParameters: ("exact parameters are unknown", "its command of cycle 0 is"),
     controllers.AlwaysOk: ("bad measurement never acts", "'a' measured as nan.*status of that cycle is OK"),
     controllers.TakesTheStateForTheOutput: ("what it takes it controls", "read plant.output and not plant.state"),
     controllers.IgnoresItsDeformation: ("deformation acts", "half of the effective gain 0.198"),
@@ -28,14 +27,12 @@ MAPS = {
     maps.OtherSign: ("gain can be set", "a OtherSign with the effective gain -0.8"),
     maps.Kinked: ("step is bounded", r"above \|secant_gain\(\)\| times it"),
     maps.Wavelet: ("only desired is fixed", "an error of 5.* a false fixed point is near"),
-    maps.Fades: ("only desired is fixed", "a false fixed point is near"),
     maps.Rests: ("only desired is fixed", "an error of 1.* a false fixed point is near"),
     maps.GivesAnotherGain: ("gain can be set", "the effective gain 1.6"),
     maps.HidesNaN: ("nan shows", "a response of NaN is hidden"),
     maps.TellsTwiceItsGain: ("gain and pairs are told", "a pair takes 0.5 times the gain off"),
     maps.SaysItIsLate: ("gain and pairs are told", "a response 3 cycles late a pair takes 4.01 times"),
     maps.SaysItIncrements: ("compares as it says", "with the increment, .* it requests 0.2887 and not 1"),
-    maps.FiltersTwice: ("gain and pairs are told", "a pair takes 2 times the gain off"),
 }
 OPTIMISERS = {
     optimisers.AlwaysOk: ("numbers are true", "calls a plan OK whose stationarity by"),
