@@ -10,8 +10,13 @@ from functools import cache
 from pathlib import Path
 
 from fpirhc.__main__ import main
-from helpers.attack.problems import LINE
+from helpers.line import line_text
 
+LINE = line_text(
+    "period=5e-3, duration=0.2, measure_from=0.05, limits=fp.Limits(inputs={'u': (-50.0, 50.0)}), "
+    "disturbances={'u': fp.Noise(0.1)}",
+    bounds="(0.5, 2.4)",
+)
 CHEAP = ("accept", "check", "compare", "list", "new", "review", "run", "study", "tune")
 WORDS = (
     "line.py", "line.py", "line.py", "no_such.py", "broken.py", "empty.py", "two_mas", "", ".", "/", "CTC", "CTC+FPI", "CTC+FP",

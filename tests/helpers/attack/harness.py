@@ -1,7 +1,6 @@
 """Drives a stepper and its plant through a fault, and says what came of it."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
@@ -10,36 +9,13 @@ import fpirhc as fp
 from fpirhc import Status
 from fpirhc.contracts import Controller, values_of
 from fpirhc.errors import FpirhcError
-from helpers.attack.faults import FIRST, Cycle, Fault
+from helpers.attack.faults import Cycle, Fault
 
 _GONE = 1e12  # size of a state that no plant comes back from
 CYCLES, LATE = 80, 15  # cycles of a run, and of its end, in which a controller must act again
 SKIPPING = {Status.BAD_SAMPLE, Status.NON_FINITE, Status.SOLVER_FAILED, Status.RESTARTED}
 PROBLEMS: tuple[str, ...] = ("two_mass", "van_der_pol", "cart_pole", "delayed_mass", "noisy_motor", "two_link_arm")
 PROBLEMS += ("mass_spring_slots", "delayed_tanks", "three_link_arm", "chain_of_masses", "mrac_pendulum")
-
-
-@dataclass
-class Outcome:
-    """What one fault did to one controller."""
-
-    raw: str = ""  # an error that is none of fpirhc's
-    outside: int = 0  # commands that were not finite or outside the limits
-    frozen: bool = False  # whether it still skipped its cycles, or held its command, at the end
-    differs: bool = False  # a single bad sample: whether something differs from the tick left out
-    deviation: float = 0.0  # of the command from the run without faults, in its normal movements per cycle
-    statuses: set[Status] = field(default_factory=set)
-
-    @property
-    def wrong(self) -> str:
-        """What a machine would suffer from; empty where nothing did."""
-        facts = {
-            self.raw: bool(self.raw),
-            f"{self.outside} commands outside": self.outside > 0,
-            "frozen": self.frozen,
-            "not equal to the tick left out": self.differs,
-        }
-        return "; ".join(text for text, true in facts.items() if true)
 
 
 class Bench:
@@ -58,39 +34,30 @@ class Bench:
         self._calm = np.zeros(len(plant.names))
         self.lost = False  # whether the plant itself left its domain, such as a tank below its bottom
         self.clean = self._run(None)[0]
-        moves = np.abs(np.diff(self.clean, axis=0))
-        # An input that rests has the movement of the others, or of one part in a million of its size.
-        # Between plans a command rests in most cycles, so the median of their movements is zero: the mean counts there.
-        usual = np.maximum(np.median(moves, axis=0), np.mean(moves, axis=0))
-        self.movement = np.maximum(usual, 1e-6 * np.abs(self.clean).max() + 1e-12)
 
-    def outcome(self, fault: Fault) -> Outcome:
-        result = Outcome()
+    def wrong(self, fault: Fault) -> str:
+        """What a machine would suffer from; empty where nothing did."""
         try:
-            result.differs = fault.single and self._differs(fault)
+            differs = fault.single and self._differs(fault)
             commands, statuses = self._run(fault)
         except FpirhcError as error:
-            result.raw = f"refused: {error}"
-            return result
+            return f"refused: {error}"
         except Exception as error:  # noqa: BLE001 -- every error that gets here is what is looked for
-            result.raw = f"{type(error).__name__}: {error}"
-            return result
+            return f"{type(error).__name__}: {error}"
         lower, upper = self.limits
-        result.outside = int((~np.isfinite(commands) | (commands < lower) | (commands > upper)).any(axis=1).sum())
-        result.statuses = set(statuses)
-        known = (
-            fault.end if fault.first == FIRST else 0
-        )  # before the first good sample the command is the one before the run
-        result.deviation = float((np.abs(commands - self.clean) / self.movement)[known:].max())
-        late = range(CYCLES - LATE, CYCLES)
+        outside = int((~np.isfinite(commands) | (commands < lower) | (commands > upper)).any(axis=1).sum())
+        late = commands[-LATE:]
         # A command at a limit stays there for good reason; one that is held between its limits does not move again.
-        still = bool((np.ptp(commands[-LATE:], axis=0) == 0).all()) and bool(
-            ((commands[-1] > lower) & (commands[-1] < upper)).any()
-        )
+        still = (np.ptp(late, axis=0) == 0).all() and ((late[-1] > lower) & (late[-1] < upper)).any()
         moves = np.ptp(self.clean[-LATE:], axis=0).max() > 0
-        skips = all(statuses[k] in SKIPPING for k in late)
-        result.frozen = not self.lost and fault.end < CYCLES - LATE and (skips or (still and moves))
-        return result
+        skips = all(status in SKIPPING for status in statuses[-LATE:])
+        frozen = not self.lost and fault.end < CYCLES - LATE and (skips or (still and moves))
+        facts = {
+            f"{outside} commands outside": outside > 0,
+            "it still skips its cycles, or holds its command, at the end": frozen,
+            "not equal to the tick left out": differs,
+        }
+        return "; ".join(text for text, true in facts.items() if true)
 
     def _run(self, fault: Fault | None) -> tuple[np.ndarray, list[Status]]:
         commands, statuses = [], []
