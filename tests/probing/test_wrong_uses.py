@@ -44,31 +44,10 @@ def probed(**settings: Any) -> Any:
 
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "a class for a body": (
-        lambda: outside(body=Body),
-        "ExternalPlant: its body is the class Body; write Body() for an object of it",
-    ),
     "a function for a body": (
         lambda: outside(body=lambda command: command),
         "ExternalPlant: its body is a value of the class function without reset and step; expected an object with "
         "reset(seed) and step(time, command)",
-    ),
-    "no measures": (
-        lambda: outside(measures={}),
-        "problem: reality: 3 mistakes\n  1. it does not measure q (m), which the sensing of the problem needs; "
-        "add it to measures, or choose an estimator that does without: Sensing(estimator=...)\n  2. it does "
-        "not measure q' (m/s), which the sensing of the problem needs; add it to measures, or choose an "
-        "estimator that does without: Sensing(estimator=...)\n  3. it does not measure q'' (m/s^2), which the "
-        "sensing of the problem needs; add it to measures, or choose an estimator that does without: "
-        "Sensing(estimator=...)",
-    ),
-    "another unit": (
-        lambda: outside(measures=MEASURES | {"q": "mm"}),
-        "problem: reality: it measures q in mm, the model has it in m; write both in one unit",
-    ),
-    "parameters of a body that stands": (
-        lambda: outside(parameters={"b": fp.Parameter(1.0, 1.0, "1")}),
-        "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body",
     ),
     "a body of another period": (
         lambda: outside(period=2e-2),
@@ -77,19 +56,6 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a start that returns nothing": (
         lambda: run(outside(body=body(Silent))),
         "reality: reset of Silent returned None, expected 3 numbers: q, q', q''",
-    ),
-    "exact parameters of a body that stands": (
-        lambda: outside().reality.with_exact(np.array([1.0])),
-        "the external plant has no exact parameters that a study could draw; state them, "
-        "ExternalPlant(make=lambda parameters, seed: body, parameters={...}), or compare it without a study",
-    ),
-    "make that returns nothing": (
-        lambda: run(outside(body=None, make=lambda _parameters, _seed: None)),
-        "reality: make returned None; expected an object with reset(seed) and step(time, command)",
-    ),
-    "make that fails": (
-        lambda: run(outside(body=None, make=lambda parameters, _seed: parameters["mass"])),
-        "reality: make raised KeyError: 'mass'",
     ),
     "a parameter of a plant outside that has none": (
         lambda: case({"exact.mass": 2.0}),
