@@ -1,7 +1,5 @@
 """Limits of states, rates, paths and the horizon's end: the same plans as an independent solver, and names in every complaint."""
 
-from dataclasses import replace
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -55,34 +53,6 @@ def test_limits_are_kept_at_the_same_optimum_as_ipopt(case):
     np.testing.assert_allclose(plan.inputs, other.inputs, atol=2e-5)
     assert plan.verify()[1] <= 1e-6
     assert plan.violations() == ()
-
-
-@pytest.mark.parametrize(
-    "optimiser",
-    [fp.FixedPoint(iterations=1, tolerance=1e-6), fp.Ipopt(), fp.Fatrop(), fp.SequentialQuadratic()],
-    ids=lambda o: type(o).__name__,
-)
-def test_limits_are_kept_in_every_unit(optimiser):
-    """A mass in metres, micrometres and megametres keeps its limit, and pays the same."""
-
-    def cost_in(unit):
-        plant = fp.Plant(
-            coordinates={"q": "m"},
-            inputs={"F": "N"},
-            order=2,
-            response=lambda q, v, u, p: {"q": u.F / p.m},
-            parameters={"m": fp.Parameter(1.0, 1.0, "kg")},
-        )
-        reference, horizon = fp.Trajectory(lambda t: {"q": unit + 0 * t}), fp.Horizon(8, 0.1)
-        cost = fp.Quadratic(states={"q": 10 / unit**2, "q'": 0.1 / unit**2}, effort={"F": 0.01 / unit**2})
-        ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits(states={"q'": (-2 * unit, 2 * unit)}))
-        plan = fp.solve(ocp, replace(optimiser, tolerance=1e-6 * unit), np.zeros(ocp.state.size), data)
-        assert plan.status == fp.Status.OK
-        assert plan.states[1].max() == pytest.approx(2 * unit, rel=1e-6)
-        return known(plan.cost)
-
-    cost, *others = map(cost_in, (1.0, 1e-6, 1e6))
-    assert others == pytest.approx([cost, cost], rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.kinds import slow_but
 from helpers.plants import pendulum
 from scipy.optimize import minimize
 
@@ -184,51 +183,6 @@ def test_long_stages_of_a_map_hold_the_input_over_whole_steps(optimiser):
 
     best = minimize(cost, np.ones(4), bounds=[(-3.0, 3.0)] * 4, options={"ftol": 1e-15, "gtol": 1e-10})
     assert run["command"][0, 0] == pytest.approx(best.x[0], abs=1e-4)
-
-
-LIMITED = fp.Limits(inputs={"torque": (-6.0, 6.0)}, states={"angle": (-0.5, 0.5)})
-TASKS = {
-    "collocation": lambda: task(horizon=fp.Horizon(STAGES, STEP, fp.Collocation(2), replan="cycle")),
-    "limits of rates": lambda: task(limits=replace(LIMITED, rates={"torque": (-FASTEST, FASTEST)}), replan=2),
-    "prices": lambda: task(limits=replace(LIMITED, prices={"angle": 10.0})),
-    "blocks": lambda: task(horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle")),
-    "lengths, limits": lambda: task(limits=LIMITED, horizon=fp.Horizon(STAGES, STEP, replan=2, lengths=GROWING)),
-    "lengths, blocks": lambda: task(
-        horizon=fp.Horizon(STAGES, STEP, blocks=(1, 2, 3), replan="cycle", lengths=GROWING)
-    ),
-    "dead time": lambda: task(dead_time=fp.DeadTime(inputs={"torque": 2 * PERIOD})),
-}
-
-
-@pytest.mark.parametrize("name", slow_but(TASKS, "limits of rates", "blocks", "lengths, limits", "dead time"))
-def test_what_a_problem_can_have_goes_with_a_plan_in_every_cycle(name):
-    """Errors are not larger than with a plan per stage; a rate that is limited from plan to plan jumps less."""
-    problem = TASKS[name]()
-    controller = planning(fp.FixedPoint(iterations=3, tolerance=1e-4), fp.Affine(gain=-0.3))
-    if name == "dead time":
-        controller = fp.Predicted(controller, inputs=2 * PERIOD)
-    per_stage = replace(problem, horizon=replace(problem.horizon, replan="stage"))
-    each, one = (fp.simulate(p, controller, seed=0, compiled=False) for p in (problem, per_stage))
-    assert each.stop is None
-    assert np.sqrt(np.mean(each["error"] ** 2)) <= (1.3 if problem.limits.rates else 1.02) * np.sqrt(
-        np.mean(one["error"] ** 2)
-    )
-
-
-@pytest.mark.parametrize(
-    "name", ["fishery", "leaking_tanks", pytest.param("anaesthesia_stimulated", marks=pytest.mark.slow)]
-)
-def test_outputs_and_maps_are_planned_between_stages(name):
-    """With stages of three cycles a plan in every cycle is that of IPOPT, and a deformation bears it."""
-    task = fp.load_problem(name)
-    problem, controllers = task.problem, task.controllers
-    horizon = replace(problem.horizon, stages=10, step=3 * problem.period, blocks=(), margins={}, replan="cycle")
-    problem = replace(problem, duration=60 * problem.period, measure_from=0.0, horizon=horizon)
-    ways = [replace(controllers["RHC"], optimiser=one) for one in (CONVERGED, fp.Ipopt(tolerance=1e-8))]
-    runs = [fp.simulate(problem, way, seed=0, compiled=False) for way in (*ways, controllers["RHC+FPI"])]
-    assert [run.stop for run in runs] == [None, None, None]
-    scale = np.abs(runs[1]["command"]).max()
-    np.testing.assert_allclose(runs[0]["command"], runs[1]["command"], atol=1e-4 * scale)
 
 
 def test_a_run_has_its_cost_whatever_the_stages_are():

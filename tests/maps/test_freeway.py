@@ -84,19 +84,6 @@ def test_an_exact_map_of_a_minute_has_no_error() -> None:
     assert error("freeway_metering", "CTC exact model") < 1e-12
 
 
-def by_hand(state: np.ndarray, rate: float, demands: tuple[float, float]) -> np.ndarray:
-    """One step of METANET in numpy, with the published numbers."""
-    rho, v, w = state[:6], state[6:12], state[12:]
-    room = np.minimum(1, (180 - rho[[0, 4]]) / (180 - 33.5))
-    main, ramp = np.array([1, rate]) * np.minimum(np.array(demands) + w / T, np.array([4000, 2000]) * room)
-    flow, merging = 2 * rho * v, np.array([0, 0, 0, 0, ramp, 0])
-    ahead, settling = np.append(rho[1:], min(rho[5], 33.5)), 102 * np.exp(-((rho / 33.5) ** 1.867) / 1.867)
-    later = v + T / (18 / 3600) * (settling - v) + T * v * (np.append(v[0], v[:-1]) - v)
-    later = later - 60 * T / (18 / 3600) * (ahead - rho) / (rho + 40) - 0.0122 * T / 2 * merging * v / (rho + 40)
-    dense = rho + T / 2 * (np.append(main, flow[:-1]) - flow + merging)
-    return np.concatenate([dense, later, w + T * (np.array(demands) - [main, ramp])])
-
-
 # The time spent
 
 
@@ -120,25 +107,6 @@ def test_an_economic_plan_is_the_published_run(which: str) -> None:
         return
     assert run["command.r"] == pytest.approx(rates, abs=0.002)
     assert run["plant_state.spent"][16] == pytest.approx(96.813, abs=0.011)
-
-
-def test_a_sign_limits_the_speed_at_which_traffic_settles() -> None:
-    """One step of the map by hand: v moves towards 1.1 times what the sign shows where that is less, and nothing else changes."""
-    plant = replace(task("freeway_coordinated").problem.plant, steps=1)
-    state = np.array(task("freeway_coordinated").problem.start_state)
-    step = plant.equations.next
-    before = by_hand(state[:14], 0.4, tuple(plant.exact[-2:]))
-    for shown, slower in (((90.0, 90.0), (0.0, 0.0)), ((50.0, 90.0), (1.0, 0.0)), ((50.0, 40.0), (1.0, 1.0))):
-        after = np.ravel(step(state, [0.4, *shown], plant.exact, np.zeros(len(plant.names))).full())
-        limited = [
-            min(0.0, 1.1 * sign - 102 * np.exp(-((rho / 33.5) ** 1.867) / 1.867))
-            for sign, rho in zip(shown, state[2:4], strict=True)
-        ]
-        wanted = before.copy()
-        wanted[8:10] += T / (18 / 3600) * np.array(limited)
-        assert after[:14] == pytest.approx(wanted, rel=1e-13)
-        assert after[-2:] == pytest.approx(shown)
-        assert (np.array(limited) < 0).tolist() == (np.array(slower) > 0).tolist()
 
 
 PUBLISHED_SIGNS = DATA.with_name("coordinated.csv")  # minute, rate, two signs

@@ -77,22 +77,6 @@ def test_with_the_exact_model_no_deformation_arises(order: int) -> None:
     assert np.abs(run["deformed"] - run["desired"]).max() < 1e-16
 
 
-@pytest.mark.parametrize(("order", "most"), [(1, 0.08), (2, 0.15), (3, 0.20)])
-def test_with_a_wrong_model_the_iteration_helps(order: int, most: float) -> None:
-    """Model 30 % wrong: shares of the error that are left. Each form takes the request of r cycles ago."""
-    law, problem = fp.Exponential(rate=0.04), task(chain(order, 1.3))
-    forms = {
-        "none": fp.Identity(),
-        "model-referenced": fp.ModelReferenced(fp.Affine(gain=-1.0)),
-        "increment": fp.Increment(fp.Affine(gain=-1.0), cycles=order - 1),
-    }
-    rms = {
-        n: float(np.sqrt((error_of(problem, fp.ComputedTorque(law, f))[150:] ** 2).mean())) for n, f in forms.items()
-    }
-    assert rms["model-referenced"] < most * rms["none"]
-    assert rms["increment"] < 2 * most * rms["none"]
-
-
 def test_a_pair_is_complete_before_it_is_used() -> None:
     """The first r requests are the desired responses: no response to a request of this run is measured before cycle r."""
     run = fp.simulate(

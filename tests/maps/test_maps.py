@@ -93,15 +93,6 @@ def test_a_run_is_the_loop_by_hand(steps: int, gain: float) -> None:
     assert np.abs(run["command"][:, 0] - commands).max() <= tolerance
 
 
-def test_a_right_map_that_answers_at_once_leaves_nothing_to_adapt() -> None:
-    right = {name: fp.Parameter(p.exact, p.exact, "1") for name, p in FISH.items()}
-    plant = fishery(parameters=right, outputs={"y": fp.Output("1", lambda x, u, p: x.stock + u.catch)})
-    problem = task(plant, reference=fp.Trajectory(lambda t: {"y": 0.5 + 0.1 * ca.sin(2e-3 * t)}))
-    forms = fp.Identity(), fp.ModelReferenced(fp.Affine(gain=-0.5))
-    runs = [simulated(problem, fp.ComputedTorque(fp.Exponential(rate=RATE), one)) for one in forms]
-    assert np.abs(runs[1]["command"] - runs[0]["command"]).max() <= 1e-12
-
-
 def chain(order: int) -> fp.Plant:
     """x1+ = x2, x2+ = x3, ..., xr+ = a x1 + b u, controlled at x1."""
     names = [f"x{k}" for k in range(1, order + 1)]

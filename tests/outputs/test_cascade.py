@@ -1,6 +1,5 @@
 """A fixed-point iteration on the target of an inner controller: pairing, stability, limits, and what may stand inside."""
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -92,17 +91,6 @@ def test_the_limit_is_that_of_the_theory(gain):
         assert bool(late < early) is settles, (share, early, late)
 
 
-@pytest.mark.parametrize("gain", [0.5, 1.0])
-def test_the_plain_form_bears_every_slope_below_two_over_the_gain(gain):
-    """Shift = F (1 - gain slope) shift with F a lag of gain one: |1 - gain slope| < 1 is enough where it is right."""
-    plain = fp.Cascade(STATIC, affine(gain), lag=5.0, plain=True)
-    for share, settles in ((0.97, True), (1.5, False)):  # the lag damps what is beyond the bound by less than a third
-        problem = linear(share * 2 / gain, dead_time=fp.DeadTime(inputs={"u": 8.0}), period=1.0, duration=900.0)
-        run = fp.simulate(problem, plain, seed=1, compiled=False)
-        early, late = (np.abs(run["error.y"][k : k + 100]).max(initial=0.0) for k in (100, 800))
-        assert bool(run.stop is None and late < early) is settles, (share, early, late)
-
-
 def test_a_target_out_of_reach_does_not_wind_the_shift_up():
     """The reference is beyond the limit of the valve for 800 s; afterwards the output is as near as if it had never been."""
 
@@ -115,28 +103,6 @@ def test_a_target_out_of_reach_does_not_wind_the_shift_up():
     assert run["state.y"][out] == pytest.approx(1.4, abs=1e-3)
     assert np.abs(run["shift"]).max() < 2.0
     assert np.abs(run["error.y"][run.time > 1320]).max() < 1e-2
-
-
-def test_two_channels_have_lags_of_their_own():
-    """Each target passes its own lag; a wrong gain of either is taken away."""
-    plant = fp.Plant(
-        coordinates={"a": "K", "b": "K"},
-        inputs={"u": "1", "v": "1"},
-        order=1,
-        response=lambda q, u, p: {"a": (p.first * u.u + 0.2 * u.v - q.a) / 5, "b": (p.second * u.v - q.b) / 40},
-        parameters={
-            "first": fp.Parameter(approximate=1.0, exact=0.6, unit="K"),
-            "second": fp.Parameter(approximate=1.0, exact=1.7, unit="K"),
-        },
-    )
-    problem = linear(
-        1.0,
-        plant=plant,
-        start={"a": 0.0, "b": 0.0},
-        reference=fp.Trajectory(lambda t: {"a": 1 + 0 * t, "b": 0 * t - 1}),
-    )
-    run = fp.simulate(problem, fp.Cascade(STATIC, affine(0.6), lag=(5.0, 40.0)), seed=1, compiled=False)
-    assert run["error"][-1] == pytest.approx([0.0, 0.0], abs=1e-5)
 
 
 def test_without_adaptation_it_is_what_it_is_around():
@@ -183,28 +149,3 @@ def test_a_cascade_around_a_controller_of_an_output_takes_its_error_away(inner: 
     cascade = fp.Cascade(controller, affine(0.3), lag=1.0)
     errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (controller, cascade)]
     assert errors[1] < 0.75 * errors[0]
-
-
-@pytest.mark.parametrize(("offset", "aim", "command"), [(2.0, 3.0, 1.0), (-2.0, -1.0, 1.0)])
-def test_a_wrong_model_that_asks_for_too_much_is_led_back_from_the_limit(
-    offset: float, aim: float, command: float
-) -> None:
-    """Y' = (u + o - y) / 5, modelled without o: the model asks for a command beyond the limits, and u = 1 is right."""
-    plain = linear(1.0)
-    rate = plain.plant.response
-    plant = replace(
-        plain.plant,
-        response=lambda q, u, p: {"y": rate(q, u, p)["y"] + p.offset / 5.0},
-        parameters={**plain.plant.parameters, "offset": fp.Parameter(approximate=0.0, exact=offset, unit="K")},
-    )
-    problem = replace(
-        plain,
-        plant=plant,
-        duration=400.0,
-        limits=fp.Limits(inputs={"u": (0.0, 2.0)}),
-        reference=fp.Trajectory(lambda t: {"y": aim + 0 * t}),
-    )
-    run = simulated(problem, fp.Cascade(STATIC, affine(0.5), LAGGED))
-    assert run["clipped"][1] == 1
-    assert run["command.u"][-1] == pytest.approx(command, abs=1e-6)
-    assert run["error.y"][-1] == pytest.approx(0.0, abs=1e-6)

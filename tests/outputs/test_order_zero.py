@@ -94,46 +94,6 @@ def test_a_wrong_static_map_is_made_up_for() -> None:
         assert rms(problem, fp.Cascade(STATIC, affine(gain), lag=None)) < 0.06 * without, gain
 
 
-def test_a_disturbance_of_the_output_is_a_part_of_its_response() -> None:
-    """A lamp of 20 W on the same meter: measured, judged, and made up for by the target."""
-    problem = heated(element(COLD, WARMER), disturbances={"power": fp.Step(at=20.0, size=20.0)})
-    run = simulated(problem, fp.Cascade(STATIC, affine(0.5), AT_ONCE))
-    lamp = np.where(run.time >= 20.0 - 1e-9, 20.0, 0.0)
-    ohms = COLD * (1 + WARMER * run["state.theta"])
-    drawn = run["command.u"][:-1] ** 2 / ohms[1:] + lamp[1:]
-    assert run["output.power"][1:] == pytest.approx(drawn, rel=1e-12)
-    assert np.array_equal(run["realised"], run["output"])
-    assert np.abs(run["error.power"][run.time > 23]).max() < 2.0
-    assert np.abs(run["error.power"]).max() > 19
-
-
-def test_a_static_map_has_no_error_once_it_is_right() -> None:
-    """Y = u + k u^3 + .3 v and z = v + k v^3, by Newton's method: exact at every sample but the first."""
-    plant = fp.Plant.of_states(
-        states={"still": "1"},
-        inputs={"u": "1", "v": "1"},
-        parameters={"k": fp.Parameter(approximate=0.3, exact=0.2, unit="1")},
-        rates=lambda x, u, p: {"still": 0 * x.still},
-        outputs={
-            "y": fp.Output("1", lambda x, u, p: u.u + p.k * u.u**3 + 0.3 * u.v),
-            "z": fp.Output("1", lambda x, u, p: u.v + p.k * u.v**3),
-        },
-    )
-    problem = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(t), "z": 0.5 + 0.2 * ca.cos(t)}),
-        start={"still": 0.0},
-        period=0.1,
-        duration=10.0,
-        measure_from=5.0,
-    )
-    exact = simulated(problem, fp.ExactModel(STATIC))
-    assert np.abs(exact["error"][1:]).max() < 1e-8  # Newton's tolerance
-    iterated = simulated(problem, fp.Cascade(STATIC, affine(0.8), AT_ONCE))
-    wrong = simulated(problem, STATIC)
-    assert np.abs(iterated["error"][50:]).max() < 0.2 * np.abs(wrong["error"][50:]).max()
-
-
 # Plans
 
 OPTIMISER = fp.FixedPoint(iterations=20, tolerance=1e-10)

@@ -56,31 +56,6 @@ def test_a_disturbed_output_is_the_output_with_the_disturbance_in_it(wave: Any, 
         assert errors[1] < 0.005
 
 
-def test_a_step_of_an_output_is_measured_judged_and_followed() -> None:
-    """The output jumps with its error, no state does; at rest y is back at its reference and h is lower by d."""
-    step = fp.Step(at=6.0, size=4.0)
-    problem = sedated(hill(5.5), disturbances={"depth": step})
-    run = simulated(problem, fp.ComputedTorque(LAW, fp.Affine(-1.5)))
-    at = round(6.0 / problem.period)
-    jumps = np.diff(run["output.depth"])
-    assert jumps[at - 1] == pytest.approx(4.0, abs=0.1)
-    assert np.diff(run["true_error.depth"])[at - 1] == pytest.approx(-4.0, abs=0.1)
-    assert np.abs(np.diff(run["output.depth'"])[at - 1]) < 0.2
-    assert np.allclose(
-        run["output.depth"] - run["output_disturbance.depth"], curve(run["plant_state.E"], 4.0), rtol=1e-12
-    )
-    assert abs(run["true_error.depth"][-1]) < 0.01
-
-
-def test_without_feedback_no_state_feels_it() -> None:
-    """Open loop: the same commands, the same states, another output."""
-    problem = sedated(hill(4.0))
-    held = fp.ComputedTorque(fp.Exponential(rate=1e-9, integral=False))
-    runs = [simulated(replace(problem, disturbances=d), held) for d in ({}, {"depth": fp.Step(at=5.0, size=3.0)})]
-    assert np.allclose(runs[0]["plant_state"], runs[1]["plant_state"], atol=1e-6)
-    assert np.allclose(runs[1]["output.depth"][-1] - runs[0]["output.depth"][-1], 3.0, atol=1e-5)
-
-
 def shifting(order: int) -> fp.Problem:
     """A chain of shifts y+ = y + 0.5 u, or one step longer, with a disturbed output."""
     chain = {

@@ -42,19 +42,6 @@ def test_limits_of_states_behind_outputs_hold_for_the_measured_state(believed: f
     assert fastest(free) > 1.5
 
 
-def test_so_do_priced_limits() -> None:
-    run = simulated(servo(0.7, prices={"speed": 1e2}), fp.RecedingHorizon(SOLVED, ADAPTIVE))
-    assert 0.9 < fastest(run) < 1.1
-
-
-def test_so_do_limits_with_margins() -> None:
-    """A tenth of the limit is kept free, of the measured speed."""
-    problem = servo(0.7)
-    inside = replace(problem, horizon=replace(problem.horizon, margins={"speed": 0.1}))
-    run = simulated(inside, fp.RecedingHorizon(SOLVED, ADAPTIVE))
-    assert 0.88 < fastest(run) < 0.93
-
-
 def test_behind_an_estimator_a_right_model_is_left_alone_by_plans_from_the_given_state() -> None:
     """And not by those from the estimated outputs, of which a note says so."""
     problem = replace(servo(1.3, states={}), sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=15, degree=2)))

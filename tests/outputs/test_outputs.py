@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.of_outputs import E0, OPTIMISER, STEEP, TRACK, arm, circle, curve, depth_error, hill, planned, sedated
+from helpers.of_outputs import OPTIMISER, arm, circle, hill, planned, sedated
 from helpers.plants import simulated
 
 import fpirhc as fp
@@ -25,53 +25,6 @@ def test_derivatives_of_outputs_are_those_of_the_motion() -> None:
     response = plant.equations.controlled_response(x, u, p).full().ravel()
     assert np.allclose(response, (after - 2 * now + before)[:2] / h**2, atol=1e-5)
     assert np.allclose(plant.equations.inverse(x, response, p).full().ravel(), u)
-
-
-def test_the_hand_of_an_arm_follows_a_circle_and_adaptation_helps() -> None:
-    problem = circle(arm())
-    plain, adaptive = fp.ComputedTorque(TRACK), fp.ComputedTorque(TRACK, fp.Affine(-0.5))
-    errors = [max(fp.measure(problem, simulated(problem, c)).rms_error.values()) for c in (plain, adaptive)]
-    assert errors[1] < 0.1 * errors[0]
-    exact = max(fp.measure(problem, simulated(problem, fp.ExactModel(plain))).rms_error.values())
-    assert exact < 0.1 * errors[0]
-
-
-def by_hand(believed: float) -> fp.Plant:
-    """The same plant with the depth as its coordinate: E is computed from the depth."""
-
-    def response(q: Any, v: Any, u: Any, p: Any) -> dict[str, Any]:
-        level, half = ca.SX.sym("E"), ca.SX.sym("half")
-        slope_of = ca.Function("slope", [level, half], [ca.jacobian(curve(level, half), level)])
-        bend_of = ca.Function("bend", [level, half], [ca.hessian(curve(level, half), level)[0]])
-        at = p.half * (E0 / q.depth - 1) ** (1 / STEEP)
-        slope, bend = slope_of(at, p.half), bend_of(at, p.half)
-        speed = v.depth / slope
-        drug = at + 2 * speed
-        return {"depth": bend * speed**2 + slope * 0.5 * (u.u - drug - speed)}
-
-    parameters = {"half": fp.Parameter(approximate=believed, exact=4.0, unit="mg/l")}
-    return fp.Plant({"depth": "1"}, {"u": "mg/l/min"}, parameters, response, order=2, time_unit="min")
-
-
-def test_an_output_by_expression_is_the_plant_whose_coordinate_it_is() -> None:
-    """With the exact model both forms are one controller on one plant; their integrated states differ."""
-    law = fp.ComputedTorque(fp.Exponential(rate=1.0))
-    one, other = (simulated(sedated(p), law) for p in (hill(4.0), by_hand(4.0)))
-    assert np.ptp(one["output.depth"]) > 30
-    assert np.abs(one["output.depth"] - other["state.depth"]).max() < 2e-4
-
-
-def test_a_plan_with_a_wrong_curve_ends_at_the_reference() -> None:
-    """A plan that is compared with the model's own outputs would stay where the wrong curve says 40, at 46."""
-    problem = planned()
-    plain, adaptive = fp.RecedingHorizon(OPTIMISER), fp.RecedingHorizon(OPTIMISER, fp.Affine(-1.5))
-    runs = [simulated(problem, c) for c in (plain, adaptive)]
-    assert abs(runs[0]["true_error.depth"][-1]) < 0.05
-    assert curve(5.5 * (E0 / 40 - 1) ** (1 / STEEP), 4.0) < 34
-    errors = [fp.measure(problem, run).rms_error["depth"] for run in runs]
-    assert errors[1] < 0.5 * errors[0]
-    exact = depth_error(problem, fp.ExactModel(plain))
-    assert exact < errors[1]
 
 
 def test_a_limit_of_an_output_is_kept_by_the_plan() -> None:

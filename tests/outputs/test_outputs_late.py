@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.of_outputs import OPTIMISER, curve, hill, planned, sedated
+from helpers.of_outputs import curve, hill, planned, sedated
 from helpers.plants import simulated
 
 import fpirhc as fp
@@ -78,29 +78,6 @@ def test_the_distance_of_a_wrong_model_moves_as_a_polynomial() -> None:
     moved = np.column_stack([distance[:, 0] + LATE * distance[:, 1], distance[:, 1]])
     np.testing.assert_allclose(run["output_ahead"], model(run["state_ahead"]) + moved, atol=1e-6)
     assert np.abs(LATE * distance[:, 1]).max() > 0.1
-
-
-def test_a_prediction_helps_behind_dead_time_and_leaves_no_error_at_rest() -> None:
-    """A law that is too fast for the dead time; the prediction keeps it, with the wrong curve too."""
-    problem, fast = late(sedated(hill(5.5)), 0.5), fp.ComputedTorque(fp.Exponential(rate=1.5))
-    bare, ahead = (simulated(problem, c) for c in (fast, fp.Predicted(fast, inputs=0.5)))
-    errors = [fp.measure(problem, r).rms_error["depth"] for r in (bare, ahead)]
-    assert errors[1] < 0.3 * errors[0]
-    plan = fp.Predicted(fp.RecedingHorizon(OPTIMISER), inputs=LATE)
-    run = simulated(late(planned()), plan)
-    assert abs(run["true_error.depth"][-1]) < 0.05
-
-
-def test_an_estimator_inside_a_prediction_has_the_measured_outputs() -> None:
-    """The filter compares what was measured with what it expected then, and not what is predicted."""
-    problem, law = late(sedated(hill(4.0))), fp.ComputedTorque(LAW)
-    noise = {"C": 1e-3, "E": 1e-3}
-    shift = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, "C": 0.01, "E": 0.01}, noise=noise)
-    assert "write Estimating(Predicted(" in fp.Predicted(fp.Estimating(law, shift), inputs=LATE).notes(problem)[-1]
-    assert fp.Estimating(fp.Predicted(law, inputs=LATE), shift).notes(problem) == ()
-    inside = simulated(problem, fp.Predicted(fp.Estimating(law, shift), inputs=LATE))
-    assert np.abs(inside["estimate"]).max() < 1e-3  # a right model has nothing to learn
-    assert np.abs(inside["output_ahead.depth"] - inside["output.depth"]).max() > 0.5
 
 
 def test_what_is_not_covered_says_so() -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 from helpers.of_outputs import arm, circle, hill, planned, sedated
-from helpers.of_outputs import depth_error as rms
 from helpers.plants import simulated
 
 import fpirhc as fp
@@ -80,15 +79,6 @@ def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:
     assert np.ptp(run["estimate"], axis=0).min() > 0.05
 
 
-def test_offset_free_control_of_a_wrong_curve() -> None:
-    """An estimate in every cycle lowers the error of both controllers, and a plan is not changed by it."""
-    problem = sedated(hill(5.5))
-    assert rms(problem, fp.Estimating(LAW, ANSWER)) < 0.5 * rms(problem, LAW)
-    run = simulated(planned(), fp.Estimating(PLAN, ANSWER))
-    assert fp.measure(planned(), run).rms_error["depth"] < 0.6 * rms(planned(), PLAN)
-    assert abs(run["true_error.depth"][-1]) < 0.02
-
-
 def test_a_disturbance_of_an_output_is_the_distance_of_the_curves() -> None:
     """At rest the estimate is the measured depth less that of the model."""
     problem = sedated(hill(5.5))
@@ -102,14 +92,6 @@ def test_a_disturbance_of_an_output_is_the_distance_of_the_curves() -> None:
         assert fp.Estimating(inner, ANSWER).notes(planned()) == ()
     commands = [simulated(planned(), one)["command"] for one in (PLAN, fp.Estimating(PLAN, SHIFT))]
     assert commands[0] == pytest.approx(commands[1], rel=1e-6)
-
-
-def test_the_mass_of_an_arm_is_found_from_the_acceleration_of_its_hand() -> None:
-    """Recursive least squares by name; the response is that of the outputs, linear in 1 / m."""
-    problem = replace(circle(arm()), duration=1.5, measure_from=0.5)
-    learner = fp.RecursiveLeastSquares({"m": fp.Uncertain(0.3, 3.0, 0.5)}, {"x": 0.1, "y": 0.1}, 5.0)
-    run = simulated(problem, fp.Estimating(fp.ComputedTorque(fp.Exponential(6.0)), learner))
-    assert run["estimate.m"][-1] == pytest.approx(1.0, abs=3e-3)
 
 
 def estimating(inner: Controller, *numbers: Mapping[str, float]) -> Callable[[], object]:

@@ -43,17 +43,6 @@ def rising(t: Any) -> Any:
     return 293 - 3 * ca.exp(-t / 50)
 
 
-def test_an_output_of_order_zero_may_depend_on_a_signal() -> None:
-    """The loss of heat k (T - ambient) + u / 10: the signal of the cycle is in the response, and no derivative of it."""
-    loss = fp.Output("W", lambda q, u, p: p.k * (q.T - p.ambient) + u.u / 10)
-    problem = heated(room(outputs={"loss": loss}), "loss", lambda t: 20 + 0 * t, input_before={"u": 10.0})
-    run = fp.simulate(problem, fp.ExactModel(fp.FeedforwardOnly()), seed=0, compiled=False)
-    assert np.abs(run["error.loss"][2:]).max() < 1.0
-    state, ambient = run["state.T"], 280 + 5 * np.sin((run.time - 0.5) / 20)
-    expected = 1.0 * (state - ambient) + np.append(10.0, run["command.u"][:-1]) / 10
-    assert run["output.loss"][1:] == pytest.approx(expected[1:], abs=1e-9)
-
-
 @pytest.mark.parametrize("course", [lambda t: 280 + ca.sin(t), lambda t: ca.pw_lin(t, [0.0, 300.0], [280.0, 285.0])])
 def test_an_output_whose_derivative_has_that_of_a_smooth_signal_is_refused(course: Any) -> None:
     difference = room(outputs={"d": fp.Output("K", lambda q, p: q.T - p.ambient)})

@@ -179,15 +179,3 @@ def test_so_are_tracked_plans_without_adaptation(name: str) -> None:
     states, coordinates = both(PLANTS[name](wrong), {"x0": 0.4, "x1": -0.2})
     run = agree(states, coordinates, fp.RecedingHorizon(OPTIMISER, tracking=REPLANNING["own"]))
     assert np.abs(run["desired"] - run["nominal"]).max() > 0.1
-
-
-@pytest.mark.parametrize("name", PLANTS)
-def test_so_are_plans_without_adaptation_that_start_there(name: str) -> None:
-    """From a start at which model and plant have other derivatives; the inverse returns the planned input."""
-    wrong = np.random.default_rng(3).uniform(0.6, 1.6, 3)
-    states, coordinates = both(PLANTS[name](wrong), {"x0": 0.4, "x1": -0.2})
-    controller = fp.RecedingHorizon(OPTIMISER, consistent=True)
-    run = agree(states, coordinates, controller)
-    np.testing.assert_allclose(run["command"], run["planned"], atol=1e-12)
-    free = simulated(states, fp.RecedingHorizon(OPTIMISER))
-    assert np.abs(free["command"] - run["command"]).max() > 0.1  # the default is another plan

@@ -65,44 +65,9 @@ def test_an_exact_model_is_left_alone(estimator, wait):
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
 
 
-@pytest.mark.parametrize("estimator", [*ESTIMATORS[:3], fp.Measured()], ids=repr)
-def test_it_works_behind_an_estimator_as_where_the_response_is_measured(estimator):
-    """The model is wrong in inertia and output: rms errors of 1.5 mm become .07 to .11 mm, and .069 mm with a measured response."""
-    problem = task(estimator, duration=2.0, measure_from=1.2)
-    runs = run(problem, PLAIN), run(problem, referenced(problem))
-    errors = [fp.measure(problem, r).rms_error["y"] for r in runs]
-    assert errors[1] < 0.08 * errors[0]
-    assert errors[1] == pytest.approx(0.069e-3, rel=0.7)
-
-
 def test_under_a_prediction_the_twin_sees_what_is_measured():
     """The controller acts on outputs ahead, the twin compares those of the samples: an exact model is left alone."""
     late = WAITS["both"]
     problem = task(fp.PositionDifference(), exact=True, dead_time=late)
     one, other = (run(problem, fp.Predicted(c, inputs=2e-3, measurement=2e-3)) for c in (PLAIN, referenced(problem)))
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
-
-
-@pytest.mark.parametrize("cycles", [1, 2])
-def test_a_map_is_left_alone_behind_a_late_measurement(cycles):
-    """State and outputs of a map arrive equally late, so the model answers from the state of the same cycle."""
-    step = 5e-3
-    plant = fp.Plant.discrete(
-        states={"x": "m", "z": "m/s"},
-        inputs={"F": "N"},
-        parameters={"k": fp.Parameter(3.0, 3.0, "N/m")},
-        next=lambda x, u, p: {"x": x.x + step * x.z, "z": x.z + step * (u.F - p.k * x.x)},
-        step=step,
-        outputs={"y": fp.Output("m", lambda x, p: x.x)},
-    )
-    problem = fp.Problem(
-        plant,
-        fp.Trajectory(lambda t: {"y": 0.5 * ca.sin(2 * t)}),
-        {"x": 0.1, "z": 0.0},
-        period=step,
-        duration=1.0,
-        dead_time=fp.DeadTime(inputs={"F": step}, measurement=cycles * step),
-    )
-    law = fp.ModelReferenced(fp.Affine(gain=-0.2), cycles=1.0, measurement=float(cycles))
-    result = run(problem, fp.ComputedTorque(fp.Exponential(3.0), law))
-    np.testing.assert_allclose(result["deformed"], result["desired"], atol=1e-9)

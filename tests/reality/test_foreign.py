@@ -1,6 +1,5 @@
 """A foreign reality: an object outside, called once per cycle; what it may do wrong, and what a run then keeps."""
 
-import math
 import re
 from dataclasses import replace
 from typing import Any
@@ -12,7 +11,6 @@ from helpers import tasks
 from helpers.drives import CONTROLLERS, MEASURES, PAIRS, SENSING, Wrapped, lagged, run, task
 
 import fpirhc as fp
-from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidProblem
 
 
@@ -96,16 +94,6 @@ def test_a_dead_time_of_the_body_is_known_and_not_simulated(name):
     inside, outside_ = run(problem, controller), run(own, controller)
     for signal in ("plant_state", "command"):
         assert np.abs(inside[signal] - outside_[signal]).max() <= 1e-9 * np.abs(inside[signal]).max()
-
-
-def test_positions_alone_are_enough_for_an_estimator():
-    """A body that measures y only runs with an estimator; errors are then those of the estimate."""
-    problem = task(sensing=fp.Sensing(estimator=fp.PositionDifference()))
-    foreign = fp.ExternalPlant(Wrapped(problem, ("y",)), measures=["y"])
-    one, other = run(problem), run(replace(problem, reality=foreign))
-    assert np.abs(one["command"] - other["command"]).max() < 1e-9 * np.abs(one["command"]).max()
-    assert np.array_equal(other["foreign.y"], other["measured.y"])
-    assert other.layout["foreign"].entry_units == ("m",)
 
 
 @pytest.mark.parametrize("kind", BAD)
@@ -198,14 +186,6 @@ def test_a_made_body_is_new_in_every_run_and_has_its_seed():
     assert not np.array_equal(first["plant_state"], weaker["plant_state"])
 
 
-def test_contraction_is_identified_where_the_response_is_measured():
-    """The run's own requests and responses give the factor 1 - a b / b^ without any equation of the body."""
-    controller = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.5))
-    problem = outside(task(start={"y": 0.3}))
-    factor = fp.measure(problem, run(problem, controller))["contraction.measured"][""]
-    assert factor == pytest.approx(1 - controller.deformation.effective_gain() * 2.0, abs=0.02)
-
-
 def test_nobody_has_the_exact_model_of_a_plant_outside():
     """Parameters that are equal in the file say nothing of the plant: the row without adaptation is no bound of the others."""
     laws = {"law": fp.ComputedTorque(fp.Exponential(rate=6.0)), "fast": fp.ComputedTorque(fp.Exponential(rate=9.0))}
@@ -213,14 +193,6 @@ def test_nobody_has_the_exact_model_of_a_plant_outside():
     known = outside(known.with_exact(known.plant.approximate))
     found = fp.compare(tasks.made(known, laws), seed=0, compiled=False)
     assert [e.exact for e in found.entries] == [False, False]
-
-
-def test_a_gain_that_changes_during_a_run_acts_from_that_cycle_on():
-    """The commands before are those of the run without the change."""
-    ready = fp.simulator(outside(task(duration=0.1)), CONTROLLERS["plain form"], compiled=False, live=["tracking.rate"])
-    before, after = (ready.run(seed=0, changes=one)["command.u"] for one in (None, {0.05: {"tracking.rate": 12.0}}))
-    assert np.array_equal(before[:50], after[:50])
-    assert np.abs(after[50:] - before[50:]).max() > 0.1 * np.abs(before).max()
 
 
 # Physical ranges
@@ -257,14 +229,6 @@ def test_run_ends_where_the_level_is_below_zero():
     assert free.stop is None
 
 
-def test_range_in_a_later_chunk_of_cycles():
-    """Cycles are computed 500 at a time; a range that is left in the second chunk ends the run at its own cycle."""
-    free, checked = run(emptying(tank())), run(emptying(tank(level=(-0.5, 1.0))))
-    first = int(np.argmax(free["state.level"] < -0.5))
-    assert first > 500
-    assert checked.cycles == first
-
-
 def test_state_of_a_reality_and_of_a_body_outside():
     """The state that counts is that of what moves: the reality's force, the measured coordinate of an object."""
     real = fp.Reality(replace(lagged(), ranges={"F": (-5.0, 0.5)}), start={"F": 0.0})
@@ -288,73 +252,3 @@ def test_noisy_sensor_does_not_end_a_run():
 
 
 # Lateness that the body states
-
-CYCLE, LATE, LAG = 1e-2, 3, 0.05
-
-
-class Cart:
-    """x'' = what was commanded, three cycles ago, behind a lag; exact for a held command."""
-
-    def __init__(self, late: int = 0, lag: float = 0.0) -> None:
-        self.late, self.lag = late, lag
-
-    def reset(self, seed):
-        del seed
-        self.waiting, self.x, self.v, self.u = [0.0] * self.late, 0.0, 0.0, 0.0
-        return [0.0, 0.0, 0.0]
-
-    def step(self, time, command):
-        del time
-        self.waiting.append(float(command[0]))
-        wanted, before = self.waiting.pop(0), self.v
-        steps = 200
-        for _ in range(steps):
-            h = CYCLE / steps
-            start = self.u
-            self.u = wanted + (self.u - wanted) * math.exp(-h / self.lag) if self.lag else wanted
-            mean = (start + self.u) / 2 if self.lag else wanted
-            self.x += h * self.v + h * h / 2 * mean
-            self.v += h * mean
-        return [self.x, self.v, (self.v - before) / CYCLE]
-
-
-CART = fp.Plant(
-    coordinates={"x": "m"},
-    inputs={"u": "m/s^2"},
-    parameters={"b": fp.Parameter(approximate=1.0, exact=1.0, unit="1")},
-    response=lambda _q, _v, u, p: {"x": p.b * u.u},
-)
-FORM = fp.ModelReferenced(fp.Affine(gain=-1.0))
-
-
-def cart(late: float = 0.0, lag: float = 0.0) -> fp.Problem:
-    body = Cart(round(late / CYCLE), lag)
-    return fp.Problem(
-        plant=CART,
-        reality=fp.ExternalPlant(body, measures={"x": "m", "x'": "m/s", "x''": "m/s^2"}, lag={"u": lag}),
-        dead_time=fp.DeadTime(inputs={"u": late}),
-        reference=fp.Trajectory(lambda t: {"x": 1 - ca.cos(2 * t)}),
-        start={"x": 0.0},
-        period=CYCLE,
-        duration=3.0,
-        limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
-    )
-
-
-def law(form: Deformation) -> fp.ComputedTorque:
-    return fp.ComputedTorque(fp.Exponential(rate=3.0, integral=False), form)
-
-
-def deformed(one: fp.Problem, form: fp.ModelReferenced) -> float:
-    """Largest difference between request and desired response."""
-    result = run(one, law(form))
-    assert result.stop is None
-    return float(np.abs(result["deformed"] - result["desired"]).max())
-
-
-@pytest.mark.parametrize("facts", [{"late": LATE * CYCLE}, {"lag": LAG}], ids=["dead time", "lag"])
-def test_an_exact_model_is_left_alone_behind_what_the_body_states(facts):
-    """The form that knows of nothing deforms what needs no deformation."""
-    one = cart(**facts)
-    unknowing = fp.ModelReferenced(FORM.map, cycles=0.0, lag=0.0)
-    assert deformed(one, FORM) < 0.06 * deformed(one, unknowing)

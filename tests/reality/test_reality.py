@@ -20,7 +20,6 @@ from helpers.drives import (
     slow_sensor,
     task,
 )
-from helpers.tasks import made
 from scipy.linalg import expm
 
 import fpirhc as fp
@@ -36,22 +35,6 @@ def test_reality_equal_to_the_model_changes_no_bit(controller, sensing):
     for name in one.layout.names:
         assert np.array_equal(one[name], other[name]), name
     assert set(other.layout.names) == {*one.layout.names, "reality_state"}
-
-
-def test_an_output_in_place_of_a_coordinate_changes_no_signal():
-    """The lagged plant by its states, whose own names are others, shows the model's coordinate as an output."""
-    states = fp.Plant.of_states(
-        states={"place": "m", "speed": "m/s", "F": "N"},
-        inputs={"u": "N"},
-        parameters=lagged().parameters,
-        rates=lambda x, u, p: {"place": x.speed, "speed": p.b * x.F, "F": (u.u - x.F) / p.tau},
-        outputs={"y": fp.Output("m", lambda x, p: x.place)},
-    )
-    start = {"place": 0.1, "speed": 0.0, "F": 0.0}
-    realities = fp.Reality(lagged(), start={"F": 0.0}), fp.Reality(states, start=start)
-    one, other = (run(task(reality=r), CONTROLLERS["plain form"]) for r in realities)
-    for name in set(one.layout.names) - {"reality_state"}:
-        np.testing.assert_allclose(other[name], one[name], rtol=1e-12, atol=1e-12, err_msg=name)
 
 
 def test_lagged_reality_moves_as_the_matrix_exponential_says():
@@ -140,18 +123,6 @@ def test_gain_of_the_wrong_sign_is_refused_behind_a_lag():
         run(task(reality=fp.Reality(lagged(gain=-2.0), start={"F": 0.0})), CONTROLLERS["plain form"])
 
 
-def test_comparison_and_report_show_what_moves(tmp_path):
-    """Its own states are on the page, and the factor of the iteration is that of a whole cycle."""
-    problem = task(reality=fp.Reality(lagged(), start={"F": 0.0}))
-    map_ = fp.Increment(fp.Affine(gain=-0.2), cycles=0)
-    pair = {"CTC": fp.ComputedTorque(TRACK), "CTC+FPI": fp.ComputedTorque(TRACK, map_)}
-    comparison = fp.compare(made(problem, pair, headline=("CTC", "CTC+FPI")), seed=0, compiled=False)
-    factor = comparison.entries[1].metrics["contraction.predicted"][""]
-    assert factor == pytest.approx(1 - 0.1 * 2.0 * (1 - np.exp(-PERIOD / TAU)), abs=1e-6)
-    fp.write_report(comparison, tmp_path / "report.html")
-    assert "reality: F" in (tmp_path / "report.html").read_text()
-
-
 # A reality with other states than the model needs only what is measured, controlled or judged; the rest is believed
 
 
@@ -230,15 +201,6 @@ def test_what_nobody_measures_may_have_any_name(controller):
         np.testing.assert_array_equal(renamed[name], whole[name], err_msg=name)
     assert renamed.layout["plant_state"].elements == ("c1",)
     np.testing.assert_array_equal(renamed["plant_state.c1"], whole["plant_state.c1"])
-
-
-def test_the_belief_is_nobodys_state():
-    """Blood is given nearly as it is measured; the tissue follows from the model, and no tissue of the reality is like it."""
-    result = run(other(), BLOOD)
-    np.testing.assert_allclose(result["state.c1"], result["plant_state.c1"], atol=1e-3)
-    assert np.ptp(result["state.c2"]) > 0.1
-    for own in ("fast", "slow"):
-        assert np.abs(result["state.c2"] - result[f"reality_state.{own}"]).max() > 0.5
 
 
 def test_no_cost_of_states_that_do_not_exist():
