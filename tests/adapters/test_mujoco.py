@@ -89,29 +89,6 @@ def test_adaptation_pays_behind_dry_friction_and_a_tool_that_nobody_weighed():
         assert error["adapted"][joint] < 0.1 * error["alone"][joint]
 
 
-@pytest.mark.outside
-def test_a_probe_finds_the_coupling_and_a_setting_at_least_as_good_as_one_by_hand():
-    """The tool makes the forearm's inertia many times larger, so its gain is far below 1; nothing is late and nothing lags."""
-    task, law = problem(REAL, 3.0), fp.ComputedTorque(fp.Exponential(rate=8.0))
-    found = fp.probe(task, law, cycles=300, seed=3)
-    assert [one.high for one in found.dead_time.values()] == [0, 0]
-    assert max(one.high for one in found.lag.values()) < PERIOD
-    assert found.gain["elbow"]["elbow"].high < 0.2
-    assert found.gain["shoulder"]["shoulder"].low > 0.7
-    assert found.deformation is not None
-    errors = []
-    for deformation in (
-        found.deformation,
-        fp.Affine(gain=-0.6),
-        fp.Affine(gain=-1.6),
-        fp.ModelReferenced(fp.Affine(gain=-1.6)),
-    ):
-        run = fp.simulate(task, law.with_deformation(deformation), seed=0, compiled=False)
-        errors.append([fp.measure(task, run).rms_error[joint] for joint in MODEL.coordinates])
-    for joint in (0, 1):
-        assert errors[0][joint] <= 1.2 * min(one[joint] for one in errors[1:])
-
-
 def test_an_unstable_body_is_a_bad_answer_of_every_later_cycle(tmp_path, monkeypatch):
     """MuJoCo puts it back to its start, from where the run went on and was complete."""
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a file of its warnings
@@ -124,29 +101,6 @@ def test_an_unstable_body_is_a_bad_answer_of_every_later_cycle(tmp_path, monkeyp
         first = next(k for k, mistake in enumerate(mistakes) if "unstable" in mistake)
         assert f"MuJoCo says that the simulation is unstable in the cycle from {first * PERIOD:g} s" in mistakes[first]
         assert all(mistakes[first:])
-
-
-def test_names_may_differ():
-    turned = fp.Plant(
-        {"a": "rad", "b": "rad"},
-        {"a_torque": "N m", "b_torque": "N m"},
-        {},
-        lambda q, v, u, p: {"a": u.a_torque, "b": u.b_torque},
-    )
-    names: dict[str, Any] = {
-        "joints": {"a": "shoulder", "b": "elbow"},
-        "actuators": {"a_torque": "M1", "b_torque": "M2"},
-    }
-    one: Any = mujoco_body(REAL, turned, period=PERIOD, **names).body
-    other: Any = mujoco_body(REAL, MODEL, period=PERIOD).body
-    assert np.array_equal(one.reset(0), other.reset(0))
-    assert np.array_equal(one.step(0.0, np.array([3.0, 1.0])), other.step(0.0, np.array([3.0, 1.0])))
-
-
-def test_a_file_is_read_too(tmp_path):
-    (tmp_path / "arm.xml").write_text(REAL)
-    measured: Any = mujoco_body(tmp_path / "arm.xml", MODEL, period=PERIOD).measures
-    assert measured["elbow''"] == "rad/s^2"
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,17 @@
 
 import inspect
 
-import numpy as np
 import pytest
 from helpers.tank import TANK
 
 import fpirhc as fp
-from fpirhc.adapters import derivatives, finite_numbers, steps_per_cycle
+from fpirhc.adapters import steps_per_cycle
 from fpirhc.adapters.commonroad import commonroad_body
 from fpirhc.adapters.fmu import fmu_body
 from fpirhc.adapters.mujoco import mujoco_body
 from fpirhc.adapters.rotorpy import rotorpy_body
 from fpirhc.adapters.tclab import tclab_body
-from fpirhc.errors import InvalidField, InvalidProblem, InvalidValue, Mistakes
+from fpirhc.errors import InvalidField, InvalidProblem
 
 
 def test_a_wrong_argument_of_an_adapter_is_named():
@@ -45,14 +44,6 @@ def test_a_clock_and_a_physics_engine_refuse_a_model_whose_time_is_not_in_second
         use("mine_body")
 
 
-def test_a_derivative_beyond_the_second_is_a_mistake():
-    """It was an index error inside."""
-    mistakes = Mistakes("mine")
-    assert derivatives(mistakes, ["x''", "y'''"]) == {"x''": ("x", 2), "y'''": ("y", 3)}
-    with pytest.raises(InvalidProblem, match=r"^mine: y is of a higher order than 2 in the model"):
-        mistakes.raise_if_any()
-
-
 def test_what_a_package_raises_has_the_adapters_name(tmp_path):
     """What is no archive is told by the package in its own words, and a file that is not there by its name."""
     pytest.importorskip("fmpy", reason="it needs the extra fpirhc[outside]")
@@ -60,10 +51,3 @@ def test_what_a_package_raises_has_the_adapters_name(tmp_path):
     for name, words in (("no.fmu", "fmu_body: BadZipFile: File is not a zip file"), ("absent.fmu", "cannot be read")):
         with pytest.raises(InvalidProblem, match=words):
             fmu_body(str(tmp_path / name), TANK, period=0.1, measures={"h": "h"})
-
-
-@pytest.mark.parametrize("given", [np.zeros(3), "up", [1.0, np.nan], None, [[1.0, 2.0]]])
-def test_numbers_have_names(given):
-    assert finite_numbers("step", [1, 2.0], ("Q1", "Q2")) == pytest.approx([1.0, 2.0])
-    with pytest.raises(InvalidValue, match=r"step\(.*\): expected a finite number for each of Q1, Q2"):
-        finite_numbers("step", given, ("Q1", "Q2"))

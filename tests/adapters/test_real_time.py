@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import warnings
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -102,13 +101,6 @@ def test_a_cycle_that_is_a_little_late_is_caught_up():
     assert machine.tank.now == pytest.approx(1.0 + 4 * PERIOD)
 
 
-def test_a_run_goes_on_behind_a_command_that_hangs():
-    machine = Machine("hangs")
-    one = run(task(machine, holds=1))
-    assert one.stop is None
-    assert list(np.flatnonzero(one["foreign_held"])) == [3]
-
-
 @pytest.mark.parametrize(
     ("bad", "cycles", "ends"),
     [
@@ -139,20 +131,6 @@ def test_a_machine_is_left_with_what_rests_however_a_run_ends(bad, cycles, ends)
         if bad == "network"
         else []
     )
-
-
-def test_an_exception_of_a_caller_ends_the_machine_too():
-    machine = Machine()
-
-    def progress(done, _cycles):
-        if done == 10:
-            raise ZeroDivisionError
-
-    with suppress(ZeroDivisionError):
-        controller = fp.ComputedTorque(fp.Exponential(rate=2.0))
-        fp.simulate(task(machine), controller, seed=0, compiled=False, progress=progress)
-    assert machine.log[-2:] == [0.25, "close"]
-    assert len(machine.times) == 11
 
 
 def test_what_rests_is_stated():

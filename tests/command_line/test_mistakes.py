@@ -1,14 +1,12 @@
 """Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 from mutated_problems import SOURCE, raw_error
 
 import fpirhc as fp
-from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidField
 
 
@@ -17,54 +15,6 @@ def test_all_mistakes_of_a_value_are_said_together():
     with pytest.raises(InvalidField, match=r"(?s)3 mistakes.*no field 'scal'.*Sigmoid.gain.*Sigmoid.shift") as caught:
         fp.Sigmoid(**wrong)
     assert "test_mistakes.py, line" in str(caught.value)
-
-
-@dataclass(frozen=True)
-class ExternalPlant(Deformation):
-    """A map of another distribution, which has no line for checks."""
-
-    gain: float
-    inner: Deformation | None = None
-    spans: dict[str, tuple[float, float]] = field(default_factory=dict)
-
-    def step(self, request, response, desired, memory):
-        del request, response
-        return desired, memory
-
-    def effective_gain(self):
-        return 0.0
-
-    def secant_gain(self):
-        return 0.0
-
-    def with_effective_gain(self, gain):
-        del gain
-        return self
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"gain": "a"}, "ExternalPlant.gain: expected a number, got the text 'a'"),
-        (
-            {"gain": 1.0, "inner": fp.Sigmoid},
-            "ExternalPlant.inner: expected a Deformation or None, got the class Sigmoid; write Sig",
-        ),
-        (
-            {"gain": 1.0, "spans": {"a": (1.0, "b")}},
-            r"ExternalPlant.spans\['a'\]\[1\]: expected a number, got the text 'b'",
-        ),
-        ({"gain": 1.0, "spans": {1: (1.0, 2.0)}}, "ExternalPlant.spans: name 1: expected a text, got 1"),
-        ({"gain": True}, "expected a number, got True"),
-        ({"gain": float("nan")}, "expected a number, got nan"),
-        ({}, r"ExternalPlant needs gain; write ExternalPlant\(gain=\.\.\.\)"),
-    ],
-)
-def test_a_class_of_another_distribution_is_checked_without_a_line_of_its_own(settings, message):
-    with pytest.raises(InvalidField, match=message):
-        ExternalPlant(**settings)
-    whole: Any = np.int64(2)
-    assert ExternalPlant(np.float64(1.0), ExternalPlant(2), {"a": (1, whole)}).gain == 1.0
 
 
 # --- Random mistakes --------------------------------------------------------------------------------------------------

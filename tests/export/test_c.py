@@ -26,9 +26,6 @@ HOSTILE = CHANGED + (
     "problem = replace(problem, plant=replace(problem.plant, coordinates=names))\n"
     'controllers["law */ #error\\nexit(1); /* "] = controllers["CTC"]\n'
 )
-WEIGHTS = CHANGED + (
-    'controllers["CTC"] = fp.ComputedTorque(fp.Exponential(6.0), fp.Affine(gain=-0.2, weights=(0.9, 0.5)))\n'
-)
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)"),
     "plan": ("two_mass", "RHC+FPI"),
@@ -148,26 +145,6 @@ def test_a_device_refuses_wrong_settings_and_never_leaves_the_limits_of_the_buil
     assert f"#define ARM_MEMORY {device.stepper.memory.size} " in header
     assert [row["unit"] for row in layout["trace"]] == list(device.stepper.signals.units)
     assert {*layout["bounds"]} == {"deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1"}
-
-
-PAIR = r"""
-#include "arm.h"
-#include <stdio.h>
-int main(void) {
-  static arm_controller c;
-  arm_init(&c);
-  printf("%d%d", arm_set(&c, ARM_SET_DEFORMATION_WEIGHTS_0, 0.8), arm_set(&c, ARM_SET_DEFORMATION_WEIGHTS_1, 0.6));
-  return 0;
-}
-"""
-
-
-def test_two_weights_of_a_list_are_no_interval(tmp_path):
-    """The first may be above the second, as Python takes them."""
-    live = ("deformation.weights.0", "deformation.weights.1")
-    device = exported(tmp_path / "device", of_text(WEIGHTS, tmp_path), "CTC", live=live)
-    (device.folder / "set.c").write_text(PAIR)
-    assert output(built(device.folder, main="set.c")) == "11"
 
 
 SINGLE = r"""

@@ -98,31 +98,6 @@ def test_a_unit_is_valid_and_its_commands_are_those_of_the_stepper_bit_by_bit(na
 
 
 @needs_compiler
-def test_a_loop_of_unit_and_plant_is_the_run_where_inputs_pass_through_and_late_where_they_do_not(tmp_path):
-    """A master that exchanges after each step alone is a dead time of one period: newtons off."""
-    device, path = of_case("plan", tmp_path)
-    problem = replace(device.problem, duration=500 * device.problem.period, measure_from=0.0)
-    run = fp.simulate(problem, device.controller, seed=0, compiled=False)
-    plant, advance = problem.plant, problem.integrator.step(problem.plant, problem.period)
-    apart = []
-    for late in (False, True):
-        state, realised, worst = run["state"][0], run["realised"][0], 0.0
-        held = np.asarray(problem.inputs_before, dtype=float)
-        with master(path) as unit:
-            for k in range(500):
-                unit.set(unit.inputs, np.concatenate([state, realised]))
-                new = np.array(unit.get(unit.outputs))
-                command, held = (held, new) if late else (new, new)
-                worst = max(worst, np.abs(command - run["command"][k]).max())
-                unit.step(k * problem.period, problem.period)
-                state = advance(state, command, plant.exact, np.zeros(advance.numel_in(3))).full().ravel()
-                realised = plant.equations.response(state, command, plant.exact).full().ravel()
-        apart.append(worst)
-    assert apart[0] < 1e-11
-    assert apart[1] > 1.0
-
-
-@needs_compiler
 def test_what_a_master_may_not_do(tmp_path):
     """Wrong settings, other steps, steps that begin elsewhere, numbers that are computed: refused, and the unit stays as it was."""
     device, path = of_case("torque", tmp_path)
@@ -168,20 +143,6 @@ def test_a_reset_begins_anew(tmp_path):
         other.set(other.inputs, samples[0])
         assert other.get(other.outputs) == said[0]
     assert said[20:] == said[:20]
-
-
-@needs_compiler
-def test_what_is_read_before_the_start_is_not_the_command_of_the_start(tmp_path):
-    """The reference is another one at t = 5 s."""
-    said = []
-    with master(of_case("torque", tmp_path)[1]) as unit:
-        for early in (True, False):
-            unit.unit.reset()
-            if early:
-                unit.get(unit.outputs)
-            unit.begin(5.0)
-            said.append(unit.get(unit.outputs))
-    assert said[0] == said[1]
 
 
 def test_the_same_controller_gives_the_same_archive(tmp_path):

@@ -6,10 +6,7 @@ from typing import Any
 import casadi as ca
 
 import fpirhc as fp
-from fpirhc.contracts import Controller
-from helpers.plants import simulated
 
-TRACK = fp.Exponential(rate=6.0)
 OPTIMISER = fp.FixedPoint(iterations=3, tolerance=1e-2)
 ARM = {"l1": 0.5, "l2": 0.4}  # m
 
@@ -82,11 +79,6 @@ def sedated(plant: fp.Plant, **settings: Any) -> fp.Problem:
         plant=plant, reference=fp.Trajectory(motion), start=start, period=1 / 60, duration=20.0, measure_from=3.0,
         **{"limits": limits, **settings},
     )  # fmt: skip
-
-
-def depth_error(problem: fp.Problem, controller: Controller) -> float:
-    """Rms error of the depth."""
-    return fp.measure(problem, simulated(problem, controller)).rms_error["depth"]
 
 
 def planned(**settings: Any) -> fp.Problem:

@@ -136,18 +136,6 @@ def test_members_from_abroad_are_found_and_keep_the_laws(abroad: Path) -> None:
     assert "Named" in families["controllers"]
 
 
-def test_review_speaks_of_members_from_abroad(abroad: Path) -> None:
-    answer = run(abroad, "-m", "fpirhc", "review", "masses.py", "--json")
-    assert answer.returncode in (0, 1), answer.stderr
-    document = json.loads(answer.stdout)["answers"]
-    assert set(document) == {"problem", "poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
-    for name in set(document) - {"problem"}:
-        [follows] = [a for a in document[name] if a["key"] == "follows"]
-        assert follows["verdict"] in ("yes", "caution"), name
-    [gain] = [a for a in document["poles+clipped"] if a["key"] == "gain"]
-    assert gain["verdict"] in ("yes", "caution")
-
-
 def test_compare_runs_members_from_abroad(abroad: Path) -> None:
     """The table has them all, the plan's metrics reach through two wrappers."""
     wrong = run(abroad, "-m", "fpirhc", "compare", "masses.py", "--plans", "--optimisers", "projected-gradien")
@@ -159,16 +147,3 @@ def test_compare_runs_members_from_abroad(abroad: Path) -> None:
     errors = {name: one["metrics"]["rms_error"]["q1"] for name, one in document["controllers"].items()}
     assert document["controllers"]["RHC"]["metrics"]["plans"][""] > 0
     assert errors["poles+clipped"] < 0.5 * errors["poles"]
-
-
-@pytest.mark.slow
-def test_check_measures_members_from_abroad(abroad: Path) -> None:
-    """A baseline is written and checked, with all of them."""
-    written = run(
-        abroad, "-m", "fpirhc", "accept", "masses.py", "--reason", "first numbers", "--no-compile", "--seeds", "2"
-    )
-    assert written.returncode == 0, written.stderr
-    [baseline] = (abroad / "baselines").glob("*.json")
-    members = {"poles", "poles+clipped", "saturated+FPI", "learner", "RHC"}
-    assert set(json.loads(baseline.read_text())["controllers"]) == members
-    assert run(abroad, "-m", "fpirhc", "check", "masses.py", "--no-compile").returncode == 0

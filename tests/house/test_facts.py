@@ -1,13 +1,13 @@
 """Generic code asks objects for facts: what a user adds is treated as what ships, a wrapper of a wrapper as what it is made of."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import pytest
 from helpers import tasks
 from helpers.reviewed import answers, mass, torque
 
 import fpirhc as fp
-from fpirhc.contracts import Block, Controller, Deformation, Layout, closing_blocks, reference_block
+from fpirhc.contracts import Controller
 from fpirhc.errors import NotSupported
 
 TRACK = fp.Exponential(rate=6.0)
@@ -24,27 +24,6 @@ FILTER = fp.DisturbanceKalman(drift={"q": 1e-3}, measured={"q": 1e-4, "q'": 1e-4
 
 
 # What a user writes
-
-
-@dataclass(frozen=True)
-class Gentle(Deformation):
-    """r+ = r + (gain / 2) (f - d), as Affine, but a user's own."""
-
-    gain: float
-
-    def step(self, request, response, desired, memory):
-        """Return r + (gain / 2) (f - d)."""
-        del memory
-        return request + 0.5 * self.gain * (response - desired), {}
-
-    def effective_gain(self):
-        return -0.5 * self.gain
-
-    def secant_gain(self):
-        return -0.5 * self.gain
-
-    def with_effective_gain(self, gain):
-        return replace(self, gain=-2 * gain)
 
 
 @dataclass(frozen=True)
@@ -66,21 +45,6 @@ class Named(Controller):
         return self.wrapped.blocks(built)
 
 
-@dataclass(frozen=True)
-class Follower(Controller):
-    """A user's own controller: the reference's response is the desired one."""
-
-    deformation: Deformation = field(default_factory=fp.Identity)
-
-    def blocks(self, built):
-        response = built.plant.response_signal
-        closing, delays = closing_blocks(built, self.deformation)
-        wanted = response("_reference_response")
-        both = Layout((response("nominal"), response("desired")))
-        copy = Block("copy", Layout((wanted,)), both, lambda s: dict.fromkeys(both.names, s._reference_response))
-        return [reference_block(built), copy, *closing], delays
-
-
 def twice(controller: Controller) -> Named:
     """A user's wrapper of a user's wrapper."""
     return Named(Named(controller), label="outer")
@@ -89,22 +53,7 @@ def twice(controller: Controller) -> Named:
 # Deformations
 
 
-def test_a_users_map_is_reviewed_as_the_shipped_one_that_it_equals():
-    """R - 0.25 h, once as Affine and once as a user's own map: the same answers to every question, by its own name."""
-    own, shipped = (answers(mass(limits=LIMITS), fp.ComputedTorque(TRACK, d)) for d in (Gentle(-0.5), fp.Affine(-0.5)))
-    assert own
-    assert own == shipped
-
-
 # Automatic settings
-
-
-def test_a_users_controller_takes_the_recommended_map():
-    """The scale of Sigmoid(gain=-0.5) is chosen for it, wrapped or not."""
-    one = Follower(fp.Sigmoid(gain=-0.5))
-    runs = [fp.simulate(mass(duration=0.1), wrapped, seed=0, compiled=False) for wrapped in (one, twice(one))]
-    assert runs[0].stop is None
-    assert runs[0].log.tobytes() == runs[1].log.tobytes()
 
 
 # Controllers

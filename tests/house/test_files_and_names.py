@@ -78,16 +78,6 @@ def test_the_micro_sign_is_the_letter_that_python_reads():
     assert np.array_equal(run(driven("\N{MICRO SIGN}")).log, run(driven("mu")).log)
 
 
-@pytest.mark.parametrize("late", [0.3 - 0.2 - 0.1, 1e-13])
-def test_a_dead_time_below_rounding_changes_nothing(late):
-    late = abs(late)
-    assert late > 0
-    plain = driven("mu")
-    one = replace(plain, dead_time=fp.DeadTime(inputs={"F": late}, measurement=late))
-    late_run, plain_run = run(one), run(plain)
-    assert all(np.array_equal(late_run[name], plain_run[name]) for name in ("command", "plant_state"))
-
-
 def test_a_run_that_is_not_finite_is_not_complete(tmp_path):
     """Whoever made its log; in its words, and after it was saved and loaded."""
     one = run(driven("mu"))

@@ -7,7 +7,6 @@ import casadi as ca
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.contracts import is_finite, status_of
 
 PLANT = fp.Plant(
     coordinates={"y": "m"},
@@ -24,25 +23,6 @@ def planned(optimiser: Any, limits: fp.Limits) -> fp.Run:
     horizon, start = fp.Horizon(5, 0.2), {"y": 2.0, "y'": 1.0}
     problem = fp.Problem(PLANT, REST, start, period=0.1, duration=0.2, limits=limits, horizon=horizon, cost=cost)
     return fp.simulate(problem, fp.RecedingHorizon(optimiser), seed=0, compiled=False)
-
-
-def test_a_clamp_turns_nan_into_a_full_command():
-    """CasADi's fmin and fmax drop NaN; a controller holds its last command instead."""
-    assert float(ca.fmin(1, ca.fmax(-1, ca.DM(np.nan)))) in (-1.0, 1.0)
-    limits = fp.Limits(inputs={"u": (-1.0, 1.0)})
-    problem = fp.Problem(plant=PLANT, reference=REST, start={"y": 0.0}, period=0.01, duration=0.1, limits=limits)
-    stepper = fp.Stepper(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)), compiled=False)
-    command, memory = stepper.step(0.0, np.array([0.01, 0.0]), np.zeros(1), stepper.start())
-    assert 0 < abs(command[0]) < 1
-    held, _ = stepper.step(0.01, np.array([np.nan, 0.0]), np.zeros(1), memory)
-    assert held[0] == command[0]
-
-
-def test_a_maximum_hides_nan_in_a_residual():
-    """A residual folded with fmax would report convergence; the status asks for finiteness."""
-    nan = ca.DM(np.nan)
-    assert float(ca.fmax(nan, 0.0)) == 0.0
-    assert fp.Status(int(ca.DM(status_of(is_finite(nan), nan, 0.0, 1e-6)))) == fp.Status.NON_FINITE
 
 
 def test_osqp_fills_infeasible_answers_with_finite_numbers():

@@ -10,7 +10,7 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc.errors import InvalidField, InvalidName, InvalidShape, InvalidValue
+from fpirhc.errors import InvalidField, InvalidName
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.02, measure_from=0.0))
 adaptive = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
@@ -40,18 +40,6 @@ def test_the_rows_of_a_run_are_offered(run):
         run[0]
     with pytest.raises(InvalidName, match=r"Did you mean 'error'\?"):
         run["eror"]
-
-
-def test_a_layout_packs_numbers_only(run):
-    layout = run.layout
-    with pytest.raises(InvalidValue, match="'time' is made of numbers"):
-        layout.pack({"time": "now"})
-    with pytest.raises(InvalidName, match="Valid: "):
-        layout.pack({1: 2.0})
-    with pytest.raises(InvalidShape, match="'error' has 2 entries, got 1"):
-        layout.pack({"error": 1.0})
-    with pytest.raises(InvalidField, match=r"save\.path: expected"):
-        run.save(5)
 
 
 def pendulum(value):
@@ -97,23 +85,3 @@ def test_names_of_the_inner_modules_are_offered_as_those_of_the_package():
         with pytest.raises(InvalidName, match=f"Did you mean '{meant}'"):
             getattr(module, name)
         assert not hasattr(module, "_no_such_name")
-
-
-def test_mistakes_name_what_was_written():
-    """The call, the disturbance, the wrapper; each name once."""
-    mistaken: Any = {"nominal": "warm", "formula": lambda t: None}
-    with pytest.raises(InvalidField, match=r"outside\.nominal: expected a number"):
-        fp.outside(nominal=mistaken["nominal"], unit="K")
-    with pytest.raises(fp.FpirhcError, match="disturbances: 'Q2': disturbance must be one scalar expression, got None"):
-        replace(brief(), disturbances={"Q1": fp.Step(1.0, 2.0), "Q2": fp.Formula(mistaken["formula"])})
-    late, drift = fp.ComputedTorque(fp.Exponential(rate=6.0)), dict.fromkeys(("q1", "q2"), 1.0)
-    twice: list[Any] = [
-        fp.Predicted(fp.Predicted(late, inputs=1e-2), inputs=1e-2),
-        fp.Estimating(fp.Estimating(late, fp.DisturbanceKalman(drift, drift)), fp.DisturbanceKalman(drift, drift)),
-    ]
-    for one in twice:
-        with pytest.raises(fp.FpirhcError, match=f"{type(one).__name__} stands around another {type(one).__name__}"):
-            fp.simulate(brief(), one, seed=0, compiled=False)
-    unknown = fp.Estimating(late, fp.DisturbanceKalman({"q": 1.0}, drift))
-    with pytest.raises(fp.FpirhcError, match=r"coordinate 'q' is unknown.* Valid: q1, q2\."):
-        fp.simulate(brief(), unknown, seed=0, compiled=False)

@@ -1,15 +1,12 @@
 """Learning the model: estimates equal batch formulas, remove offsets, keep bounds, and are refused where they cannot work."""
 
 import math
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
-import scipy.linalg
-import scipy.optimize
 from helpers.plants import linear
 
 import fpirhc as fp
@@ -79,24 +76,6 @@ def feedback(problem: fp.Problem) -> float:
     return -float(plan.inputs[0, 0]) / 1e-3
 
 
-def test_the_gain_is_that_of_the_stationary_filter():
-    """Against the Riccati equation of a double integrator written out by hand, solved by scipy and by iterating it."""
-    problem = task(linear(1.0, 1.0))
-    filter = fp.DisturbanceKalman(drift={"y": 2.0}, measured={"y": 1e-3}, noise={"y": 0.5})
-    h = PERIOD
-    a = np.array([[1, h, h**2 / 2], [0, 1, h], [0, 0, 1]])
-    b, c = np.array([[h**2 / 2], [h], [0]]), np.array([[1.0, 0, 0]])
-    q, r = 0.5**2 * b @ b.T + np.diag([0, 0, 2.0**2 * h]), np.array([[1e-6]])
-    p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
-    result = filter.gain(replace(problem, plant=filter.model(problem.plant)))
-    np.testing.assert_allclose(result, p @ c.T / (c @ p @ c.T + r), rtol=1e-8)
-    s = np.eye(3)
-    for _ in range(3000):
-        gain = s @ c.T @ np.linalg.inv(c @ s @ c.T + r)
-        s = a @ (s - gain @ c @ s) @ a.T + q
-    np.testing.assert_allclose(result, gain, rtol=1e-6)
-
-
 class Fed:
     """An estimator stepped over given pairs by hand."""
 
@@ -145,19 +124,6 @@ def test_recursive_least_squares_are_the_batch_ones(time):
         estimates = fed(*pair)
         expected, *_ = batch(plant, data[:k], factor ** np.arange(k - 1, -1, -1), factor**k)
         np.testing.assert_allclose(estimates, expected, rtol=1e-7, atol=1e-10)
-
-
-@pytest.mark.parametrize("build", [fp.RecursiveLeastSquares])
-def test_forgetting_follows_a_jump(build):
-    """The gain b doubles: with forgetting the estimate is there soon, without it stays in between."""
-    before, after = spring(b=1.0), spring(b=2.0)
-    collected = {}
-    for time in (0.3, math.inf):
-        fed = Fed(task(before), build(SPRING, NOISE, time))
-        for pair in [*pairs(300, before), *pairs(150, after, seed=4)]:
-            collected[time] = fed(*pair) + before.approximate
-    assert collected[0.3][1] == pytest.approx(2.0, abs=0.1)
-    assert collected[math.inf][1] < 1.6
 
 
 @pytest.mark.parametrize("build", [fp.RecursiveLeastSquares])

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from typing import Any
 
-import abroad
 import casadi as ca
 import numpy as np
 import pytest
@@ -68,36 +67,6 @@ def test_an_estimated_response_teaches_the_parameters():
     problem = spring(sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=11, degree=3)), duration=8.0)
     result = run(problem, fp.Estimating(TRACK, LEARNERS["RLS"]))
     assert np.abs(result["estimate"][-1] / [3.0, 1.0] - 1).max() < 0.02
-
-
-def test_a_rule_of_inverse_dynamics_learns_behind_dead_time():
-    """Mass and stiffness of y'' = (u - k y) / m by projection inside Slotine and Li's controller, with a command 30 ms late."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        parameters={"k": fp.Parameter(2.0, 3.0, "N/m"), "m": fp.Parameter(1.5, 1.0, "kg")},
-        response=lambda q, v, u, p: {"y": (u.u - p.k * q.y) / p.m},
-    )
-    problem = spring(plant=plant, dead_time=fp.DeadTime(inputs={"u": 0.03}), duration=10.0)
-    bounds = {"k": (0.0, 10.0), "m": (0.2, 5.0)}
-    result = run(problem, fp.rivals.SlotineLi(2.0, {"y": 4.0}, fp.Projection(gain=0.1), bounds))
-    assert result.stop is None
-    np.testing.assert_allclose(result["estimate"][-1], [3.0, 1.0], atol=1e-3)
-
-
-def test_offset_free_control_works_behind_dead_time():
-    """Four tanks of others with late pumps: the disturbance model leaves less than .6 of the level's error, transients included."""
-    task = abroad.load("quadruple_tank")
-    late = fp.DeadTime(inputs=dict.fromkeys(task.problem.plant.inputs, 2 * task.problem.period))
-    problem = replace(task.problem, dead_time=late)
-    plain = task.controllers["RHC"]
-    filter = fp.DisturbanceKalman({"h1": 0.1, "h2": 0.1}, {"h1": 1e-2, "h2": 1e-2}, noise={"h3": 0.1, "h4": 0.1})
-    lead = next(iter(late.inputs.values()))
-    errors = [
-        max(fp.measure(problem, run(problem, fp.Predicted(c, inputs=lead))).rms_error.values())
-        for c in (plain, fp.Estimating(plain, filter))
-    ]
-    assert errors[1] < 0.6 * errors[0]
 
 
 # The response in the filter

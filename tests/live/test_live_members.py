@@ -124,13 +124,6 @@ def test_the_switch_of_slots_may_be_live():
     assert all(isinstance(one, float) for one in tried.values()), tried
 
 
-def test_the_poles_of_a_law_on_a_map_are_live():
-    task = fp.load_problem("fishery")
-    assert check_live(task.problem, task.controllers["CTC"], paths=["tracking.poles"], cycles=12) == {
-        "tracking.poles": 1.07
-    }
-
-
 def test_a_symbol_turned_into_a_number_is_refused():
     """CasADi makes NaN of it without an error; the loop is never built."""
 
@@ -149,28 +142,3 @@ def test_a_symbol_turned_into_a_number_is_refused():
 
 
 # Plants whose inverse is Newton's
-
-
-@pytest.mark.parametrize("plan", [False, True])
-def test_every_setting_of_a_plant_with_newtons_inverse_is_live(plan):
-    """A force that grows with the third power of the input: changed equals rebuilt, bit by bit in the virtual machine."""
-    cubic = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        parameters={"b": fp.Parameter(1.0, 1.4, "1/kg")},
-        response=lambda q, v, u, p: {"y": p.b * (u.u + 0.1 * u.u * u.u * u.u) - q.y},
-    )
-    problem = fp.Problem(
-        plant=cubic,
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
-        start={"y": 0.1},
-        period=1e-3,
-        duration=0.1,
-        limits=fp.Limits(inputs={"u": (-50.0, 50.0)}),
-        horizon=fp.Horizon(stages=2, step=1e-2),
-        cost=fp.Quadratic(states={"y": 1e3, "y'": 1.0}, effort={"u": 1e-3}),
-    )
-    law, optimiser = fp.ComputedTorque(fp.Exponential(rate=6.0), SIGMOID), fp.FixedPoint(iterations=1, tolerance=1e-3)
-    paths = ["deformation.gain", "cost.states.y" if plan else "tracking.rate", "limits.inputs.u.1"]
-    tried = check_live(problem, fp.RecedingHorizon(optimiser, SIGMOID) if plan else law, paths=paths, cycles=20)
-    assert all(isinstance(one, float) for one in tried.values()), tried

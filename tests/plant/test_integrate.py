@@ -1,7 +1,5 @@
 """Integrators: order of convergence, and agreement with methods of scipy that control their error."""
 
-import itertools
-
 import casadi as ca
 import numpy as np
 import pytest
@@ -83,27 +81,3 @@ def test_a_stiff_plant_is_sent_to_collocation_which_follows_it():
     with pytest.raises(fp.FpirhcError, match=r"2500 sub-steps; use Reality\(..., integrator=Collocation\(\)"):
         fp.Problem(**asked, reality=fp.Reality(STIFF))
     fp.Problem(**asked, reality=fp.Reality(STIFF), integrator=fp.Collocation())
-
-
-def test_work_of_collocation_grows_as_the_coupling_of_the_states():
-    """A rod of n cells, each coupled with its neighbours: twice the cells, about twice the operations; one Newton step is exact."""
-
-    def step(cells, newton=1):
-        names = [f"T{k}" for k in range(cells)]
-
-        def rates(x, u, p):
-            padded = [x[n] for n in (names[0], *names, names[-1])]
-            flows = [1e3 * (a - b) for a, b in itertools.pairwise(padded)]
-            return {n: flows[k] - flows[k + 1] + (u.heat if k == 0 else 0.0) for k, n in enumerate(names)}
-
-        outputs = {"end": fp.Output("K", lambda x, p: x.T0)}
-        rod = fp.Plant.of_states(
-            states=dict.fromkeys(names, "K"), inputs={"heat": "K/s"}, rates=rates, outputs=outputs, parameters={}
-        )
-        return fp.Collocation(newton=newton).step(rod, 0.1)
-
-    assert step(40).n_instructions() < 2.3 * step(20).n_instructions()
-    x = np.linspace(10.0, 30.0, 20)
-    once, thrice = (step(20, newton)(x, [2.0], [], [0.0] * 20).full() for newton in (1, 3))
-    np.testing.assert_allclose(once, thrice, rtol=1e-10)
-    np.testing.assert_allclose(once.mean(), x.mean() + 0.1 * 2.0 / 20, rtol=1e-10)  # the heat stays in the rod

@@ -103,19 +103,3 @@ def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
 def test_wrong_spreads_are_refused(make, message):
     with pytest.raises(fp.FpirhcError, match=message):
         make()
-
-
-def test_a_review_refuses_what_scenarios_refuse():
-    """The parameter c = 0.5 may shrink by 40 % to its bound of 0.3."""
-    one = plant(c=fp.Parameter(0.5, 0.5, "1", (0.3, 1.0)))
-    reference = fp.Trajectory(lambda t: {"y": ca.sin(t)})
-    problem = fp.Problem(plant=one, reference=reference, start={"y": 0.0}, period=0.01, duration=1.0)
-    law = {"CTC": fp.ComputedTorque(fp.Exponential(rate=6.0))}
-    assert fp.review(problem, law, mismatch=39.0, seed=0).mismatch == 39.0
-    for wrong, words in (
-        (41.0, r"parameter 'c'.*at most 40 % stay inside"),
-        (100.0, "less than 100"),
-        (math.nan, "a number, got nan"),
-    ):
-        with pytest.raises(fp.FpirhcError, match=words):
-            fp.review(problem, law, mismatch=wrong, seed=0)

@@ -4,7 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import pandas as pd
 import pytest
@@ -132,20 +131,6 @@ def error(problem: fp.Problem, deformation: Deformation | None) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("known", [(0.4, 0, 0.0, 0.05), (1.0, 3, 0.0, 0.05)])
-def test_the_choice_is_near_the_best_of_a_grid_by_hand(known):
-    """At most 1.2 times the least error of settings that are given the true gain, dead time and lag."""
-    gain, dead, _, _ = known
-    problem = replace(body_problem(*known), duration=4.0)
-    by_hand = [
-        error(problem, fp.ModelReferenced(fp.Affine(gain=-2 * g / gain), cycles=float(d)))
-        for g in (0.05, 0.15, 0.3, 0.6)
-        for d in {0, dead}
-    ]
-    assert error(problem, fp.probe(problem, RHC).deformation) <= 1.2 * min(by_hand)
-
-
-@pytest.mark.slow
 def test_intervals_contain_the_truth_in_nineteen_of_twenty_records(tmp_path):
     missed, path = 0, tmp_path / "run.csv"
     for seed in range(20):
@@ -153,25 +138,6 @@ def test_intervals_contain_the_truth_in_nineteen_of_twenty_records(tmp_path):
         pairs = (found.gain["q"]["q"], -1.5), (found.dead_time["u"], 2), (found.lag["u"], 0.03)
         missed += not all(one.low <= true <= one.high for one, true in pairs)
     assert missed <= 1
-
-
-@pytest.mark.slow
-def test_a_loop_behind_a_long_window_is_not_refused():
-    """Twice the model's gain, two cycles late, and positions through 31 samples: a gain by hand divides the error by three."""
-    seen = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(1e-4))}, fp.SavitzkyGolay(31, degree=4))
-    problem = replace(body_problem(2.0, 2), duration=4.0, sensing=seen)
-    assert error(problem, fp.probe(problem, RHC).deformation) < error(problem, fp.Identity()) / 3
-
-
-@pytest.mark.slow
-def test_what_a_record_does_not_bound_is_adapted_by_trials_alone():
-    """Forty cycles are a tenth of what a lag of .3 s takes: nothing is proposed untried."""
-    problem = replace(body_problem(1.0, 0, 0.3, 0.05), duration=2.0)
-    untried, found = (fp.probe(problem, RHC, cycles=60, amplitude=1.0, trials=trials) for trials in (False, True))
-    assert untried.why == "the record is too short for the lag: take more cycles"
-    assert untried.deformation is None
-    assert untried.why in found.notes
-    assert found.deformation is None or found.trials[found.why.partition(":")[0]].passes
 
 
 @pytest.mark.slow
@@ -184,17 +150,6 @@ def test_coupled_bodies_are_offered_a_gain_matrix():
     for one in weighted.values():
         product = np.array(one.form.weights) @ np.array([[0.8, 0.6], [0.5, 0.7]])
         assert product == pytest.approx(np.eye(2), abs=0.15)
-
-
-@pytest.mark.slow
-def test_a_model_that_is_not_affine_in_its_input_has_a_choice():
-    """The model is 20 tan(u / 20): no inverse in symbols is needed where all coordinates are controlled."""
-    problem = body_problem(1.6, 0, 0.0, 0.02)
-    bent = replace(problem.plant, response=lambda q, v, u, p: {"q": p.b * 20 * ca.tan(u.u / 20)})
-    task = replace(problem, plant=bent, limits=fp.Limits(inputs={"u": (-15.0, 15.0)}), duration=2.0)
-    found = fp.probe(task, RHC, cycles=100)
-    assert found.deformation is not None
-    assert min(one.error for one in found.trials.values()) < 0.3
 
 
 WRONG_RECORDS = {

@@ -82,43 +82,6 @@ def test_everybody_rests_with_the_basal_dose():
     np.testing.assert_allclose(x[[minute.names.index(n) for n in names]], PUBLISHED, atol=1e-9)
 
 
-def test_the_clinic_knows_the_weight_the_dose_and_the_fasting_glucose():
-    """Its model rests where the person does, with parameters of the group; the emptying of the stomach is not in it."""
-    problem, minute, _, _ = body("child#003")
-    believed, own = problem.plant.parameters, minute.parameters
-    assert {"kmin", "b", "d"}.isdisjoint(believed)
-    for known in ("BW", "basal"):
-        assert believed[known].approximate == own[known].exact
-    for mean in ("kp2", "Vmx", "kabs"):
-        assert believed[mean].approximate != own[mean].exact
-        assert believed[mean].approximate != task().problem.plant.parameters[mean].approximate  # of another group
-
-
-def described(task_of: Any, head: str) -> dict[str, list[float]]:
-    """The rows of the description's table that begins with this head."""
-    lines = task_of.description.splitlines()
-    first = next(k for k, line in enumerate(lines) if line.strip().startswith(head))
-    rows = [line.strip() for line in lines[first + 1 : first + 1 + len(task_of.controllers)]]
-    cells = [[cell.strip() for cell in row.split("  ") if cell.strip()] for row in rows]
-    return {name: [float(number) for number in numbers] for name, *numbers in cells}
-
-
-def test_order_five_is_at_its_limits_and_unsafe():
-    """Nearly every cycle is at a limit of the dose, and every row is below 70 mg/dl for more than 4 % of the time."""
-    of = task("diabetes_order_five")
-    assert of.problem.plant.response_orders == {"glucose": 5}
-    table = described(of, "shares of the time")
-    assert set(table) == set(of.controllers)
-    assert "keeps_rule = ()" in of.path.read_text(encoding="utf-8")
-    for name, controller in of.controllers.items():
-        run = fp.simulate(of.problem, controller, seed=0, compiled=False)
-        glucose = run["output.glucose"]
-        shares = [np.mean((glucose >= 70) & (glucose <= 180)), np.mean(glucose < 70), np.mean(run["clipped"] > 0.5)]
-        assert table[name] == pytest.approx([*(100 * share for share in shares), glucose.min()], abs=0.6)
-        assert shares[1] > 0.04
-        assert shares[2] > 0.95
-
-
 @pytest.mark.parametrize(
     "name", [pytest.param(f"child#{k:03d}", marks=[] if k == 4 else pytest.mark.slow) for k in range(1, 11)]
 )

@@ -142,22 +142,6 @@ def test_it_breaks_away_at_the_static_friction(force, slides):
         assert displacement == pytest.approx(-1.5e-4 * np.log(1 - force / 1.5), rel=0.02)
 
 
-@pytest.mark.slow
-def test_sub_steps_follow_the_bristles():
-    """The plant's own integrator against SciPy's Radau over a reversal with the command of a run: within 1 % of its rms error."""
-    name, controller = "stick_slip", "RHC+FPI"
-    problem, run = task(name).problem, run_of(name, controller)
-    begin, end = 5400, 5600  # x' changes its sign at 5.498 s
-    command, state = run["command"], run["state"]
-    now = np.array(state[begin])
-    for k in range(begin, end):
-        now = solve_ivp(rate_of(problem.plant, command[k]), (0, problem.period), now, "Radau", rtol=1e-9, atol=1e-12).y[
-            :, -1
-        ]
-    assert state[begin, 2] * state[end, 2] < 0
-    assert abs(now[0] - state[end, 0]) < 0.01 * rms(name, controller)
-
-
 # Tumour
 
 
@@ -235,18 +219,6 @@ def test_the_ball_rolls_as_lagrange_has_it():
 
 
 # A house
-
-
-def test_bill_and_comfort_are_those_of_the_description():
-    """The second table, figure by figure."""
-    one, columns = task("building"), ("total", "bill", "outside", "hours_outside")
-    lines = one.description.split("by 0.2 K [h]")[1].split("\n\n")[0].strip().splitlines()
-    assert [line.strip().rsplit(maxsplit=4)[0] for line in lines] == list(one.controllers)
-    for line in lines:
-        name, *numbers = line.strip().rsplit(maxsplit=4)
-        measured = fp.measure(one.problem, run_of("building", name), one.metrics)
-        found = [measured[column][""] for column in columns]
-        assert [float(n) for n in numbers] == pytest.approx(found, abs=0.06, rel=0.02), name
 
 
 def test_an_economic_plan_of_a_day_is_that_of_ipopt():

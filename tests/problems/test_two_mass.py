@@ -42,13 +42,6 @@ def test_equation_six_makes_it_precise():
     np.testing.assert_allclose(response, [0.35, 0.19], rtol=0.05, equal_nan=False)
 
 
-def test_equation_three_does_as_well():
-    """The other map with the same effective gain leaves the same error."""
-    six = late_error(sigmoid(-0.5, scale=20.0))[1]
-    three = late_error(tasks.two_mass.controllers["CTC+FPI (eq 3)"])[1]
-    np.testing.assert_allclose(three, six, rtol=0.05, equal_nan=False)
-
-
 def test_response_error_times_gain_over_period_is_constant():
     """First-order law of a slowly varying task: |h| |A_c| / period = const, within 10 %."""
     constants = []

@@ -105,28 +105,12 @@ def test_it_is_the_extended_filter_of_the_books():
     assert np.linalg.eigvalsh(own).min() > 0
 
 
-def test_adaptation_works_on_believed_states():
-    """The patient is another one than the model's: with FPI the plasma errs a tenth, though three compartments are believed."""
-    errors = {}
-    for name, controller in (("without", CTC), ("with", FPI)):
-        problem = infusion(KALMAN, duration=60.0, measure_from=20.0)
-        errors[name] = fp.measure(problem, run(problem, controller)).rms_error["C1"]
-    assert errors["with"] < 0.1 * errors["without"]
-
-
 def test_a_model_referenced_form_passes_the_null_test_on_believed_states():
     """With an exact model it changes nothing: the twin's response passes the same estimator."""
     problem = infusion(KALMAN, duration=10.0)
     referenced = fp.ComputedTorque(fp.Exponential(rate=0.5), fp.ModelReferenced(fp.Affine(gain=-0.5)))
     first, second = (run(problem, fp.ExactModel(c)) for c in (CTC, referenced))
     np.testing.assert_allclose(first["state"], second["state"], atol=1e-9)
-
-
-def test_a_filter_of_what_is_measured_calms_the_command() -> None:
-    noisy = {n: fp.Sensor(noise=fp.Noise(2e-3)) for n in ("angle", "angle'")}
-    filters = None, fp.KalmanFilter(dict.fromkeys(noisy, 2e-3), {"angle": 0.05})
-    runs = [run(swing(ANGLE, sensing=fp.Sensing(noisy, observer=one)), TRACK)["command"] for one in filters]
-    assert np.abs(np.diff(runs[1], 2, axis=0)).mean() < 0.2 * np.abs(np.diff(runs[0], 2, axis=0)).mean()
 
 
 def test_a_state_that_cannot_be_observed_is_named_before_the_run():
@@ -176,12 +160,6 @@ def fishery(observer: StateObserver, birth: float = 2.5, noise: float = 0.0, **c
     )  # fmt: skip
 
 
-def test_the_right_map_believes_what_is() -> None:
-    result = run(fishery(FILTER), SLOWLY)
-    np.testing.assert_allclose(result["state"], result["plant_state"], atol=1e-12)
-    assert np.ptp(result["plant_state"], axis=0).min() > 0.02
-
-
 def test_a_filter_of_a_map_is_that_of_the_books() -> None:
     """Against a recursion in numpy with a wrong birth rate; noise adds T w to the next state, as a disturbance does."""
     result = run(fishery(FILTER, birth=3.0, noise=0.02), SLOWLY)
@@ -193,42 +171,6 @@ def test_a_filter_of_a_map_is_that_of_the_books() -> None:
     start, noise = (np.array([0.9, 0.7]), np.array([0.1, 0.1])), np.array([0.02, 0.01])
     states, _ = extended_filter(result, step, lambda x: x[1:], start, noise, 0.02)
     np.testing.assert_allclose(result["state"], states, atol=1e-12)
-
-
-def room(observer: StateObserver) -> fp.Problem:
-    """A heated room in known weather: what is felt is measured, air and walls are believed."""
-    plant = fp.Plant.of_states(
-        states={"air": "K", "walls": "K"},
-        inputs={"heat": "kW"},
-        parameters={"loss": fp.Parameter(0.3, 0.3, "kW/K"), "ambient": fp.outside(nominal=280.0, unit="K")},
-        rates=lambda x, u, p: {
-            "air": p.loss * (p.ambient - x.air) + 0.5 * (x.walls - x.air) + u.heat,
-            "walls": 0.1 * (x.air - x.walls) + 0.05 * (p.ambient - x.walls),
-        },
-        outputs={"felt": fp.Output("K", lambda x, p: 0.7 * x.air + 0.3 * x.walls)},
-        time_unit="h",
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"felt": 291.0 + ca.sin(0.3 * t)}),
-        start={"air": 292.0, "walls": 289.0},
-        period=0.25,
-        duration=10.0,
-        signals={"ambient": fp.Known(lambda t: 280.0 + 5.0 * ca.sin(0.4 * t))},
-        sensing=fp.Sensing({}, fp.PositionDifference(), measured=["felt"], observer=observer),
-    )
-
-
-ROOM: dict[str, Any] = {"measured": {"felt": 0.1}, "noise": {"air": 0.1, "walls": 0.1}}
-
-
-def test_a_right_model_in_known_weather_believes_what_is() -> None:
-    """The model moves in the weather of the time of the samples."""
-    problem = replace(room(fp.KalmanFilter(**ROOM)), dead_time=fp.DeadTime(measurement=0.5))
-    result = run(problem, CTC)
-    true = result["plant_state"]
-    assert np.ptp(true[:, 1]) > 0.5
-    np.testing.assert_allclose(result["state"][3:], true[1:-2], atol=1e-9)
 
 
 # Outputs

@@ -199,19 +199,3 @@ def test_a_repeated_time_is_no_missing_cycle():
     sample = 10 * period, np.array([0.5, -0.1])
     assert np.array_equal(stepper.step_measured(*sample, twice)[0], stepper.step_measured(*sample, memory)[0])
     assert status(stepper) == fp.Status.OK
-
-
-@pytest.mark.parametrize("name", ["paired", "SavitzkyGolay", "predicted"])
-def test_a_controller_comes_back_after_any_pause(name):
-    """Of one second or of 25: all cycles are counted, the command is finite, and later ones come from fresh samples."""
-    own = loop(name)
-    stepper, period = own.stepper, own.problem.period
-    row = np.array([0.4, -0.1, *[0.0] * (len(stepper.measures) - 2)])
-    for pause in (200, 5_000):
-        memory, commands = stepper.start(), []
-        for k in [*range(10), *range(10 + pause, 120 + pause)]:
-            command, memory = stepper.step_measured(k * period, row, memory)
-            commands.append(command)
-        assert np.isfinite(commands).all()
-        assert stepper.skipped == pause
-        assert status(stepper) not in {fp.Status.BAD_SAMPLE, fp.Status.BAD_TIME, fp.Status.HELD}

@@ -194,13 +194,6 @@ def test_polynomials_up_to_the_degree_are_met_exactly(estimator, degree):
         np.testing.assert_allclose(state[first:], states[first:], atol=1e-9)
 
 
-def test_noise_of_an_nth_difference():
-    """White noise of deviation sigma becomes sigma sqrt(binomial(2 n, n)) / T^n."""
-    for order in (1, 2, 4):
-        row = fp.PositionDifference().coefficients(order)[-1]
-        assert np.linalg.norm(row) == pytest.approx(math.sqrt(math.comb(2 * order, order)))
-
-
 @pytest.mark.parametrize("estimator", [e for e in ESTIMATORS[1:] if not isinstance(e, fp.LowPassDifference)], ids=str)
 def test_deformation_waits_for_the_window(estimator):
     """Until the window holds samples of the run alone the request is the desired response; estimates are finite from the first."""

@@ -1,13 +1,9 @@
 """The step as a CasADi Function: what a user's own loop and code generation from it do is what the stepper does, bit by bit."""
 
-import subprocess
 from functools import cache
-from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
-from helpers.machine import COMPILER, needs_compiler
 
 import fpirhc as fp
 
@@ -65,39 +61,6 @@ def test_a_loop_of_ones_own_is_the_stepper_bit_by_bit(name):
         shown = {name: value for name, value in stepper.trace().items() if name != "status" or k < 10}
         places = dict(zip(stepper.trace(), np.cumsum([v.size for v in stepper.trace().values()]), strict=True))
         assert all(same(trace[places[n] - v.size : places[n]], v) for n, v in shown.items()), k
-
-
-@needs_compiler
-@pytest.mark.parametrize("name", ["CTC+FPI", "outputs"])
-def test_code_generation_of_ones_own_gives_the_stepper_bit_by_bit(name, tmp_path: Path, monkeypatch):
-    """CasADi's own generator, a compiler, and flat arrays in the order of `reads`."""
-    stepper, rows = case(name)
-    monkeypatch.chdir(tmp_path)  # CasADi writes into the current folder alone
-    stepper.function.generate("step.c", {"with_header": False})
-    compiler = str(COMPILER)
-    flags = ("-shared", "-fPIC", "-O2", "-ffp-contract=off")
-    subprocess.run([compiler, *flags, "step.c", "-o", "step.so", "-lm"], check=True, capture_output=True)
-    function = ca.external(stepper.function.name(), str(tmp_path / "step.so"))
-    own = memory = stepper.start()
-    for k, row in enumerate(rows):
-        own, _, command = (v.full().ravel() for v in function(own, *stepper.reads.unpack(row).values()))
-        expected, memory = stepped(stepper, row, memory)
-        assert same(command, expected), k
-        assert same(own, memory), k
-
-
-def test_a_setting_written_as_an_argument_acts_as_a_change():
-    """'settings' is one argument of the Function, with every setting and nothing else."""
-    stepper, rows = case("RHC+FPI")
-    numbers = {"deformation.gain": -0.7, "cost.states.q1": 900.0}
-    assert stepper.settings["settings"].elements == tuple(stepper.numbers)
-    other = fp.Stepper(*_of("RHC+FPI"), live=list(numbers), compiled=False)
-    assert other.change(numbers)
-    row = rows[3].copy()
-    for path, value in numbers.items():
-        row[stepper.reads.columns.index(f"settings.{path}")] = value
-    command = stepper.function(other.start(), *stepper.reads.unpack(row).values())[2]
-    assert same(command.full().ravel(), stepped(other, row, other.start())[0])
 
 
 def _of(name: str):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
 
 LOOPS = {"two_mass": "RHC+FPI", "tumour": "RHC+FPI", "crane_slots": "slots+FPI"}
 
@@ -28,21 +27,3 @@ def test_a_run_of_what_is_shared_is_that_of_the_problem_that_is_built_anew(name)
         np.testing.assert_array_equal(one.log, other.log)
         assert not np.array_equal(one["plant_state"], first["plant_state"])
     np.testing.assert_array_equal(fp.simulate(problem, plain, seed=0, compiled=False).log, first.log)
-
-
-def test_what_depends_on_them_is_checked_again():
-    """An input without effect with these parameters, and a parameter outside its bounds."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "N"},
-        order=2,
-        response=lambda q, v, u, p: {"q": p.b * u.u - p.k * q.q},
-        parameters={"b": fp.Parameter(1.0, 1.2, "1/kg"), "k": fp.Parameter(1.0, 1.2, "1/s^2", (0.5, 2.0))},
-    )
-    reference = fp.Trajectory(lambda t: {"q": 0.1 * t})
-    problem = fp.Problem(plant=plant, reference=reference, start={"q": 0.0}, period=0.01, duration=1.0)
-    assert problem.with_exact(np.array([0.3, 1.9])).real_plant.exact.tolist() == [0.3, 1.9]
-    with pytest.raises(InvalidProblem, match=r"\(exact parameters\) is not invertible at the start"):
-        problem.with_exact(np.array([0.0, 1.0]))
-    with pytest.raises(InvalidProblem, match="'k': exact is outside"):
-        problem.with_exact(np.array([1.0, 3.0]))

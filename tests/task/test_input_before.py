@@ -68,13 +68,6 @@ def test_the_first_weight_of_a_rate_is_counted_from_it():
             assert planned(problem, optimiser) == pytest.approx(before, abs=1e-4)
 
 
-def test_the_first_limit_of_a_rate_is_counted_from_it():
-    """|u_0 - u before| <= rate step, wherever the input was."""
-    limits = fp.Limits(rates={"u": (-10.0, 10.0)})
-    far = replace(PROBLEM, start={"y": -50.0}, limits=limits, input_before={"u": 3.0}, cost=replace(COST, effort={}))
-    assert planned(far, fp.Ipopt()) == pytest.approx(3.0 + 10.0 * PERIOD, abs=1e-5)
-
-
 def test_it_acts_until_the_first_command_arrives():
     """A mass under a constant force: y = 1 + u t^2 / (2 m) for as long as no command has arrived, by hand."""
     waiting = 0.1
@@ -82,12 +75,3 @@ def test_it_acts_until_the_first_command_arrives():
     run = fp.simulate(late, COMPUTED, seed=0, compiled=False)
     times = run.time[run.time <= waiting + PERIOD / 2]
     np.testing.assert_allclose(run["plant_state.y"][: times.size], 1 + 3.0 * times**2 / (2 * MASS), rtol=1e-12)
-
-
-def test_the_response_before_the_first_cycle_is_that_of_this_input():
-    """Behind a dead time of the measurement the first samples still show the time before the run."""
-    late = replace(PROBLEM, dead_time=fp.DeadTime(measurement=0.03), input_before={"u": 3.0})
-    run = fp.simulate(late, COMPUTED, seed=0, compiled=False)
-    np.testing.assert_allclose(run["realised.y"][:3], 3.0 / MASS, rtol=1e-12)
-    seen = replace(late, sensing=fp.Sensing(sensors={"y": fp.Sensor(quantum=1e-9)}))
-    np.testing.assert_allclose(fp.simulate(seen, COMPUTED, seed=0, compiled=False)["realised.y"][:3], 1.5, rtol=1e-9)

@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
 
 PERIOD, DURATION = 0.25, 30.0  # h
 
@@ -131,20 +130,6 @@ def _moved(logged, period, ambient):
     return np.array(states)
 
 
-def test_a_preview_lowers_the_cost_of_a_known_load():
-    """A cold front at 6 h and a slow boiler: a forecast heats before, no signal never."""
-    front = fp.Samples([0.0, 6.0], [283.0, 268.0])
-    cost = fp.Quadratic(states={"air": 1.0}, rate={"heat": 3.0})
-    choices = {"preview": fp.Known(front), "unknown": fp.Unknown(front)}
-    costs = {}
-    for name, one in choices.items():
-        problem = task(room(OUTSIDE), {"ambient": one}, cost=cost, duration=12.0)
-        logged = run(problem, RHC)
-        assert logged["signals.ambient"][-1] == 268.0
-        costs[name] = fp.measure(problem, logged)["cost"]["total"]
-    assert costs["preview"] < 0.6 * costs["unknown"]
-
-
 LATE: dict[str, tuple[dict[str, Any], fp.ModelReferenced]] = {
     "ideal": ({}, fp.ModelReferenced(fp.Affine(gain=-0.5))),
     "dead time": (
@@ -183,51 +168,6 @@ def test_who_is_told_what():
     right = run(task(room(OUTSIDE), {"ambient": fp.Known(NIGHT)}), CTC)
     assert np.array_equal(exact["signals_told"], exact["signals"])
     assert np.array_equal(exact["state"], right["state"])
-
-
-def test_a_reality_may_have_signals_that_the_model_does_not_have():
-    """The sun shines on the reality alone; both have the weather."""
-
-    def sunny(q, u, p):
-        rates = response(q, u, p)
-        return {**rates, "air": rates["air"] + p.sun / p.heat_capacity}
-
-    model = room(OUTSIDE)
-    plant = replace(model, response=sunny, parameters={**model.parameters, "sun": fp.outside(nominal=0.0, unit="kW")})
-    signals = {"ambient": fp.Known(NIGHT), "sun": fp.Unknown(fp.Samples([0.0, 8.0, 16.0], [0.0, 2.0, 0.0]))}
-    logged = run(task(model, signals, reality=fp.Reality(plant)), CONTROLLERS["CTC+FPI"])
-    assert sorted(c for c in logged.layout.columns if c.startswith("signals")) == [
-        "signals.ambient",
-        "signals.sun",
-        "signals_told.ambient",
-    ]
-    assert set(np.unique(logged["signals.sun"])) == {0.0, 2.0}
-    dark = run(task(model, {"ambient": fp.Known(NIGHT)}), CONTROLLERS["CTC+FPI"])
-    assert np.abs(logged["state.air"] - dark["state.air"]).max() > 0.05
-    with pytest.raises(InvalidProblem, match=r"'sun' .* has no values"):
-        task(model, {"ambient": fp.Known(NIGHT)}, reality=fp.Reality(plant))
-
-
-def test_the_contraction_is_that_of_the_weather_of_the_cycle():
-    """Here an input gain changes with a signal: the factor of a cycle is |1 - a real/told| at its values; the largest counts."""
-    plant = fp.Plant(
-        coordinates={"x": "m"},
-        inputs={"u": "N"},
-        order=1,
-        response=lambda q, u, p: {"x": p.gain * u.u - q.x},
-        parameters={"gain": fp.outside(nominal=2.0, unit="m/N/s")},
-    )
-    problem = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"x": 1 + ca.sin(t)}),
-        start={"x": 1.0},
-        period=0.01,
-        duration=1.0,
-        signals={"gain": fp.Unknown(lambda t: 2.0 + t)},
-    )
-    logged = run(problem, fp.ComputedTorque(fp.Exponential(rate=2.0), fp.Affine(gain=-0.5)))
-    expected = np.abs(1 - 0.25 * (2.0 + logged["time"].ravel() + 0.005) / 2.0)
-    assert fp.measure(problem, logged)["contraction.predicted"][""] == pytest.approx(expected[1:].max(), abs=1e-9)
 
 
 def priced(cost: Any) -> fp.Problem:

@@ -87,16 +87,6 @@ def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(na
         )
 
 
-@pytest.mark.parametrize("controller", ["CTC", "CTC+FPI (eq 6)"])
-def test_steps_within_a_run_equal_the_trajectory(controller):
-    """The law holds through changes where no horizon knows them ahead: 1e-12 of states, motions and responses."""
-    starts = {"q1": 2.2, "q2": 5.4}
-    problems = two_mass(), on(tasks.two_mass.problem, closed_form(10.0, 2, starts, STEPS))
-    ours, theirs = (fp.simulate(p, tasks.two_mass.controllers[controller], seed=0, compiled=False) for p in problems)
-    for signal in ("state", "reference", "desired"):
-        np.testing.assert_allclose(ours[signal], theirs[signal], rtol=0, atol=1e-11 if signal == "desired" else 1e-12)
-
-
 def test_a_horizon_knows_no_set_point_ahead():
     """A step moves nothing before its time, and the command in its first cycle."""
     controller, starts = tasks.two_mass.controllers["RHC+FPI"], {"q1": 2.2, "q2": 5.4}
@@ -177,15 +167,6 @@ def test_bad_references():
         )
 
 
-def test_functions_of_time():
-    """A function of time is sampled in every cycle; steps are the function that jumps."""
-    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], compiled=False)
-    functions = {n: lambda t, s=s: [v for at, v in s if at <= t + 1e-9][-1] for n, s in STEPS.items()}
-    sampled, stepped = ready.run(seed=0, setpoints=functions), ready.run(seed=0)
-    np.testing.assert_array_equal(sampled.log, stepped.log)
-    assert sampled.settings["setpoints"] == {"q1": "a function of time", "q2": "a function of time"}
-
-
 def test_run_and_file_record_what_was_in_force(tmp_path):
     """Signal 'setpoint' has it cycle by cycle, the facts have it as steps; the terminal shows it."""
     run = fp.simulate(
@@ -209,38 +190,3 @@ def test_a_slot_has_the_filter_of_its_chain():
     )
     run = fp.simulate(on(task.problem, reference, 1.0), task.controllers["slots"], seed=0, compiled=False)
     assert [run[f"nominal.{name}"][1] for name in ("h2", "h1")] == pytest.approx([rate**2 * -1.4, rate * -2.5])
-
-
-def test_predicted_says_that_set_points_are_late():
-    """With dead time the plant follows later by it; without adaptation errors it is the same motion, shifted."""
-    task = fp.load_problem("delayed_mass")
-    name = task.problem.plant.names[0]
-    problem = on(task.problem, fp.Setpoint({name: [(0.0, 0.0), (0.2, 0.3)]}, rate=6.0), 1.0)
-    controller = task.controllers["CTC+FPI increment"]
-    notes = controller.notes(problem)
-    assert any("follows set-points 0.06 s late" in note for note in notes)
-    assert not any("late" in note for note in controller.notes(task.problem))
-    exact = fp.ExactModel(controller)
-    run = fp.simulate(problem, exact, seed=0, compiled=False)
-    late = round(0.06 / problem.period)
-    lag = run[f"plant_state.{name}"][late:] - run[f"reference.{name}"][:-late]
-    assert np.abs(lag).max() < 0.2 * np.abs(run[f"true_error.{name}"]).max()
-
-
-def test_a_stepper_names_set_points_of_outputs():
-    """They are those of the outputs, which are other quantities than the states and of another number."""
-    plant = fp.Plant.of_states(
-        states={"place": "m", "speed": "m/s"},
-        inputs={"force": "N"},
-        parameters={"mass": fp.Parameter(1.0, 1.0, "kg")},
-        rates=lambda x, u, p: {"place": x.speed, "speed": u.force / p.mass},
-        outputs={"height": fp.Output("m", lambda x, p: 2.0 * x.place)},
-    )
-    reference = fp.Setpoint({"height": 1.0}, rate=2.0)
-    problem = fp.Problem(plant, reference, start={"place": 0.5, "speed": 0.0}, period=0.01, duration=0.1)
-    stepper = fp.Stepper(problem, fp.ComputedTorque(fp.Exponential(rate=3.0)), compiled=False)
-    assert stepper.setpoints == {"height": 1.0}
-    sample = 0.0, problem.start_state, np.zeros(1), stepper.start()
-    stepper.step(*sample, output=np.array([1.0, 0.0]), setpoints={"height": 1.5})
-    assert stepper.setpoints == {"height": 1.5}
-    assert stepper.trace()["setpoint"].tolist() == [1.5]
