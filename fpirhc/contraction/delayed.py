@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import Array, jacobians_along, linear_limit
 from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
-from fpirhc.deformation.wrappers.delayed import Paired
+from fpirhc.deformation.delayed import Paired
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.problem import Problem

@@ -26,11 +26,10 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
-from fpirhc.simulation.loop import start_memory
+from fpirhc.simulation.loop import loses, start_memory
 from fpirhc.simulation.moved import moving
 from fpirhc.simulation.ranges import ranges_of
 from fpirhc.simulation.run import judged_motion
-from fpirhc.simulation.sensed import loses
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables
 from fpirhc.simulation.trials import warn_of_harm

@@ -18,10 +18,9 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.leaky import default_pole
+from fpirhc.deformation.delayed import Paired, default_pole
+from fpirhc.deformation.filters import Filtered
 from fpirhc.deformation.model_referenced import ModelReferenced
-from fpirhc.deformation.wrappers.delayed import Paired
-from fpirhc.deformation.wrappers.filters import Filtered
 from fpirhc.errors import FpirhcError, require
 from fpirhc.plant.parameter import outside
 from fpirhc.plant.plant import Plant

@@ -1,13 +1,15 @@
-"""Closes the loop: controller blocks and the exact plant as ONE step.
+"""Closes the loop: controller blocks and the exact plant as ONE step, from what moves through sensors to the command and back.
 
 Per cycle k the loop holds the plant's state x_k and the response that was realised just before t_k under the command
-held since t_{k-1}; the controller turns them into a command; the plant moves on by one period with that command held.
+held since t_{k-1}; sensors and their dead time show them to the controller, which turns them into a command; the plant moves
+on by one period with that command held. The way from the command to what moves is in `fpirhc.simulation.moved`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -15,17 +17,20 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.contract import Undeformed
-from fpirhc.controllers.gate import INNER, Gate
+from fpirhc.controllers.gate import INNER, LOST, Gate
 from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
-from fpirhc.simulation.moved import acting_blocks, moving, outside_blocks
+from fpirhc.plant.chain import response_names
+from fpirhc.plant.motion import followed_units
+from fpirhc.sensing.base import backward_difference, combine
+from fpirhc.simulation.moved import HELD, Mover, acting_blocks, moving, outside_blocks, real_signals
 from fpirhc.simulation.replay import known_samples
-from fpirhc.simulation.sensed import lost_blocks, sensing_blocks
-from fpirhc.simulation.tables import disturbance_signals
-from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings
-from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
+from fpirhc.simulation.tables import disturbance_signal
+from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings, rename
+from fpirhc.symbolic.expression import Signals, Value, expression
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.symbolic.open import SETTINGS
+from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
 from fpirhc.task.problem import Problem
 
 
@@ -47,7 +52,7 @@ def _closed(built: Built) -> Composite:
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
     samples = known_samples(problem) if lost or ranges else 0
     acting = Gate(problem, inner, simulated=True, ranges=ranges, loses=bool(lost), samples=samples)
-    disturbed = disturbance_signals(problem)
+    disturbed = (disturbance_signal(problem),) if problem.disturbances else ()
     seeing = sensing_blocks(mover, predicts="state_ahead" in acting.inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
@@ -117,3 +122,176 @@ class HeldInput(Undeformed):
             Block("hold", Layout((plant.state, plant.parameter)), writes, step),
             *closing,
         ], delays
+
+
+Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
+_LOST_QUEUE = "lost_samples_queue"
+_PAST, _FULL = "_outputs_past", "_outputs_known"
+
+
+def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
+    """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
+    problem, plant = mover.problem, mover.problem.plant
+    response = plant.response_signal("realised")
+    at_once = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    if at_once and not problem.truth.seen:
+        sense = [mover.sense(plant.motion, response)]
+        return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
+    true, shown = _true_blocks(mover, response)
+    if predicts and not mover.shows_truth and all(map(problem.moves.shows, problem.judged_names)):
+        true = [*true, _truth_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
+    if at_once:
+        return true  # with coordinates measured in place of others
+    return [*true, *_late_blocks(problem, shown)]
+
+
+def _true_blocks(mover: Mover, response: Signal) -> tuple[list[Block], Shown]:
+    """Blocks of the true motion, response and error; and the signals that sensors see."""
+    problem, motion = mover.problem, mover.motion
+    hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response, "_seen")
+    if not mover.shows_truth:
+        return [mover.sense(*hidden)], hidden
+    true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response, "plant_realised")
+    sense = mover.sense(*true)
+    sense = with_true_response(problem, sense, true[0][-1], true[1])
+    blocks = [sense, _truth_block(problem, true[0][-1])]
+    if not problem.truth.seen:
+        return blocks, true
+    direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    shown = (motion, response) if direct else hidden
+    return [*blocks, _seen_block(problem, shown)], shown
+
+
+def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
+    """Blocks of sensors and their dead time, from what the sensors see to what the controller is given.
+
+    Sensors are those of the outputs where the plant has some; its state then comes with the dead time alone.
+    """
+    plant, late, sensing = problem.plant, problem.dead_time.measurement_wait(problem.period), problem.sensing
+    first = problem.first_output
+    starts = {plant.state.name: problem.start_state, plant.output.name: first}
+    motion = zip(shown[0], plant.motion, strict=False)
+    # a believed state is the controller's own
+    states = [(true, to, starts[to.name]) for true, to in motion] if sensing.observer is None else []
+    if not sensing.ideal:
+        others = states[:-1]
+        sensors = [
+            *_late_states(others, late),
+            *sensing.blocks(plant, problem.first_shown, late, (*shown[0], shown[1])),
+        ]
+        if sensing.estimates:
+            return sensors
+        raw = sensing.raw(plant, problem.first_shown, late)
+        return [*sensors, sensing.estimator.block(plant, problem.period, first, raw)]
+    assert late is not None
+    resting = tuple(problem.first_shown[name] for name in response_names(plant))
+    realised = replace(shown[1], name="realised", start=resting)
+    return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
+
+
+def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
+    """Return how many cycles one call of the loop runs: one where samples may be lost, and the caller replays them."""
+    mover = moving(problem)
+    many = mover.cycles_of_call if compiled else mover.cycles_interpreted
+    return 1 if loses(mover) else many
+
+
+def loses(mover: Mover) -> bool:
+    """Return whether samples may be lost, or lie outside the range of their sensor."""
+    return bool(lost_blocks(mover) or sensor_ranges(mover.problem))
+
+
+def lost_blocks(mover: Mover) -> list[Block]:
+    """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
+    problem = mover.problem
+    drawn, held = problem.sensing.drawn, [one for one in mover.reads if one.name == HELD]
+    if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
+        return []
+    late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        lost = problem.sensing.lost(ca.vertcat(*(getattr(s, one.name) for one in drawn)))
+        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) for one in held)))
+        arrived, remembered = late.arrived(s, _LOST_QUEUE, now)
+        return {LOST.name: arrived, **remembered}
+
+    memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
+    return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
+
+
+def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Queue | None) -> list[Block]:
+    """Blocks of the dead time from true signals to measured ones, with the values before the run."""
+    if late is None:
+        return [rename(f"see_{to.name}", true, to) for true, to, _ in states]
+    return [
+        delay_block(f"see_{to.name}", true, replace(to, start=tuple(map(float, start))), [late] * to.size)
+        for true, to, start in states
+    ]
+
+
+def _truth_block(problem: Problem, motion: Signal) -> Block:
+    """Block (time, true state or outputs) -> true error of the judged ones."""
+    plant = problem.plant
+    places = [plant.output.elements.index(c) for c in problem.judged_names]
+    own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
+    writes = Layout(
+        (vector("true_error", problem.judged_names, [followed_units(plant)[c] for c in problem.judged_names]),)
+    )
+    if problem.given_signals:
+        reads = Layout((like(plant.output, "reference"), motion))
+        return Block(
+            "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
+        )
+    function, reads = problem.motion(), Layout((plant.time, motion, *problem.own_signals))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        along = function(s.time, *(getattr(s, one.name) for one in problem.own_signals))[0]
+        return {"true_error": along[places] - getattr(s, motion.name)[own]}
+
+    return Block("truth", reads, writes, step)
+
+
+def _seen_block(problem: Problem, shown: Shown) -> Block:
+    """Block -> the state, the outputs and the response that are measured in place of the true ones."""
+    motion, response = shown
+    functions = {one.name: problem.truth.function(one.elements, seen=True) for one in motion}
+    functions[response.name] = problem.truth.function(response_names(problem.plant), seen=True)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = (s._state_before, s._acting_before, s._exact, s._forcing_before)
+        return {name: function(*now) for name, function in functions.items()}
+
+    return Block("seen", Layout(real_signals(problem)), Layout((*motion, response)), step)
+
+
+def with_true_response(problem: Problem, sense: Block, motion: Signal, response: Signal) -> Block:
+    """Return the block of the true motion; on a map with the true response in place of the one that it writes.
+
+    `motion`: signal of the state, or of the outputs where the plant has some.
+    """
+    period = problem.period
+    orders = problem.plant.response_orders
+    if not any(problem.plant.differences.values()):
+        return sense
+    places = {c: problem.plant.output.elements.index(c) for c in orders}
+    entries = [(c, j) for c, order in orders.items() for j in range(1, order + 1)]
+    past = Signal(_PAST, tuple(f"{c}@{j}" for c, j in entries))
+    known = Signal(_FULL)
+
+    def step(s: Signals) -> dict[str, Value]:
+        values = dict(sense.step(s))
+        before = dict(zip(entries, ca.vertsplit(getattr(s, _PAST)), strict=True))
+        now = expression(values[motion.name])
+        samples = {c: [now[k], *(before[c, j] for j in range(1, orders[c] + 1))] for c, k in places.items()}
+        enough = getattr(s, _FULL)
+        values[response.name] = ca.vertcat(
+            *(
+                ca.if_else(enough > order - 0.5, combine(backward_difference(order), samples[c]) / period**order, 0)
+                for c, order in orders.items()
+            )
+        )
+        values[f"{_PAST}_next"] = ca.vertcat(*(samples[c][j - 1] for c, j in entries))
+        values[f"{_FULL}_next"] = ca.fmin(enough + 1, max(orders.values()))
+        return values
+
+    return replace(sense, step=step, memory=sense.memory + Layout((past, known)))

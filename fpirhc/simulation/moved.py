@@ -1,4 +1,4 @@
-"""The first half of the path of a run: from the command to what moves. What the controller is given of it is the second, `sensed`.
+"""The first half of the path of a run: from the command to what moves. `loop` has the second, to what the controller is given.
 
     command -> dead time -> what moves, for one cycle -> its motion and response -> sensors -> dead time -> controller
 

@@ -20,12 +20,11 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.loop import close_loop, plans_exactly, start_memory
+from fpirhc.simulation.loop import close_loop, cycles_per_call, plans_exactly, start_memory
 from fpirhc.simulation.moved import Exchange, moving
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
-from fpirhc.simulation.sensed import cycles_per_call
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
 from fpirhc.simulation.tables import Changes, InForce, in_force, run_tables
 from fpirhc.symbolic.block import Composite

@@ -36,13 +36,6 @@ def run_tables(
     return [table for table in (*random, set_point_table(problem, setpoints, cycles)) if table.shape[1]]
 
 
-def disturbance_signals(problem: Problem) -> tuple[Signal, ...]:
-    """Return the signal of all disturbances in the order of the problem, or nothing when there are none."""
-    if not problem.disturbances:
-        return ()
-    return (disturbance_signal(problem),)
-
-
 def disturbance_columns(problem: Problem) -> tuple[tuple[str, int], ...]:
     """Return name and derivative of every column of the disturbances: first all names, then d', d'', ... of outputs."""
     orders = problem.disturbed_outputs

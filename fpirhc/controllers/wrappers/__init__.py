@@ -1,1 +1,0 @@
-"""Controllers around a controller."""

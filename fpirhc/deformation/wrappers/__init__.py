@@ -1,1 +1,0 @@
-"""Deformations around a deformation: pairing under dead time, filters, gains that change on line."""
