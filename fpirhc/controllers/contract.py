@@ -228,6 +228,8 @@ class OfDerivatives(Undeformed, ABC):
 class ControllerWrapper(Controller, ABC):
     """Contract: a controller around another one, with its deformation."""
 
+    once: ClassVar[bool] = False  # whether it cannot stand around another one of its kind: its signals have fixed names
+
     controller: Controller
 
     @property
@@ -268,8 +270,9 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
     """Return the controller with every automatic setting replaced by its value for this problem."""
     if controller.inner is not None:
         name = type(controller).__name__
-        require(  # both would have the same signals
-            type(controller) not in map(type, _chain(controller.inner)),
+        once = getattr(controller, "once", False) and type(controller) in map(type, _chain(controller.inner))
+        require(
+            not once,
             f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both",
         )
         inner = resolved(controller.inner_problem(problem), controller.inner)

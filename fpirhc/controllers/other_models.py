@@ -79,6 +79,8 @@ class Estimating(ControllerWrapper):
             plan, which uses the estimate of the cycle in which it was made.
     """
 
+    once = True
+
     estimator: ParameterEstimator
     dead_time: DeadTime | None = field(default=None, kw_only=True)
     at_once: bool = field(default=False, kw_only=True)

@@ -55,6 +55,8 @@ class Predicted(ControllerWrapper):
         InvalidValue: a dead time that is negative or not finite.
     """
 
+    once = True
+
     inputs: NotNegative
     measurement: NotNegative = 0.0
     by: Literal["model", "desired"] = "model"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast, final
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotSupported, require
+from fpirhc.errors import InvalidName, NotSupported, require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
 from fpirhc.symbolic.expression import stays
@@ -259,7 +259,7 @@ def against_wrappers(deformation: Deformation) -> Iterator[str]:
     while deformation.inner is not None:
         name, inside = type(deformation).__name__, list(_chain(deformation.inner))
         pairing = [one for one in inside if one.form.pairs]
-        if type(deformation) in map(type, inside):
+        if any(type(one) is type(deformation) for one in inside) and _shares_memory(deformation):
             yield f"{name} stands around another {name}; one is enough, so leave one of them out"
         elif pairing and replace(deformation.form, steady=True) != replace(deformation.inner.form, steady=True):
             yield (
@@ -272,6 +272,15 @@ def against_wrappers(deformation: Deformation) -> Iterator[str]:
                 f"one; put it inside: ModelReferenced({name}(map, ...))"
             )
         deformation = deformation.inner
+
+
+def _shares_memory(wrapper: Deformation) -> bool:
+    """Whether two signals of its memory have one name, as those of wrappers of a kind have."""
+    try:
+        wrapper.memory(("q0",))
+    except InvalidName:
+        return True
+    return False
 
 
 def memory_of_map(wrapper: Wrapper, memory: Mapping[str, Expression], size: int) -> dict[str, Expression]:
