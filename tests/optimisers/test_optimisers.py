@@ -132,4 +132,5 @@ def test_a_first_state_outside_its_limits_is_infeasible():
     plan = fp.solve(ocp, fp.Ipopt(), np.array([2.6, 5.6, 0.2, -0.1]), data)
     assert plan.status == fp.Status.INFEASIBLE
     assert known(plan.feasibility) > 1e-2
+    assert "iterations unknown in" in repr(plan)
     assert plan.verify()[2] == pytest.approx(plan.feasibility)
