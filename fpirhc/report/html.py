@@ -85,6 +85,7 @@ def render(comparison: Comparison) -> str:
         (*scripts, f"const DATA={data};\n{asset('report.js')}"),
         slots=slots,
         bands=BANDS,
+        real=any("real" in chart for chart in series["charts"]),
         own=own,
         motions=motions,
         contraction=[
@@ -183,7 +184,6 @@ def asset(name: str) -> str:
 
 
 INTERVALS = 300
-_REALITY = "reality_state"
 
 
 def chart_data(comparison: Comparison) -> dict[str, Any]:
@@ -212,11 +212,11 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
             lines = [(what, e.run[f"{signal}.{c}"]) for what, signal in responses_of(e.run.layout).items()]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
-    real = [e for e in entries if _REALITY in e.run.layout]  # with states that the model does not have
-    more = [n for e in real[:1] for n in e.run.layout[_REALITY].elements if n not in e.run.layout["state"].elements]
-    for column in (f"{_REALITY}.{name}" for name in more):
-        lines = [(e.name, e.run[column]) for e in real]
-        charts.append(_chart(f"reality: {column.partition('.')[2]}", real[0].run.unit(column), lines, edges))
+    real = [e for e in entries if "reality_state" in e.run.layout]
+    for n in real[0].run.layout["reality_state"].elements if real else ():
+        if n not in real[0].run.layout["state"].elements:  # the model does not have it
+            lines = [(e.name, e.run[f"reality_state.{n}"]) for e in real]
+            charts.append({**_chart(n, real[0].run.unit(f"reality_state.{n}"), lines, edges), "real": True})
     middles = 0.5 * np.diff(edges) * longest.period
     return {
         "controllers": [

@@ -249,8 +249,8 @@ def figure_of(result: VariantStudy) -> Any:
     axes, table = getattr(result.variants, "axes", {}), result.table
     column, units = result.figure.column, table.attrs["units"]
     with_unit = {name: f"{name} [{units[name]}]" if name in units else name for name in (column, *axes)}
-    with_unit |= {"error": "rms error / range of the reference"}
-    shown = table.assign(shown=table[column].where(table.outcome == "finished"))
+    with_unit |= {"error": "rms error [% of the range of the reference]"}
+    shown = table.assign(shown=(1 if result.figure.metric else 100) * table[column].where(table.outcome == "finished"))
     names = list(dict.fromkeys(table.controller))
     if len(axes) == 2:
         rows, abreast = -(-len(names) // _ABREAST), min(len(names), _ABREAST)

@@ -57,7 +57,7 @@ function place(spec) {
   const title = document.createElement("h3");
   title.textContent = spec.title + " [" + spec.unit + "]";
   box.append(title);
-  document.getElementById(spec.only ? "responses" : "charts").append(box);
+  document.getElementById(spec.only ? "responses" : spec.real ? "reality" : "charts").append(box);
   return { box, spec };
 }
 
