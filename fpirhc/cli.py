@@ -182,8 +182,8 @@ def study(
     """Run controllers in many variants of a problem. Variants are named cases, drawn plants, or swept settings; or one quantity
     grows until each controller fails (--limits).
 
-    The others are compared with the first controller, or with the headline's. study.csv has every run and its parameters; the
-    same command goes on after an interruption.
+    Every controller is compared with the first one, or with the first of the file's headline. study.csv has every run and its
+    parameters; the same command goes on after an interruption.
     """
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
@@ -241,7 +241,7 @@ def _cluster(address: str) -> Any:
 )
 def probe(
     problem: opt.Problem, controller: Annotated[
-        str | None, typer.Option("--controller", "-c", metavar="NAME", help="that runs the plant [default: first that can]")
+        str | None, typer.Option("--controller", "-c", metavar="NAME", help="runs the plant [default: first that can]")
     ] = None,
     cycles: Annotated[int | None, given("N", "length of the excitation [default: 300]")] = None,
     amplitude: Annotated[float | None, given("NUMBER", "size of the excitation, in the unit of the response")] = None,

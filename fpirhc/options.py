@@ -58,7 +58,8 @@ class Command(TyperCommand):
         return super().parse_args(ctx, words)
 
     def get_help(self, ctx: Any) -> str:
-        return re.sub(r"\{(\w+)\}| <(?:str|list\[str\])>", r"\1", super().get_help(ctx)).replace("x>=", "at least ")
+        text = re.sub(r"\{(\w+)\}| <(?:str|list\[str\])>", r"\1", super().get_help(ctx))
+        return text.replace("x>=", "at least ").replace("<=x<=", " to ")
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002
         formatter.write(f"\nExamples:\n{self.epilog}\n")
@@ -89,10 +90,10 @@ Controller = Annotated[str, typer.Argument(metavar="CONTROLLER", help="name of a
 Controllers = Annotated[
     list[str] | None, given("NAME ...", "only these controllers of the file", "--controllers", "-c")
 ]
-Out = Annotated[Path | None, given("FOLDER", "folder of the results [default: results/PROBLEM]")]
+Out = Annotated[Path | None, given("FOLDER", "folder of the results [default: in results/PROBLEM]")]
 Seed = Annotated[int, given("N", "seed of noise and of what is drawn", min=0)]
 Mismatch = Annotated[
-    float, given("PERCENT", "draw exact parameters, dead times within so much of the file's", parser=percent)
+    float, given("PERCENT", "draw exact parameters and dead times within this much of the file's", parser=percent)
 ]
 _REPLACED = "replace numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"
 Set = Annotated[list[str] | None, given("PATH=NUMBER ...", _REPLACED, "--set")]
