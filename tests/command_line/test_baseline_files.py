@@ -8,12 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.blessed import LINE, NOISY
+from helpers.line import line_text
 
 import fpirhc as fp
 from fpirhc.__main__ import main
 
 pytest_plugins = ["pytester"]
+SHORT = "period=1e-3, duration=0.3"
+PLANNED = """measure_from=0.1, limits=fp.Limits(inputs={"u": (-25.0, 25.0)}), horizon=fp.Horizon(stages=8, step=1e-2),
+    cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2})"""
+SIGMOID = "fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)"
+PLANS = f'controllers["RHC+FPI"] = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), {SIGMOID})\n'
+LINE = line_text(f"{SHORT}, {PLANNED}", SIGMOID, more=PLANS)
+NOISY = line_text(
+    f"{SHORT}, disturbances={{'u': fp.Noise(0.5), 'y': fp.Noise(2.0)}}", more='del controllers["CTC+FPI"]\n'
+)
+NOISY = NOISY.replace("ca.sin(2 * t)", "0 * t").replace('"y": 0.5', '"y": 0.0')
 PROBLEMS = {"line": LINE, "noisy": NOISY}
 
 

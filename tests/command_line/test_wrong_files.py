@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from helpers.first_files import PENDULUM, REACTOR, TANKS, changes_of, messages_of
+from helpers.first_files import PENDULUM, REACTOR, changes_of, messages_of
 
 import fpirhc as fp
 from fpirhc.__main__ import main
@@ -138,6 +138,15 @@ one controller
   {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)} -> fp.RecedingHorizon(optimiser)
     line 36: controllers: expected {name: a Controller}, got a value of the class RecedingHorizon; write {'NAME':
     RecedingHorizon(...)}
+start outside the limits
+  fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"torque": (-15.0, 15.0)}, states={"angle": (0.5, 2.5)})
+    no Do states, rates and paths keep their limits? ... angle by at most 0.5 rad, 25 % of its range
+gain of the wrong sign
+  gain=-2.6 -> gain=2.6
+    no Is the gain admissible? ... Set deformation.gain to -
+controlled by one name
+  order=2, -> order=2, controlled="angle",
+    Plant.controlled: expected (a text, ...) or None, got the text 'angle'; write ('angle',)
 a search in the cost of the problem
   controllers = { -> tuning = {"RHC": {"cost.deviation.torque": fp.LogSpan(1e-3, 1.0)}}; controllers = {
     setting 'cost.deviation.torque' is the problem's, and ... changes controllers alone; give this one its own, cost=problem.cost
@@ -170,15 +179,6 @@ weights of states behind an output
   outputs={"temperature": 1.0}, rate -> states={"T": 1.0}, rate
     weigh temperature, Quadratic(outputs=...)
 """
-WRONG_TANKS = """
-start outside the limits
-  start={"h1": 1.0 -> start={"h1": 3.0
-    no Do states, rates and paths keep their limits? ... h1 by at most 1.01 m, 50.5 % of its range
-gain of the wrong sign
-  gain=-0.7 -> gain=0.7
-  {"pump1": (0.0, 2.0), "pump2": (0.0, 2.0)} -> {"pump1": (-2.0, 2.0), "pump2": (-2.0, 2.0)}
-    no Is the gain admissible? ... Set deformation.gain to -
-"""
 OTHERS = {
     "no input in the response": one(
         PENDULUM, "u.torque - ", "0 - ", "no input reaches coordinate 'angle'", "use torque in the response"
@@ -191,16 +191,6 @@ OTHERS = {
             "leave an input out",
             "docs/plants.md",
         ),
-    ),
-    "controlled by one name": Wrong(
-        TANKS,
-        (
-            (', "pump2": "m^3/s"', ""),
-            ("u.pump2 + ", ""),
-            (', "pump2": (0.0, 2.0)', ""),
-            ("order=1,", 'order=1,\n    controlled="h1",'),
-        ),
-        ("Plant.controlled: expected (a text, ...) or None, got the text 'h1'; write ('h1',)",),
     ),
     "a horizon that is not there": one(
         PENDULUM,
@@ -260,7 +250,7 @@ def changed(file: str, table: str) -> dict[str, Wrong]:
     return {name: Wrong(file, tuple(changes), said) for name, (changes, said) in changes_of(table).items()}
 
 
-FILES = changed(PENDULUM, WRONG_PENDULUM) | changed(REACTOR, WRONG_REACTOR) | changed(TANKS, WRONG_TANKS) | OTHERS
+FILES = changed(PENDULUM, WRONG_PENDULUM) | changed(REACTOR, WRONG_REACTOR) | OTHERS
 # Command lines beside a correct file: the words, and what must be said, in this order.
 REFUSED = """
 compare nofile => problem 'nofile' is unknown. Give the path of a problem file, or a name from 'fpirhc list'
@@ -372,7 +362,7 @@ def test_a_wrong_file_or_command_line_is_explained(name, tmp_path, monkeypatch, 
         assert place >= 0, f"'{words}' is not in its place in: {said}"
 
 
-@pytest.mark.parametrize("file", [PENDULUM, REACTOR, TANKS])
+@pytest.mark.parametrize("file", [PENDULUM, REACTOR])
 def test_the_files_without_a_mistake_are_accepted(file, tmp_path):
     (tmp_path / "mine.py").write_text(file, encoding="utf-8")
     assert len(fp.load_problem(str(tmp_path / "mine.py")).controllers) == 2

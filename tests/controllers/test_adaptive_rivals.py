@@ -248,9 +248,6 @@ def test_projection_learns_while_the_command_is_clipped():
     assert errors[-1] < 0.9 * errors[0]
 
 
-# The shipped arms.
-
-
 # What does not fit is refused before the run.
 
 

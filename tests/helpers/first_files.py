@@ -1,4 +1,4 @@
-"""Three correct problem files of the kinds that people write first: equations of motion, states with an output, two inputs."""
+"""Two correct problem files of the kinds that people write first: equations of motion, and states with an output."""
 
 PENDULUM = '''"""A pendulum."""
 import casadi as ca
@@ -74,39 +74,6 @@ controllers = {
     "RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=0.1)),
     "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=0.1), fp.ModelReferenced(fp.Affine(gain=-0.7))),
 }
-'''
-TANKS = '''"""Two tanks in series."""
-import casadi as ca
-import numpy as np
-import fpirhc as fp
-
-
-def response(q, u, p):
-    between = p.pipe * (q.h1 - q.h2)
-    return {"h1": (u.pump1 - between) / p.area, "h2": (u.pump2 + between - p.drain * q.h2) / p.area}
-
-
-plant = fp.Plant(
-    coordinates={"h1": "m", "h2": "m"},
-    inputs={"pump1": "m^3/s", "pump2": "m^3/s"},
-    order=1,
-    response=response,
-    parameters={
-        "area": fp.Parameter(approximate=1.0, exact=1.2, unit="m^2"),
-        "pipe": fp.Parameter(approximate=0.3, exact=0.25, unit="m^2/s"),
-        "drain": fp.Parameter(approximate=0.1, exact=0.15, unit="m^2/s"),
-    },
-)
-problem = fp.Problem(
-    plant=plant,
-    reference=fp.Trajectory(lambda t: {"h1": 1 + 0.1 * ca.sin(t), "h2": 0.5 + 0.1 * ca.cos(t)}),
-    start={"h1": 1.0, "h2": 0.5},
-    period=0.05,
-    duration=1.0,
-    limits=fp.Limits(inputs={"pump1": (0.0, 2.0), "pump2": (0.0, 2.0)}, states={"h1": (0.0, 2.0)}),
-)
-law = fp.ComputedTorque(fp.Exponential(rate=2.0))
-controllers = {"CTC": law, "CTC+FPI": law.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.7)))}
 '''
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 import fpirhc as fp
 from fpirhc.contracts import Controller
@@ -59,33 +58,6 @@ def slow_room() -> fp.Problem:
     return fp.Problem(room, path, {"T": 0.9}, period=0.1, duration=400.0, measure_from=100.0, **plan)
 
 
-def three_lags() -> fp.Problem:
-    """At a constant set-point, where the slowest of three lags in a row is the third derivative's share of rounding."""
-    plant = fp.Plant.of_states(
-        states={"a": "K", "b": "K", "c": "K"},
-        inputs={"u": "K"},
-        rates=lambda x, u, p: {
-            "a": 3 * (u.u - x.a) / p.delay,
-            "b": 3 * (x.a - x.b) / p.delay,
-            "c": 3 * (x.b - x.c) / p.delay,
-        },
-        outputs={"outlet": fp.Output("K", lambda x, p: x.c)},
-        parameters={"delay": fp.Parameter(1.0, 1.2, "min")},
-        time_unit="min",
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"outlet": 10 + 0 * t}),
-        start={"a": 0.0, "b": 0.0, "c": 0.0},
-        period=0.05,
-        duration=10.0,
-        measure_from=5.0,
-        limits=fp.Limits(inputs={"u": (0.0, 20.0)}),
-        horizon=fp.Horizon(stages=40, step=0.05),
-        cost=fp.Quadratic(outputs={"outlet": 1.0}, rate={"u": 0.01}),
-    )
-
-
 def limited_rate() -> fp.Problem:
     """A force that may change by 20 N/s: an own loop with such an actuator has .637 m without adaptation, and metres with it."""
     return cart(
@@ -118,34 +90,6 @@ def turntable(reference: Callable[[Any], Any]) -> fp.Problem:
         limits=fp.Limits(inputs={"torque": (-3.0, 3.0)}),
         horizon=fp.Horizon(stages=20, step=2e-2),
         cost=fp.Quadratic(states={"yaw": 100.0, "yaw'": 1.0}, deviation={"torque": 1e-2}),
-    )
-
-
-def levitation(exact: float = 1.4e-4) -> fp.Problem:
-    """A ball below a magnet, whose current follows the voltage: order three, unstable, with limits of the voltage."""
-
-    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
-        force = p.inductance / (2 * 0.06) * (x.current / x.gap) ** 2
-        return {"gap": x.speed, "speed": 9.81 - force, "current": (u.voltage - 5.0 * x.current) / 0.05}
-
-    plant = fp.Plant.of_states(
-        states={"gap": "m", "speed": "m/s", "current": "A"},
-        inputs={"voltage": "V"},
-        rates=rates,
-        outputs={"gap": fp.Output("m", lambda x, _: x.gap)},
-        parameters={"inductance": fp.Parameter(1.5e-4, exact, "H m")},
-    )
-    rest = 0.012 * np.sqrt(2 * 0.06 * 9.81 / exact)
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"gap": 0.012 + 0.001 * ca.sin(3 * t)}),
-        start={"gap": 0.012, "speed": 0.003, "current": float(rest)},
-        period=1e-3,
-        duration=1.0,
-        measure_from=0.3,
-        limits=fp.Limits(inputs={"voltage": (-20.0, 20.0)}),
-        horizon=fp.Horizon(stages=20, step=4e-3),
-        cost=fp.Quadratic(outputs={"gap": 1e6, "gap'": 1e2}, rate={"voltage": 1e-2}),
     )
 
 

@@ -50,12 +50,6 @@ def twice(controller: Controller) -> Named:
     return Named(Named(controller), label="outer")
 
 
-# Deformations
-
-
-# Automatic settings
-
-
 # Controllers
 
 

@@ -139,6 +139,3 @@ def test_a_symbol_turned_into_a_number_is_refused():
         fp.simulate(
             two_masses(), fp.ComputedTorque(TRACKING, Lossy(gain=-0.5)), seed=0, settings={"deformation.gain": -0.4}
         )
-
-
-# Plants whose inverse is Newton's

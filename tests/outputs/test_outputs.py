@@ -51,9 +51,6 @@ def test_an_output_that_is_only_judged_is_measured_and_not_controlled() -> None:
     assert np.array_equal(run["true_error.level"], 4.0 - run["plant_state.E"])
 
 
-# Outputs that the wrong model computes in place of a measurement
-
-
 # What is refused, and how
 
 DOUBLE: dict[str, Any] = {

@@ -249,6 +249,3 @@ def test_noisy_sensor_does_not_end_a_run():
     result = run(calm, fp.ComputedTorque(fp.Exponential(rate=1.0)))
     assert result["state.level"].min() < 0
     assert result.stop is None
-
-
-# Lateness that the body states

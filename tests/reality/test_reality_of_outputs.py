@@ -123,6 +123,3 @@ def test_it_moves_as_scipy_says():
         x = solve_ivp(lambda t, x, u=u: moved(x, u, 0.2), (0, PERIOD), x, rtol=1e-11, atol=1e-13).y[:, -1]
     np.testing.assert_allclose(result["reality_state"], states, rtol=2e-6)
     np.testing.assert_allclose(result["output.bis"], 93 / (1 + (np.array(states)[:, 3] / 4.1) ** 1.36), rtol=2e-6)
-
-
-# A body outside
