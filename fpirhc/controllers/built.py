@@ -31,6 +31,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
+from fpirhc.symbolic.open import open_numbers
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
@@ -59,7 +60,6 @@ class Built:
     warm_up: float  # number of the first cycle whose response may be used
     sample: tuple[Signal, ...]  # what a step is given
     planned: Problem | None  # the problem as plans have it, with their cost and limits
-    opened: bool  # whether some numbers are open
 
     @property
     def plant(self) -> Plant:
@@ -94,7 +94,7 @@ class Built:
         """Return what the controller inside a wrapper is built from; `controller`: in its place."""
         wrapped = controller or wrapper.inner
         assert wrapped is not None
-        return build(wrapper.inner_problem(self.problem), wrapped, opened=self.opened)
+        return build(wrapper.inner_problem(self.problem), wrapped)
 
     def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""
@@ -104,16 +104,15 @@ class Built:
 _LATEST: Latest[Built] = Latest(8)
 
 
-def build(problem: Problem, controller: Controller, *, opened: bool = False) -> Built:
-    """Return the controller built for the problem: the one place where a pair is checked and its automatic numbers are chosen.
+def build(problem: Problem, controller: Controller) -> Built:
+    """Return the controller built for the problem: the one place where a pair is checked and its automatic numbers are chosen."""
+    ready = (
+        controller if open_numbers(problem, controller) else checked(problem, controller)
+    )  # open ones were checked closed
+    return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _built(problem, ready))
 
-    `opened`: whether numbers of both are open; then they are those of a pair that was checked.
-    """
-    ready = controller if opened else checked(problem, controller)
-    return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _built(problem, ready, opened=opened))
 
-
-def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
+def _built(problem: Problem, ready: Controller) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
     own, before = problem.own_signals, tuple(map(float, problem.inputs_before))
@@ -139,7 +138,6 @@ def _built(problem: Problem, ready: Controller, *, opened: bool) -> Built:
         warm_up=problem.warm_up_cycles,
         sample=problem.sample,
         planned=planned,
-        opened=opened,
     )
 
 

@@ -78,7 +78,7 @@ class Planner:
 
     def corrects(self, plant: Plant) -> bool:
         """Return whether the inverse makes the plant's response that of the plan: a deformation does, or a disturbance of it."""
-        return self.adapts or plant.believes_responses
+        return self.adapts or any("'" in name for name in plant.believed)
 
     def feeds_back(self, plant: Plant) -> bool:
         """Return whether a law or a correction of the response takes back what outputs of order 0 are away from a plan."""

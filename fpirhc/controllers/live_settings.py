@@ -57,7 +57,7 @@ class LiveSettings:
         checked(self.problem, self.controller)
         opened = Opened(self.start)
         try:
-            composite = compose(build(*self._with(opened.symbols, checked=False), opened=True))
+            composite = compose(build(*self._with(opened.symbols, checked=False)))
         except _OF_BUILD as error:
             interruption = unwrapped(error)
             if not isinstance(interruption, Exception):

@@ -25,7 +25,7 @@ from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.motion import followed_units
-from fpirhc.plant.plant import Plant
+from fpirhc.plant.plant import Output, Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite, left_after
@@ -139,7 +139,7 @@ class Slotted(Controller):
         return Block("schedule", Layout((built.plant.time,)), Layout((scalar("slot"),)), step)
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
-        one = build(slot_problem(built.problem, name), self.slots[name], opened=built.opened)
+        one = build(slot_problem(built.problem, name), self.slots[name])
         same = built.plant.response_orders.get(name) == one.plant.response_orders[name]
         place = built.plant.controlled_names.index(name) if same else None
         return Turn(number, name, self.slots[name], replace(one, warm_up=built.warm_up + (place is None)), place)
@@ -170,7 +170,8 @@ def slot_problem(problem: Problem, name: str) -> Problem:
 def _slot_problem(problem: Problem, name: str) -> Problem:
     plant = problem.plant
     inverse = plant.inverse if plant.controlled_names == (name,) else None
-    light = replace(plant, outputs=plant.followed, controlled=(name,), inverse=inverse)
+    shown = plant.outputs or {n: Output(unit, lambda *q, n=n: q[0][n]) for n, unit in plant.coordinates.items()}
+    light = replace(plant, outputs=shown, controlled=(name,), inverse=inverse)
     return replace(problem, plant=light, judged=(name,), cost=None)
 
 

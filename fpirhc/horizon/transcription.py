@@ -107,7 +107,12 @@ def _transcribed(
         settings=stage.settings,
         state_of=lambda outputs: plant.equations.state_of(outputs, ca.SX(nodes[0][:, -1])),
         runaway=lambda: spurious_growth(
-            plant, horizon.discretisation, horizon.longest, nodes[0][: plant.state.size, :-1], nodes[1]
+            plant,
+            horizon.discretisation,
+            horizon.longest,
+            nodes[0][: plant.state.size, :-1],
+            nodes[1],
+            plant.approximate,
         ),
         node_times=horizon.nodes,
         shares=horizon.share / horizon.relative_lengths,

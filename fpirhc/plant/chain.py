@@ -143,7 +143,7 @@ def disturbance_name(name: str) -> str:
 def without_disturbances(plant: Plant) -> Plant:
     """Return the plant without believed disturbances of its outputs' responses; itself where there are none."""
     kept = {name: parameter for name, parameter in plant.believed.items() if "'" not in name}
-    return replace(plant, believed=kept) if plant.believes_responses else plant
+    return plant if kept == plant.believed else replace(plant, believed=kept)
 
 
 @lru_cache(maxsize=8)  # the parts of a loop that is composed ask for the same few

@@ -6,11 +6,9 @@ exported.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, cast, final
 
 import casadi as ca
@@ -188,61 +186,22 @@ def _symbols(rate: ca.Function) -> tuple[ca.SX, ...]:
     return tuple(ca.SX.sym(rate.name_in(k), rate.size1_in(k)) for k in range(4))
 
 
-_MOST = 1000  # sub-steps, beyond which another method is better
-_INSIDE = 2.0  # |pole| times sub-step at which Runge-Kutta 4 is stable for all decaying modes, with some room
-
-
-def stiffness(
-    plant: Plant, integrator: Integrator, period: float, state: np.ndarray, command: np.ndarray, parameters: np.ndarray
-) -> str:
-    """Return a sentence that names the pole that the integrator makes grow, and what would do; empty where all is well."""
-    modes = poles(plant, state, command, parameters)
-    if not np.isfinite(modes).all():
-        return ""
-    growth = _spurious(plant, integrator, period, modes)
-    wrong = growth > 1 + 1e-9
-    if not wrong.any():
-        return ""
-    fastest = modes[wrong][int(np.argmax(np.abs(modes[wrong])))]
-    substeps = math.ceil(float(np.abs(modes).max()) * period / _INSIDE)
-    few = substeps <= _MOST
-    remedy = f"RungeKutta4(substeps={substeps})" if few else "Collocation()"
-    needed = "" if few else f"; RungeKutta4 would need {substeps} sub-steps"
-    rate = f"1/{plant.time_unit}"
-    beside = "" if abs(fastest.imag) <= 1e-9 * abs(fastest) else f" +- {abs(fastest.imag):.4g}i"
-    return (
-        f"a mode decays with the pole {fastest.real:.4g}{beside} {rate}, which times the period of {period:g} {plant.time_unit} is "
-        f"{abs(fastest) * period:.3g}, and {integrator!r} makes it grow by {float(growth[wrong].max()):.3g} per cycle{needed}; use "
-        f"integrator={remedy}"
-    )
-
-
 def spurious_growth(
-    plant: Plant, integrator: Integrator, period: float, states: np.ndarray, commands: np.ndarray
+    plant: Plant,
+    integrator: Integrator,
+    period: float,
+    states: np.ndarray,
+    commands: np.ndarray,
+    parameters: np.ndarray,
 ) -> np.ndarray:
-    """Return the largest factor by which steps along a trajectory make a decaying mode of the model grow, shape (N,); 1: none."""
-    points = zip(states.T, commands.T, strict=True)
-    modes = [poles(plant, state, command, plant.approximate) for state, command in points]
-    return np.array(
-        [_spurious(plant, integrator, period, m).max(initial=1.0) if np.isfinite(m).all() else 1.0 for m in modes]
-    )
-
-
-def _spurious(plant: Plant, integrator: Integrator, period: float, modes: np.ndarray) -> np.ndarray:
-    """Factor by which a step makes each decaying mode grow; 1 for the others."""
-    growth = integrator.growth(modes * period)
-    if growth is None or plant.step is not None:
-        return np.ones(len(modes))
-    return np.where(modes.real <= 1e-9 * np.abs(modes), np.maximum(growth, 1.0), 1.0)
-
-
-def poles(plant: Plant, state: np.ndarray, command: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-    """Return the eigenvalues of dx'/dx at a point, per unit of time, shape (nx,); not finite where the slope is not."""
-    slope = np.asarray(_slope_of(plant)(state, command, parameters).full())
-    return np.linalg.eigvals(slope) if np.isfinite(slope).all() else np.full(len(slope), np.nan + 0j)
-
-
-@lru_cache(maxsize=8)
-def _slope_of(plant: Plant) -> ca.Function:
+    """Return the largest factor by which steps at some points, one per column, make a decaying mode grow, shape (N,); 1: none."""
     x, u, p = plant.symbols()
-    return ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.equations.rate(x, u, p), x))])
+    slope = ca.Function("fpirhc_slope", [x, u, p], [ca.densify(ca.jacobian(plant.equations.rate(x, u, p), x))])
+    largest = np.ones(states.shape[1])
+    for k, (state, command) in enumerate(zip(states.T, commands.T, strict=True)):
+        slopes = np.asarray(slope(state, command, parameters).full())
+        if plant.step is None and np.isfinite(slopes).all():
+            modes = np.linalg.eigvals(slopes)  # per unit of time
+            growth, decays = integrator.growth(modes * period), modes.real <= 1e-9 * np.abs(modes)
+            largest[k] = 1.0 if growth is None else growth[decays].max(initial=1.0)
+    return largest

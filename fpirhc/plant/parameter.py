@@ -111,9 +111,11 @@ def exact_ranges(parameters: Mapping[str, Parameter], mismatch: float) -> dict[s
     for name, parameter in parameters.items():
         (low, high), (least, largest) = parameter.bounds, ranges[name]
         if least < low or largest > high:
+            wider = (_range(parameter, percent) for percent in range(math.ceil(mismatch)))
+            most = sum(low <= one and other <= high for one, other in wider) - 1  # ranges grow with it
             mistakes.add(
                 f"parameter '{name}': {mismatch:g} % around {parameter.exact:g} reach from {least:g} to {largest:g} "
-                f"{parameter.unit}, outside its bounds ({low:g}, {high:g}); at most {_most(parameter):.3g} % stay inside"
+                f"{parameter.unit}, outside its bounds ({low:g}, {high:g}); at most {most} % stay inside"
             )
     mistakes.raise_if_any()
     return ranges
@@ -136,19 +138,6 @@ def _range(parameter: Parameter, mismatch: float) -> tuple[float, float]:
         return parameter.spread.interval(parameter.exact, mismatch / 100)
     width = mismatch / 100 * abs(parameter.exact)
     return parameter.exact - width, parameter.exact + width
-
-
-def _most(parameter: Parameter) -> float:
-    """The largest mismatch that stays inside the bounds, percent; ranges grow with it, so bisection finds it."""
-    low, high = parameter.bounds
-    inside, outside = 0.0, 100.0
-    while low <= _range(parameter, outside)[0] and _range(parameter, outside)[1] <= high:
-        inside, outside = outside, 2 * outside
-    for _ in range(60):
-        middle = (inside + outside) / 2
-        least, largest = _range(parameter, middle)
-        inside, outside = (middle, outside) if low <= least and largest <= high else (inside, middle)
-    return inside
 
 
 TAILS = 2.0  # standard deviations at which normal distributions are cut off; 95 % of the uncut one lie inside

@@ -152,11 +152,6 @@ class Plant(Checked):
         return Equations(self)
 
     @cached_property
-    def followed(self) -> Mapping[str, Output]:
-        """What may follow a reference, as outputs: these, or without any the coordinates."""
-        return self.outputs or {n: Output(unit, lambda *q, n=n: q[0][n]) for n, unit in self.coordinates.items()}
-
-    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the coordinates."""
         return tuple(self.coordinates)
@@ -229,11 +224,6 @@ class Plant(Checked):
     def differences(self) -> dict[str, int]:
         """Of every controlled quantity over how many cycles its response is a difference: its order on a map, else none."""
         return {name: self.response_age * order for name, order in self.response_orders.items()}
-
-    @property
-    def believes_responses(self) -> bool:
-        """Whether it believes something to add to the response of an output, of which plans are made without."""
-        return any("'" in name for name in self.believed)
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""

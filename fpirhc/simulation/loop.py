@@ -58,7 +58,7 @@ def _closed(built: Built) -> Composite:
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(mover, disturbed)
     around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
-    constants = [Delay(signal, signal.name) for signal in open_settings(around).signals] if built.opened else []
+    constants = [Delay(signal, signal.name) for signal in open_settings(around).signals]
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
     delays = [*mover.delays, Delay(built.model.parameter, "parameters"), *constants]
     return compose("loop", reads, around, delays, outputs=mover.sent)

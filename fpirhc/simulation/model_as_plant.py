@@ -20,7 +20,7 @@ from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
-from fpirhc.task.exogenous import Exogenous, as_known
+from fpirhc.task.exogenous import Exogenous, Known, signals_of
 from fpirhc.task.problem import Problem
 from fpirhc.task.reality import Reality
 
@@ -102,8 +102,12 @@ class ModelAsPlant:
     def _made(self, parameters: np.ndarray, signals: Mapping[str, Exogenous], deformation: Deformation) -> Problem:
         own = self._problem.of_model
         plant, longest = exactly(own.plant, parameters), own.measure_from + CYCLES * own.period
-        known, duration = as_known(own.plant, signals), min(own.duration, longest)
-        return with_believed_way(replace(own, plant=plant, signals=known, duration=duration), deformation)
+        known = {  # signals are what the model believes
+            name: one if one.told else Known(own.plant.parameters[name].approximate)
+            for name, one in signals_of(own.plant, signals).items()
+        }
+        own = replace(own, plant=plant, signals=known, duration=min(own.duration, longest))
+        return with_believed_way(own, deformation)
 
     def pair(self, loops: tuple[Simulator, Simulator]) -> tuple[Problem, tuple[Run, Run]]:
         """Return the problem of the second loop's model, and the runs of both loops on it."""

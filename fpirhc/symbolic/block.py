@@ -5,7 +5,7 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate
@@ -150,7 +150,7 @@ class Composite:
     @property
     def settings(self) -> Layout:
         """The signal of the settings, where it is read."""
-        return _settings(self.reads.signals)
+        return Layout(tuple(s for s in self.reads.signals if s.name == SETTINGS))
 
     @cached_property
     def opaque(self) -> bool:
@@ -161,16 +161,7 @@ class Composite:
 def compose(
     name: str, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay] = (), outputs: Sequence[str] = ()
 ) -> Composite:
-    """Wire `blocks`, in order, by signal name into one step.
-
-    Args:
-        name: of the composite and of its Function.
-        outputs: names of traced signals that the Function returns once more by themselves, after (memory, trace).
-
-    Raises:
-        InvalidName: a block reads a signal that no earlier block writes, or two blocks write the same signal.
-        InvalidShape: a reader and a writer disagree on a size.
-    """
+    """Wire blocks, in order, by signal name into one step, which returns the traced `outputs` once more by themselves."""
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
     reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
@@ -210,7 +201,7 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
 
 def open_settings(blocks: Sequence[Block]) -> Layout:
     """Return the signal of the settings, where some blocks read it."""
-    return _settings([s for b in blocks for s in b._built[1].signals])
+    return Layout(tuple({s.name: s for b in blocks for s in b.inputs.signals if s.name == SETTINGS}.values()))
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:
@@ -271,10 +262,6 @@ def every(block: Block, cycles: int) -> Block:
 
     name = f"{block.name}_every_{cycles}"
     return Block(name, block.inputs, block.writes, step, own, opaque=True)
-
-
-def _settings(signals: Iterable[Signal]) -> Layout:
-    return Layout(tuple({s.name: s for s in signals if s.name == SETTINGS}.values()))
 
 
 def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:

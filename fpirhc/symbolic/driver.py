@@ -165,14 +165,10 @@ def is_driver(name: str) -> bool:
     return name in _drivers
 
 
-def entry_of(name: str) -> tuple[str, int]:
-    """Return the name of the C function of a driver, and the numbers that it needs in w."""
-    return f"{name}_driver", _drivers[name][0].room
-
-
-def file_of(name: str) -> str:
-    """Return the C file of a driver."""
-    return f"#define ENTRY {name}_driver\n{_drivers[name][1]}"
+def parts_of(name: str) -> tuple[str, int, str]:
+    """Return the name of the C function of a driver, the numbers that it needs in w, and its C file."""
+    entry, (driver, source) = f"{name}_driver", _drivers[name]
+    return entry, driver.room, f"#define ENTRY {entry}\n{source}"
 
 
 def renamed(function: ca.Function, name: str) -> ca.Function:

@@ -25,8 +25,8 @@ class Evaluator:
     """A Function with its own argument and result arrays."""
 
     def __init__(self, function: ca.Function) -> None:
-        """Allocate the arrays and bind them; sparse arguments and results become dense."""
-        self.function = _dense(function)
+        """Allocate the arrays and bind them; arguments and results are dense."""
+        self.function = function
         self._buffer, handle = cast(tuple[Any, Callable[[], object]], self.function.buffer())  # its stub is that of C++
         self.arguments = tuple(_array(self.function.size_in(k)) for k in range(self.function.n_in()))
         self.results = tuple(_array(self.function.size_out(k)) for k in range(self.function.n_out()))
@@ -96,16 +96,6 @@ def require_unsolved(error: RuntimeError) -> None:
 def _array(size: tuple[int, int]) -> np.ndarray:
     rows, columns = size
     return np.zeros(rows if columns == 1 else (columns, rows))
-
-
-def _dense(function: ca.Function) -> ca.Function:
-    sparse_in = any(not function.sparsity_in(k).is_dense() for k in range(function.n_in()))
-    sparse_out = any(not function.sparsity_out(k).is_dense() for k in range(function.n_out()))
-    if not (sparse_in or sparse_out):
-        return function
-    inputs = [ca.MX.sym(function.name_in(k), *function.size_in(k)) for k in range(function.n_in())]
-    results = [ca.densify(r) for r in function.call(inputs)]
-    return ca.Function(function.name(), inputs, results, function.name_in(), function.name_out())
 
 
 T = TypeVar("T")

@@ -88,17 +88,14 @@ def pair(results: Expression) -> tuple[Expression, Expression]:
 
 def holds_nan(function: ca.Function) -> bool:
     """Whether a Function, or one that it calls, holds the constant NaN."""
-    return any(_has_nan(f) for f in (function, *function.find_functions()))
-
-
-def _has_nan(function: ca.Function) -> bool:
-    if not function.is_a("SXFunction") and not function.is_a("MXFunction"):
-        return False
-    places = [k for k in range(function.n_instructions()) if function.instruction_id(k) == ca.OP_CONST]
-    if function.is_a("SXFunction"):
-        return any(math.isnan(function.instruction_constant(k)) for k in places)
-    matrices = (function.instruction_MX(k).to_DM() for k in places)
-    return any(bool(np.isnan(np.asarray(m.full())).any()) for m in matrices)
+    for f in (function, *function.find_functions()):
+        scalar = f.is_a("SXFunction")
+        for k in range(f.n_instructions() if scalar or f.is_a("MXFunction") else 0):
+            if f.instruction_id(k) == ca.OP_CONST:
+                value = f.instruction_constant(k) if scalar else f.instruction_MX(k).to_DM().full()
+                if np.isnan(value).any():
+                    return True
+    return False
 
 
 SMOOTHING = 1e-6  # half width, in the unit of the argument, within which the power is rounded off around zero

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import casadi as ca
 
 from fpirhc.errors import NoCode
-from fpirhc.symbolic.driver import SIGNATURE, entry_of, file_of, is_driver, of_type
+from fpirhc.symbolic.driver import SIGNATURE, is_driver, of_type, parts_of
 
 NAME = "fpirhc_native"  # stands for the exported name, which is made of the key
 _PART = re.compile(r"^(?=/\* \w+:\(.*\*/\nstatic int casadi_f\d+\(|CASADI_SYMBOL_EXPORT )", re.MULTILINE)
@@ -42,17 +42,16 @@ def generate(function: ca.Function, calls: int = 0) -> tuple[str, ...]:
     except RuntimeError as error:
         raise NoCode(f"CasADi cannot write it as C: {str(error).strip().splitlines()[-1]}") from None
     _check_self_contained(source)
-    drivers = list(dict.fromkeys(f.name() for f in [function, *called] if is_driver(f.name())))
-    entries = {name: entry_of(name) for name in drivers}
+    drivers = {f.name(): parts_of(f.name()) for f in [function, *called] if is_driver(f.name())}
     # The graph in place of which the loops of a driver stand may need less work than they do.
     bodies = {
         name: f"  casadi_real work[{max(room, 1)}];\n  return {entry}(arg, res, iw, work, mem);\n"
-        for name, (entry, room) in entries.items()
+        for name, (entry, room, _) in drivers.items()
     }
-    declared = "".join(f"int {entry}{SIGNATURE};\n" for entry, _ in entries.values())
+    declared = "".join(f"int {entry}{SIGNATURE};\n" for entry, *_ in drivers.values())
     if calls:
         bodies[NAME] = _loop(source, function)
-    return of_type(_with_bodies(source, bodies, declared)), *map(file_of, drivers)
+    return of_type(_with_bodies(source, bodies, declared)), *(file for *_, file in drivers.values())
 
 
 def _called(function: ca.Function) -> list[ca.Function]:

@@ -83,12 +83,6 @@ def really_known(signals: Mapping[str, Exogenous]) -> Mapping[str, Exogenous]:
     return _REAL.of(tuple(values.values()), tuple(values), lambda: {name: Known(one) for name, one in values.items()})
 
 
-def as_known(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogenous]:
-    """Return signals that are what the model believes: the world of a null test."""
-    nominal = {name: Known(plant.parameters[name].approximate) for name in outside_names(plant)}
-    return {name: one if one.told else nominal[name] for name, one in signals_of(plant, signals).items()}
-
-
 def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Return the parameters at some times, shape (m, np): the same row m times where there is no function."""
     if function is None:

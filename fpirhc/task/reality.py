@@ -19,7 +19,7 @@ from fpirhc.errors import InvalidProblem, Mistakes, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, output_order
-from fpirhc.plant.integrators import Integrator, stiffness
+from fpirhc.plant.integrators import Integrator, spurious_growth
 from fpirhc.plant.maps import over, unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.parameter import Parameter
@@ -158,10 +158,12 @@ class Reality(Checked):
         if not np.isfinite(rates).all():
             wrong = plant.state.elements[int(np.argmin(np.isfinite(rates)))]
             raise InvalidProblem(f"reality: the rate of its state '{wrong}' is not finite at the start")
-        stiff = stiffness(plant, integrator, period, start, command, plant.exact)
-        if stiff:
-            what, _, remedy = stiff.partition("; use ")
-            raise InvalidProblem(f"reality: {what}; use Reality(..., {remedy})")
+        [grown] = spurious_growth(plant, integrator, period, start[:, None], command[:, None], plant.exact)
+        if grown > 1 + 1e-9:
+            raise InvalidProblem(
+                f"reality: a mode decays much faster than the period of {period:g} {plant.time_unit}, and {integrator!r} makes it "
+                f"grow by {grown:.3g} per cycle; use Reality(..., integrator=Collocation()), or RungeKutta4 with more sub-steps"
+            )
 
     def as_model(self, model: Plant) -> Plant:
         """Return its plant as the model of a controller, with outputs where the model has the same quantities as outputs."""

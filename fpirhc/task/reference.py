@@ -152,10 +152,11 @@ class Setpoint(Reference):
         for name, order in self._orders(plant).items():
             rest = self._first(name)
             held, z = ca.SX(rest), ca.SX(ca.DM([rest, *[0.0] * (order - 1)]))
-            for time, change in self._changes(name):
-                rising = _transition(self.rate, ca.fmax(t - time, 0), order)[:, 0]
-                z = z + change * (ca.DM(np.eye(order)[:, 0]) - rising)
-                held = held + change * (t >= time * (1 - _ON_TIME))
+            for (_, old), (time, new) in pairwise(pairs(name, self.values[name])):
+                if new != old:
+                    rising = _transition(self.rate, ca.fmax(t - time, 0), order)[:, 0]
+                    z = z + (new - old) * (ca.DM(np.eye(order)[:, 0]) - rising)
+                    held = held + (new - old) * (t >= time * (1 - _ON_TIME))
             chains[name] = self._chain(plant, z, held)
         return ca.Function("fpirhc_reference", [t], list(_arranged(plant, chains)), ["t"], ["state", "response"])
 
@@ -246,11 +247,6 @@ class Setpoint(Reference):
     def _first(self, name: str) -> float:
         """Where the filter of a coordinate begins."""
         return pairs(name, self.values[name])[0][1]
-
-    def _changes(self, name: str) -> list[tuple[float, float]]:
-        """Times and sizes of the changes of one set-point."""
-        steps = pairs(name, self.values[name])
-        return [(time, value - old) for (_, old), (time, value) in pairwise(steps) if value != old]
 
     def _check_names(self, plant: Plant) -> None:
         mistakes = Mistakes("reference")

@@ -65,7 +65,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         lambda: real(lagged(), start={"F": 0.0}, seen={"y": "Y"}), "coordinate of the reality 'Y' is unknown"
     ),
     "no start": (lambda: real(lagged()), "does not have: F; give their first values: Reality(start={'F': ...})"),
-    "stiff": (lambda: real(lagged(tau=1e-4), start={"F": 0.0}), "RungeKutta4(substeps=5)"),
+    "stiff": (lambda: real(lagged(tau=1e-4), start={"F": 0.0}), "RungeKutta4(substeps=1) makes it grow by"),
     "judged": (lambda: task(reality=fp.Reality(Y), judged=["y", "F"]), "'F'"),
     "a plant": (lambda: task(reality=pendulum()), "Reality"),
     "no exact model": (

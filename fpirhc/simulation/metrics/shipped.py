@@ -295,7 +295,7 @@ def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shi
         data = ca.vertcat(data[: place.start], data[place] - shift, data[place.stop :])
         motion = [*motion, shift]
     terms = ocp.stage_cost(ocp.start(x, before), u, data)[1]
-    one = ca.Function("fpirhc_cost", [t, *motion, x, u, before, p], [terms])
+    one = ca.Function("fpirhc_cost", [t, *motion, x, u, before, p], [ca.densify(terms)])
     with contextlib.suppress(RuntimeError):  # a table to look up, or a solver, is no scalar code
         one = one.expand()
     tables = [ca.MX.sym(one.name_in(k), one.size1_in(k), count) for k in range(one.n_in() - 1)]
