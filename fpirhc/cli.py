@@ -396,7 +396,7 @@ def doctor(json: opt.Json = False) -> None:
 
 @command(
     "export two_mass RHC+FPI --out device                    C99 in the folder device",
-    "export two_mass RHC+FPI --live deformation.gain limits.inputs.Q1",
+    "export two_mass RHC+FPI --live deformation.gain limits.inputs.Q1.1",
     "export two_mass RHC+FPI --to fmu2                       a unit for co-simulation",
     "export two_mass RHC+FPI --to lab                        a page with sliders",
 )

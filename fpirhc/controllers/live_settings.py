@@ -1,6 +1,6 @@
 """Settings that stay open in a compiled loop: which numbers of a controller and its problem they are, and what they may be.
 
-    live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1"])
+    live = live_settings(problem, controller, ["deformation.gain", "cost.states.q1", "limits.inputs.Q1.1"])
 
 An automatic setting, such as the scale of a sigmoid, stays as it was chosen for the build. See docs/simulators.md.
 """
@@ -45,7 +45,7 @@ class LiveSettings:
     problem: Problem  # the problem with the numbers of the build
     unresolved: Controller  # the controller as it was given, for loops of other problems
     controller: Controller  # the same with its automatic settings chosen
-    paths: tuple[str, ...] = ()  # of all live numbers, intervals as their ends
+    paths: tuple[str, ...] = ()  # of all live numbers
 
     @property
     def start(self) -> dict[str, float]:
@@ -156,28 +156,24 @@ class LiveSettings:
 
 def live_settings(problem: Problem, controller: Controller, paths: Sequence[str] = ()) -> LiveSettings:
     """Return the live settings of a loop, with the controller resolved."""
-    every = tuple(dict.fromkeys(end for path in paths for end in _ends(problem, controller, path)))
-    return LiveSettings(problem, controller, resolved(problem, controller), every)
+    for path in paths:
+        _check(problem, controller, path)
+    return LiveSettings(problem, controller, resolved(problem, controller), tuple(dict.fromkeys(paths)))
 
 
-def _ends(problem: Problem, controller: Controller, path: str) -> list[str]:
-    """The path of a number, or the paths of the finite ends of an interval."""
+def _check(problem: Problem, controller: Controller, path: str) -> None:
+    """Raise unless a finite number stands at the path that is no whole number and no switch."""
     owner = _owner(problem, controller, path)
     content = content_at(owner, path, "the problem" if owner is problem else "the controller")
-    interval = isinstance(content, tuple) and len(content) == 2 and owner is problem
-    ends = [f"{path}.{k}" for k in (0, 1) if math.isfinite(content[k])] if interval else [path]  # type: ignore[index]
     if isinstance(content, bool) or (isinstance(content, int | float) and is_whole(owner, path)):
         what = f"{content!r} decides what the loop is made of, as whole numbers and switches do"
         raise not_live([path], f"{what}; {ANEW}")
-    if not interval and not isinstance(content, int | float | np.number):
+    if not isinstance(content, int | float | np.number):
         ways = ", ".join(names_in(content)) or "none"
         hint = "give it a number first" if content is None else f"go on with one of: {ways}"
         raise InvalidValue(f"setting '{path}' is {content!r}, not a number; {hint}")
-    if not ends or (not interval and not math.isfinite(cast(float, content))):
-        raise InvalidValue(
-            f"setting '{path}' is {content!r}: there is no limit that could change; give it a finite number"
-        )
-    return ends
+    if not math.isfinite(content):
+        raise InvalidValue(f"setting '{path}' is {content!r}: no limit that could change; give it a finite number")
 
 
 def _owner(problem: Problem, controller: Controller, path: str) -> Problem | Controller:

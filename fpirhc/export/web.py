@@ -145,7 +145,8 @@ def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: P
 def _with_live(problem: Problem, controller: Controller) -> Simulator:
     """The loop with those of its gains and the limits of its inputs that it can keep open."""
     wanted = [path for path in paths_to("gain", controller) if not path.startswith("optimiser.")]
-    wanted += [f"limits.inputs.{name}" for name, ends in problem.limits.inputs.items() if np.isfinite(ends).any()]
+    ends = ((name, k, end) for name, pair in problem.limits.inputs.items() for k, end in enumerate(pair))
+    wanted += [f"limits.inputs.{name}.{k}" for name, k, end in ends if np.isfinite(end)]
     ready, opened = simulator(problem, controller, compiled=False), list[str]()
     for path in wanted:
         try:

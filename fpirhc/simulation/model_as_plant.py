@@ -102,12 +102,9 @@ class ModelAsPlant:
     def _made(self, parameters: np.ndarray, signals: Mapping[str, Exogenous], deformation: Deformation) -> Problem:
         own = self._problem.of_model
         plant, longest = exactly(own.plant, parameters), own.measure_from + CYCLES * own.period
-        known = {  # signals are what the model believes
-            name: one if one.told else Known(own.plant.parameters[name].approximate)
-            for name, one in signals_of(own.plant, signals).items()
-        }
-        own = replace(own, plant=plant, signals=known, duration=min(own.duration, longest))
-        return with_believed_way(own, deformation)
+        given, stated, duration = signals_of(own.plant, signals), own.plant.parameters, min(own.duration, longest)
+        known = {n: one if one.told else Known(stated[n].approximate) for n, one in given.items()}  # all it believes
+        return with_believed_way(replace(own, plant=plant, signals=known, duration=duration), deformation)
 
     def pair(self, loops: tuple[Simulator, Simulator]) -> tuple[Problem, tuple[Run, Run]]:
         """Return the problem of the second loop's model, and the runs of both loops on it."""

@@ -170,7 +170,7 @@ def simulator(
         controller: its automatic settings are chosen here.
         compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
         live: paths of settings that a run may change without another build: 'deformation.gain', 'cost.states.q1',
-            'limits.inputs.Q1'.
+            'limits.inputs.Q1.1'.
 
     Raises:
         InvalidName: no such setting; the nearest one is offered.

@@ -34,7 +34,7 @@ CASES = {
     "map": ("fishery", "RHC+FPI"),
     "sensors": ("noisy_motor", "RHC+FPI"),
 }
-LIVE = ("deformation.gain", "limits.inputs.Q1")
+LIVE = ("deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1")
 
 
 def of_case(name: str, folder: Path, live: tuple[str, ...] = ()) -> Exported:

@@ -17,11 +17,11 @@ from fpirhc import Status
 pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 # Controllers of states, of outputs, of a map and of sensors, a plan, and what of each may be live.
 CASES = {
-    "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "tracking.rate", "limits.inputs.Q1")),
-    "vector": ("two_mass", "CTC+FPI (eq 3)", ("deformation.gain", "limits.inputs.Q2")),
-    "outputs": ("anaesthesia", "CTC+FPI", ("deformation.gain", "limits.inputs.infusion")),
-    "map": ("fishery", "CTC+FPI", ("deformation.map.gain", "limits.inputs.effort")),
-    "plan": ("leaking_tanks", "RHC+FPI", ("deformation.gain", "limits.inputs.u")),
+    "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "tracking.rate", "limits.inputs.Q1.1")),
+    "vector": ("two_mass", "CTC+FPI (eq 3)", ("deformation.gain", "limits.inputs.Q2.0", "limits.inputs.Q2.1")),
+    "outputs": ("anaesthesia", "CTC+FPI", ("deformation.gain", "limits.inputs.infusion.0", "limits.inputs.infusion.1")),
+    "map": ("fishery", "CTC+FPI", ("deformation.map.gain", "limits.inputs.effort.0", "limits.inputs.effort.1")),
+    "plan": ("leaking_tanks", "RHC+FPI", ("deformation.gain", "limits.inputs.u.0", "limits.inputs.u.1")),
 }
 INSTANCES, CYCLES, CHANGES = 2, 80, 5
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))]

@@ -19,7 +19,7 @@ fmi1 = pytest.importorskip("fmpy.fmi1", reason=REASON)
 validation = pytest.importorskip("fmpy.validation", reason=REASON)
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 CASES = {
-    "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "limits.inputs.Q1")),
+    "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1")),
     "plan": ("two_mass", "RHC+FPI", ()),
     "outputs": ("anaesthesia", "RHC+FPI", ()),
     "map": ("fishery", "RHC+FPI", ()),

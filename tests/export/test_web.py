@@ -17,7 +17,7 @@ CASES = {
     "plan": ("two_mass", "RHC+FPI"),
     "outputs": ("anaesthesia", "RHC+FPI"),
 }
-LIVE = {"torque": ("deformation.gain", "limits.inputs.Q1")}
+LIVE = {"torque": ("deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1")}
 
 
 def of_case(name: str, folder: Path) -> Exported:

@@ -8,7 +8,7 @@ import pytest
 import fpirhc as fp
 
 CASES = {
-    "CTC+FPI": ("two_mass", "CTC+FPI (eq 6)", ["deformation.gain", "limits.inputs.Q1"]),
+    "CTC+FPI": ("two_mass", "CTC+FPI (eq 6)", ["deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1"]),
     "RHC+FPI": ("two_mass", "RHC+FPI", ["deformation.gain", "cost.states.q1"]),
     "outputs": ("anaesthesia", "CTC+FPI", []),
     "map": ("fishery", "RHC+FPI", []),
@@ -71,7 +71,7 @@ def _of(name: str):
 def test_bounds_are_where_the_check_begins_to_refuse():
     """Every number inside is accepted, and one a little beyond an end is refused; limits of inputs end at those of the build."""
     stepper = fp.Stepper(
-        *_of("CTC+FPI"), live=["deformation.gain", "tracking.rate", "limits.inputs.Q1"], compiled=False
+        *_of("CTC+FPI"), live=["deformation.gain", "tracking.rate", "limits.inputs.Q1.1"], compiled=False
     )
     bounds, build = stepper.bounds(), dict(stepper.numbers)
     assert list(bounds) == ["deformation.gain", "tracking.rate", "limits.inputs.Q1.0", "limits.inputs.Q1.1"]
