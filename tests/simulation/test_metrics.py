@@ -105,6 +105,8 @@ def test_cost_is_the_sum_of_the_measured_part_by_term():
     along: dict[str, Any] = {"reference": np.sin(PERIOD * np.arange(CYCLES)), "command": step(9.0, 2.0, 50)}
     metrics = fp.measure(problem(**PRICED), run(step(9.0, 2.0, 50), **along))
     assert metrics["cost"] == pytest.approx({"states": 20.0, "effort": 10.0, "total": 30.0})
+    every = fp.measure(problem(**PRICED, measure_from=0.0), run(step(9.0, 2.0, 50), **along))
+    assert every["cost"]["total"] == pytest.approx(30.0 + 1.5 * 81 * 5)
     assert fp.measure(problem(), run(0.0))["cost"] == {}
     assert fp.measure(problem(**PRICED), run(0.0, **along, stop="signal 'x' is not finite"))["cost"] == {}
 

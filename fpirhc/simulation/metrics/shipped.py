@@ -343,17 +343,15 @@ METRICS = (
     Metric("solve.worst_feasibility", _over("feasibility", np.max), report=False, order=90),
     Metric("plans", plans, better="neither", report=False, order=90),
     Metric("cost", cost, by="term", shown=("total",), order=70, always=False),
-    # A difference of 1e-4 has no meaning: the factor is a fit, or a difference of eigenvalues from one.
     Metric(
         "contraction.predicted",
         predicted,
         short="contr. factor",
         better="neither",  # the smallest factor is not the best gain
         main=True,
-        floor=1e-4,
         order=85,
         always=False,
     ),
     Metric("contraction.growing", growing, title="contraction above 1", text=in_percent, order=85, always=False),
-    Metric("contraction.measured", measured, floor=1e-4, order=85, always=False),
+    Metric("contraction.measured", measured, order=85, always=False),
 )
