@@ -178,12 +178,6 @@ class _ReferenceExpansion:
                 most = np.fmax(most, np.abs(slope).max(axis=1, initial=0.0))
         return np.where(np.isfinite(most), most, 0.0)
 
-    def hessian(self) -> np.ndarray:
-        """Return M (N nu, N nu), the Hessian of V with the dynamics linearised."""
-        stages, _, nu = self.b.shape
-        columns = np.eye(stages * nu).reshape(-1, stages, nu)
-        return np.array([self.hessian_times(column).ravel() for column in columns])
-
     def growth(self) -> np.ndarray:
         """Largest factor |eigenvalue of dF/ds| by which a motion grows in each stage, shape (N,)."""
         finite, factors = np.isfinite(self.a).all(axis=(1, 2)), np.full(len(self.a), np.nan)

@@ -136,31 +136,15 @@ class Run(FoundByName):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader of its numbers should know, in sentences."""
-        return tuple(filter(None, (self.depends_on_rounding, self.never_paired)))
-
-    @property
-    def never_paired(self) -> str:
-        """Why a deformation that pairs by an estimated dead time did nothing: a sentence where it identified none."""
-        if "paired_cycles" not in self.layout or not self.cycles or (self["paired_cycles"] >= 0).any():
-            return ""
-        return (
-            "no dead time was identified in the whole run, so adaptation never began: a smooth task shows none; "
-            "Increment.within(map, most) needs none"
-        )
-
-    @property
-    def depends_on_rounding(self) -> str:
         """Why the same run may be another one elsewhere: a sentence where plans did not converge in 1 % of the cycles or more."""
         if "status" not in self.layout or not self.cycles:
-            return ""
+            return ()
         share = float(np.mean(self["status"] == Status.NOT_CONVERGED))
-        if share < _FEW:
-            return ""
-        return (
+        words = (
             f"plans did not converge in {in_percent(share)} of the cycles; such plans depend on rounding, so compiled C, the "
             f"virtual machine and another computer may give other runs: allow more iterations, or loosen the tolerance"
         )
+        return (words,) if share >= _FEW else ()
 
     def first(self, cycles: int) -> Run:
         """Return the run of its first cycles; itself where it has fewer."""

@@ -26,7 +26,7 @@ from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
-from fpirhc.simulation.tables import Changes, InForce, in_force, run_tables
+from fpirhc.simulation.tables import Changes, in_force, run_tables
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.layout import Layout
@@ -89,10 +89,6 @@ class Simulator:
     def remembers(self) -> bool:
         """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
         return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
-
-    def in_force(self, variant: Problem | None = None, settings: Numbers | None = None) -> InForce:
-        """Return problem and controller of a run; arguments as in `run`."""
-        return in_force(self.live, self.loop, variant or self.problem, settings or {}, {})
 
     @checked_call
     def run(

@@ -1,7 +1,6 @@
 """The contract of metrics: one value holds a number's name, function, appearance and comparison.
 
-A file of this folder that defines `METRICS`, a tuple of `Metric`, adds them; so does an entry point of the group
-`fpirhc.metrics` of another package, and `metrics = (...)` in a problem file.
+`METRICS` of `shipped` are those of every problem, `metrics = (...)` in a problem file its own.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import entry_points
 from numbers import Integral, Real
 from typing import Literal, SupportsIndex
 
@@ -20,7 +18,6 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import ByName, Checked, FoundByName, checked_call
-from fpirhc.members import within
 from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
@@ -155,17 +152,15 @@ def input_unit(problem: Problem, name: str) -> str:
     return problem.plant.inputs[name]
 
 
-GROUP = "fpirhc.metrics"  # of entry points; each leads to a Metric or to a tuple of them
 _TAKEN = frozenset({"compiled", "cycle_us", "notes", "optimality", "outcome", "plan", "statuses", "stop"})  # by files
 
 
 @cache
 def known_metrics() -> tuple[Metric, ...]:
-    """Return the shipped metrics and those of installed packages, in the order of their columns."""
-    shipped = [metric for module in within("fpirhc.simulation.metrics") for metric in getattr(module, "METRICS", ())]
-    loaded = [point.load() for point in entry_points(group=GROUP)]
-    installed = [one for some in loaded for one in ((some,) if isinstance(some, Metric) else some)]
-    return _ordered([*shipped, *installed])
+    """Return the shipped metrics, in the order of their columns."""
+    from fpirhc.simulation.metrics.shipped import METRICS
+
+    return _ordered(METRICS)
 
 
 def known_metric(name: str) -> Metric | None:
