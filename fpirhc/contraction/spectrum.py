@@ -200,7 +200,7 @@ def _require_one_sign(spectrum: Spectrum) -> None:
     """Check that some gain converges."""
     if not spectrum.one_sign:
         raise NotContractive(
-            "the response Jacobian has eigenvalues with real parts of both signs or zero (from "
+            "the input gains of the plant, over those of the model, have both signs or are zero (from "
             f"{spectrum.smallest_real:.4g} to {spectrum.largest_real:.4g}), so no gain makes the iteration converge: "
             "it enlarges the error in some direction. Check that each input acts on its own coordinate and that the "
             "approximate parameters give the effect of every input its true sign"

@@ -117,7 +117,7 @@ def load_problem(name_or_path: str | Path) -> Task:
     except FpirhcError as error:
         raise ProblemFileError(str(error)) from None
     title, _, description = (module.__doc__ or path.stem).strip().partition("\n")
-    return Task(path.stem, path, title, description.strip(), **facts)
+    return Task(path.stem, path, title, description.strip("\n"), **facts)
 
 
 _NEEDED = {"problem": "fpirhc.Problem(...)", "controllers": "{'name': fpirhc.ComputedTorque(...), ...}"}

@@ -149,7 +149,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
 @cache
 def blocks(text: str) -> list[tuple[bool, str]]:
     """Return the paragraphs of a description, each with whether it is set as written, as indented equations and tables are."""
-    blocks = (block for block in textwrap.dedent(text).strip().split("\n\n") if block.strip())
+    blocks = (block for block in textwrap.dedent(text).strip("\n").split("\n\n") if block.strip())
     return [(True, textwrap.dedent(b)) if b.startswith("  ") else (False, " ".join(b.split())) for b in blocks]
 
 

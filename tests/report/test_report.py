@@ -29,7 +29,9 @@ def comparison() -> Any:
     track, form = fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=5.0)
     controllers = {"plain": fp.ComputedTorque(track), "adaptive": fp.ComputedTorque(track, form)}
     controllers["exact"] = fp.ExactModel(controllers["plain"])
-    return fp.compare(tasks.made(problem(), controllers, description="Its task."), seed=0, compiled=False)
+    return fp.compare(
+        tasks.made(problem(), controllers, description="    y = 2 x\n\nIts task."), seed=0, compiled=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,7 @@ def test_report_is_self_contained_and_small(written):
     settings = whole[whole.index("<h2>Settings") :]  # as Python, and only what is no default
     assert "<pre>fp.ExactModel(controller=fp.ComputedTorque(tracking=fp.Exponential(rate=6.0)))</pre>" in settings
     assert "deformation=fp.Sigmoid(gain=-0.5, scale=5.0)" in settings
+    assert "<pre class='about'>y = 2 x</pre><p class='about'>Its task.</p>" in whole
 
 
 def test_the_best_number_is_of_those_with_the_wrong_model_and_no_factor_is_best(comparison):
