@@ -10,8 +10,17 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
-from fpirhc.deformation.delayed import check_cycles, check_uncertainty, check_whole, chosen_pole, leaked
+from fpirhc.deformation.base import (
+    Deformation,
+    Form,
+    Wrapper,
+    check_cycles,
+    check_uncertainty,
+    check_whole,
+    chosen_pole,
+    leaked,
+    memory_of_map,
+)
 from fpirhc.errors import require
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite

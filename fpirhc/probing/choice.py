@@ -17,8 +17,8 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.affine import Affine
-from fpirhc.deformation.base import Deformation
-from fpirhc.deformation.delayed import Paired, default_pole
+from fpirhc.deformation.base import Deformation, default_pole
+from fpirhc.deformation.delayed import Paired
 from fpirhc.deformation.filters import Filtered
 from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import FpirhcError, require

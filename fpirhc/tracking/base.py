@@ -16,7 +16,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.expression import Signals
+from fpirhc.symbolic.expression import Signals, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar, vector
 
 
@@ -64,11 +64,22 @@ class Tracking(Checked, ABC):
         """Signals that the law carries to the next cycle."""
 
 
+def decay_gains(rate: float, order: int) -> tuple[float, ...]:
+    """Return the gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
+    return tuple(math.comb(order, s) * power(rate, order - s) for s in range(order))
+
+
+def companion(gains: tuple[float, ...]) -> np.ndarray:
+    """Return the matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
+    matrix = np.diag(np.ones(len(gains) - 1), 1)
+    matrix[-1] = -np.array(gains)
+    return matrix
+
+
 def one_rate(gains: Sequence[float]) -> float | None:
     """Return Lambda where the law of these gains is (d/dt + Lambda)^m z = 0; None where its modes differ."""
     rate = gains[-1] / len(gains)
-    modes = [math.comb(len(gains), s) * rate ** (len(gains) - s) for s in range(len(gains))]
-    return rate if np.allclose(gains, modes) else None
+    return rate if np.allclose(gains, decay_gains(rate, len(gains))) else None
 
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor

@@ -18,9 +18,9 @@ from fpirhc.fields.kinds import Positive, Range
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, power
+from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, error_chains, law_signals, own_errors
+from fpirhc.tracking.base import ROOM, IntegralLaw, Useful, decay_gains, error_chains, law_signals, own_errors
 
 MOST = 20_000  # cycles of memory: the memory has a fixed size
 _REACH = 20.0  # memory x rate by default
@@ -80,10 +80,6 @@ class Fractional(IntegralLaw):
         """Weights w_1 ... w_L of the past, shape (cycles,)."""
         return np.cumprod(1 - (float(self.order) + 1) / np.arange(1, cycles + 1))
 
-    def _gains(self, order: int) -> tuple[float, ...]:
-        """Gains of (e_int, e, e', ...) in S below its highest derivative, for relative order n."""
-        return tuple(math.comb(order, s) * power(self.rate, order - s) for s in range(order))
-
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
         check_modes(self, plant, [self.rate])
@@ -125,7 +121,7 @@ class Fractional(IntegralLaw):
     def _useful(self, plant: Plant) -> list[Useful]:
         if not self.largest:
             return []
-        gains = [(*self._gains(order), 1.0, 0.0)[:2] for order in plant.response_orders.values()]
+        gains = [(*decay_gains(self.rate, order), 1.0, 0.0)[:2] for order in plant.response_orders.values()]
         return [Useful(self.rate * i, self.rate * e, most) for (i, e), most in zip(gains, self.largest, strict=True)]
 
     def _useful_decay(self, measured: Expression, last: Expression) -> Expression:
@@ -144,7 +140,7 @@ class Fractional(IntegralLaw):
         """S, and its derivative without e^(n)."""
         decaying, drift = [], []
         for k, chain in enumerate(errors):
-            gains = self._gains(len(chain))
+            gains = decay_gains(self.rate, len(chain))
             whole = [integral[k], *chain]
             decaying.append(whole[-1] + sum(g * e for g, e in zip(gains, whole, strict=False)))
             drift.append(sum(g * e for g, e in zip(gains, chain, strict=True)))

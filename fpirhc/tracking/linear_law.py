@@ -6,7 +6,6 @@ place of derivatives, and the integral is a sum.
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,9 +19,9 @@ from fpirhc.fields.kinds import Duration, Positive
 from fpirhc.plant.maps import check_modes
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
-from fpirhc.symbolic.expression import Signals, power, total
+from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression
-from fpirhc.tracking.base import IntegralLaw, Useful, error_chains, law_signals, own_errors
+from fpirhc.tracking.base import IntegralLaw, Useful, decay_gains, error_chains, law_signals, own_errors
 
 _SAME = 1e-9  # share of a cycle that is rounding
 
@@ -118,8 +117,7 @@ class Exponential(LinearLaw):
     largest: Sequence[float] = ()
 
     def gains(self, order: int) -> tuple[float, ...]:
-        degree = order + 1 if self.integral else order
-        return tuple([math.comb(degree, s) * power(self.rate, degree - s) for s in range(degree)])
+        return decay_gains(self.rate, order + 1 if self.integral else order)
 
 
 @dataclass(frozen=True)
@@ -171,8 +169,7 @@ class ShiftPolynomial(LinearLaw):
         """
         degree = order + 1 if self.integral else order
         if not isinstance(self.poles, Sequence):
-            rate = (1 - self.poles) / self.step
-            return tuple(math.comb(degree, s) * power(rate, degree - s) for s in range(degree))
+            return decay_gains((1 - self.poles) / self.step, degree)
         if len(self.poles) != degree:
             raise InvalidValue(
                 f"ShiftPolynomial: {len(self.poles)} poles are given, and a quantity of relative order {order} has {degree} modes"

@@ -12,7 +12,6 @@ import numpy as np
 from fpirhc.controllers.base import closing_blocks, invert_block, nominal_blocks, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives
-from fpirhc.controllers.rivals.model_reference import decay_gains
 from fpirhc.fields.kinds import Positive
 from fpirhc.members import Example
 from fpirhc.plant.maps import check_modes, step_of
@@ -21,7 +20,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_in_mean, power, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking, error_chains, own_errors
+from fpirhc.tracking.base import Tracking, decay_gains, error_chains, own_errors
 
 
 @dataclass(frozen=True)

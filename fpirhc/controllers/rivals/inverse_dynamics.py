@@ -10,7 +10,6 @@ import casadi as ca
 from fpirhc.controllers.base import closing_blocks, invert_block, nominal_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives, Undeformed
-from fpirhc.controllers.rivals.model_reference import decay_gains
 from fpirhc.errors import Mistakes
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
@@ -21,7 +20,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, is_finite, left_after, power
 from fpirhc.symbolic.layout import Expression, Layout, like, scalar, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking, error_chains
+from fpirhc.tracking.base import Tracking, decay_gains, error_chains
 
 
 @dataclass(frozen=True)

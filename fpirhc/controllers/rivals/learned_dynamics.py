@@ -12,7 +12,6 @@ from scipy.linalg import solve_continuous_lyapunov
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.rivals.learned_parameters import Learning, equation_function, learning_delays
-from fpirhc.controllers.rivals.model_reference import companion
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.errors import InvalidValue, require
 from fpirhc.fields.kinds import Positive
@@ -24,7 +23,7 @@ from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import error_chains, integral_signal
+from fpirhc.tracking.base import companion, error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -24,19 +23,7 @@ from fpirhc.symbolic.expression import Signals, expression, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking, error_chains
-
-
-def decay_gains(rate: float, order: int) -> tuple[float, ...]:
-    """Return the gains of (e, e', ...) in (d/dt + rate)^n e = 0, lowest derivative first."""
-    return tuple(math.comb(order, s) * power(rate, order - s) for s in range(order))
-
-
-def companion(gains: tuple[float, ...]) -> np.ndarray:
-    """Return the matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
-    matrix = np.diag(np.ones(len(gains) - 1), 1)
-    matrix[-1] = -np.array(gains)
-    return matrix
+from fpirhc.tracking.base import Tracking, companion, decay_gains, error_chains
 
 
 def model_block(plant: Plant, rate: float, period: float) -> Block:
