@@ -299,7 +299,6 @@ def with_field(controller: _Own, name: str, value: object) -> _Own:
 
 
 def _chain(controller: Controller | None) -> Iterator[Controller]:
-    """Yield a controller and those inside it, the outermost first."""
     while controller is not None:
         yield controller
         controller = controller.inner

@@ -13,16 +13,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import (
-    Deformation,
-    Form,
-    Wrapper,
-    check_cycles,
-    check_uncertainty,
-    chosen_pole,
-    leaked,
-    memory_of_map,
-)
+from fpirhc.deformation.base import Deformation, Form, Wrapper, check_cycles, chosen_pole, leaked, memory_of_map
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import Cycles, Queue
@@ -123,9 +114,7 @@ class Increment(_Queued):
     pole: BelowOne | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.uncertainty is not None:
-            check_uncertainty("Increment", self.uncertainty, self.cycles)
+        check_cycles("Increment", self.cycles, uncertainty=self.uncertainty)
 
     @classmethod
     def within(cls, map: Deformation, most: float) -> Increment:

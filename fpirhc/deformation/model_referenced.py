@@ -15,7 +15,6 @@ from fpirhc.deformation.base import (
     Form,
     Wrapper,
     check_cycles,
-    check_uncertainty,
     check_whole,
     chosen_pole,
     leaked,
@@ -56,9 +55,8 @@ class ModelReferenced(Wrapper):
         for name, value in (("cycles", self._cycles), ("measurement", self.measurement)):
             check_cycles("ModelReferenced", value, name)
             check_whole("ModelReferenced", value, name)
-        check_cycles("ModelReferenced", self._delays)
-        if self.uncertainty is not None and self.cycles is not None:  # else it is checked with the problem's dead times
-            check_uncertainty("ModelReferenced", self.uncertainty, self._delays)
+        # without cycles it is checked with the problem's dead times
+        check_cycles("ModelReferenced", self._delays, uncertainty=None if self.cycles is None else self.uncertainty)
 
     @property
     def form(self) -> Form:

@@ -69,13 +69,6 @@ def decay_gains(rate: float, order: int) -> tuple[float, ...]:
     return tuple(math.comb(order, s) * power(rate, order - s) for s in range(order))
 
 
-def companion(gains: tuple[float, ...]) -> np.ndarray:
-    """Return the matrix A of x' = A x for the chain x = (e, e', ...) with e^(n) = -gains . x, shape (n, n)."""
-    matrix = np.diag(np.ones(len(gains) - 1), 1)
-    matrix[-1] = -np.array(gains)
-    return matrix
-
-
 def one_rate(gains: Sequence[float]) -> float | None:
     """Return Lambda where the law of these gains is (d/dt + Lambda)^m z = 0; None where its modes differ."""
     rate = gains[-1] / len(gains)

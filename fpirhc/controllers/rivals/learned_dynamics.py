@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import solve_continuous_lyapunov
+from scipy.linalg import companion, solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
@@ -23,7 +23,7 @@ from fpirhc.symbolic.block import Block, Delay, fed
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import companion, error_chains, integral_signal
+from fpirhc.tracking.base import error_chains, integral_signal
 from fpirhc.tracking.linear_law import Exponential
 
 
@@ -106,7 +106,7 @@ class AdaptiveInverseDynamics(Controller):
         gains = self.tracking.gains(2)
         size = len(gains)
         weights = np.diag([self.tracking.rate ** (2.0 * (size - 1 - k)) for k in range(size)])
-        return np.asarray(solve_continuous_lyapunov(companion(gains).T, -weights)[-1])
+        return np.asarray(solve_continuous_lyapunov(np.flip(companion([1.0, *reversed(gains)])).T, -weights)[-1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import solve_continuous_lyapunov
+from scipy.linalg import companion, solve_continuous_lyapunov
 
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
@@ -23,7 +23,11 @@ from fpirhc.symbolic.expression import Signals, expression, power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking, companion, decay_gains, error_chains
+from fpirhc.tracking.base import Tracking, decay_gains, error_chains
+
+
+def _chain(gains: tuple[float, ...]) -> np.ndarray:  # A of x' = A x for x = (e, e', ...)
+    return np.flip(companion([1.0, *reversed(gains)]))
 
 
 def model_block(plant: Plant, rate: float, period: float) -> Block:
@@ -35,7 +39,7 @@ def model_block(plant: Plant, rate: float, period: float) -> Block:
     gains = [decay_gains(rate, len(chain)) for chain in chains]
     ends_of_steps = np.cumsum([0, *(len(g) ** 2 for g in gains)]).tolist()
 
-    fixed = np.concatenate([step_of(plant, companion(g), period).ravel(order="F") for g in gains])
+    fixed = np.concatenate([step_of(plant, _chain(g), period).ravel(order="F") for g in gains])
     memory = Layout((Signal("model_deviation", tuple(e for chain in chains for e in chain)),))
     ends = np.cumsum([0, *(len(chain) for chain in chains)]).tolist()
 
@@ -144,7 +148,7 @@ class LyapunovMRAC(OfDerivatives):
 
     def weights(self, order: int) -> np.ndarray:
         """Return P of the scaled error z for one coordinate, shape (order, order)."""
-        return np.asarray(solve_continuous_lyapunov(companion(decay_gains(1.0, order)).T, -np.eye(order)))
+        return np.asarray(solve_continuous_lyapunov(_chain(decay_gains(1.0, order)).T, -np.eye(order)))
 
     def check(self, problem: Problem) -> None:
         """Raise if the proof of the rule does not cover the plant."""
