@@ -170,7 +170,7 @@ def whole_numbers(text: str) -> Markup:
     """Return a sentence as HTML whose lines do not end inside a number, or between a number and its unit."""
     from markupsafe import Markup, escape
 
-    return Markup(_NUMBER.sub(r"<span class='number'>\g<0></span>", str(escape(text))))
+    return Markup(_NUMBER.sub(r"<span class='number'>\g<0></span>", str(escape(text)).replace("-&gt;", "→")))
 
 
 def css_class(outcome: Outcome | None) -> str:
