@@ -37,7 +37,7 @@ from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.symbolic.evaluate import attempted
-from fpirhc.symbolic.native import compiling_ahead
+from fpirhc.symbolic.native import compile_all
 from fpirhc.task.problem import Problem
 
 
@@ -45,7 +45,7 @@ def select(task: Task, names: Sequence[str] | None) -> dict[str, Controller]:
     """Return the named controllers of a task in the given order; all of them when no names are given."""
     mistakes = Mistakes(f"problem '{task.name}'")
     mistakes.unknown("controller", names or (), task.controllers)
-    if not mistakes.none and any("," in name for name in names or ()):
+    if mistakes and any("," in name for name in names or ()):
         mistakes.add("names are separated by spaces, without commas")
     mistakes.raise_if_any()
     return {name: task.controllers[name] for name in names or task.controllers}
@@ -202,21 +202,21 @@ def compare(
     problem, skipped = task.problem, dict[str, str]()
     aim = objective(task.headline_metric, task.metrics, problem)
     rows, entries = _Rows(task, selected, seed, compiled), list[Entry]()
-    with compiling_ahead() as compiling:
-        for name in selected:
-            try:
-                rows.compose(name, compiling)
-            except FpirhcError as error:
-                skipped[name] = str(error)
-        for name in rows.composed:
-            try:
-                entries.append(rows.entry(name, progress and partial(progress, name)))
-            except FpirhcError as error:
-                skipped[name] = str(error)
-            except KeyboardInterrupt:
-                done = {*skipped, *(e.name for e in entries)}
-                skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
-                break
+    for name in selected:
+        try:
+            rows.compose(name)
+        except FpirhcError as error:
+            skipped[name] = str(error)
+    compile_all(rows.wanted)
+    for name in rows.composed:
+        try:
+            entries.append(rows.entry(name, progress and partial(progress, name)))
+        except FpirhcError as error:
+            skipped[name] = str(error)
+        except KeyboardInterrupt:
+            done = {*skipped, *(e.name for e in entries)}
+            skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
+            break
     return Comparison(
         **circumstances(task, selected, command, begin),
         seed=seed,
@@ -237,21 +237,20 @@ class _Rows:
         self._task, self._controllers, self._seed, self._compiled = task, controllers, seed, compiled
         self.composed: dict[str, tuple[ComposedLoop, ComposedStep | None]] = {}
         self._loops: dict[str, Simulator] = {}
+        self.wanted: list[tuple[Any, int]] = []  # Functions to be compiled, and so many calls of each
         self._model = ModelAsPlant(task.problem, seed=seed)
         adaptive = [n for n, one in controllers.items() if one.deformation.adapts and pair_of(controllers, n)]
         self._asked = task.headline[1] if task.headline and task.headline[1] in adaptive else next(iter(adaptive), None)
 
-    def compose(self, name: str, compiling: Callable[..., None]) -> None:
-        """Compose a loop, and its step by hand, and start the compiler for them."""
+    def compose(self, name: str) -> None:
+        """Compose a loop, and its step by hand."""
         problem = self._task.problem
         loop = ComposedLoop.of(problem, resolved(problem, self._controllers[name]))
         facts: dict[str, Any] = {"bounded": False, "broken": []}
         step = attempted("the time of a cycle", ComposedStep.of, problem, loop.live.controller, **facts)
         self.composed[name] = loop, step
         if loop.worth_compiling(self._compiled):
-            compiling(loop.function, calls=loop.calls)
-            if step is not None:
-                compiling(step.function)
+            self.wanted += [(loop.function, loop.calls), *([(step.function, 0)] if step is not None else [])]
 
     def _loop(self, name: str) -> Simulator:
         ready = self._loops.get(name)

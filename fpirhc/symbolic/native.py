@@ -15,8 +15,8 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.util import find_spec
@@ -38,7 +38,6 @@ _FLAGS = (*_ALIGNED, "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-fno-sema
 _SUFFIX = {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 _LARGE = 500_000  # bytes of C above which optimising takes longer than it saves: at 1.2 MB -O3 took 52 s and -O1 21 s
 _loaded: dict[str, ca.Function] = {}
-_begun: dict[Path, Future[None]] = {}  # compilers at work, by the library that they make
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,29 +85,18 @@ def native(function: ca.Function, flags: Sequence[str] = (), *, required: bool =
         return Native(function, False, str(error))
 
 
-@contextlib.contextmanager
-def compiling_ahead() -> Iterator[Callable[..., None]]:
-    """Yield a function that starts the compiler for what `native` will be asked later, which waits for it, and has its errors."""
-    pool, begun = ThreadPoolExecutor(os.cpu_count()), list[Path]()
-
-    def begin(function: ca.Function, flags: Sequence[str] = (), *, calls: int = 0) -> None:
-        compiler = find_compiler()
-        if compiler is None:
-            return
+def compile_all(wanted: Iterable[tuple[ca.Function, int]]) -> None:
+    """Compile so many calls of Functions side by side, where `native` will find them; what fails is its error then."""
+    compiler, libraries = find_compiler(), dict[str, _Library]()
+    for function, calls in wanted if compiler is not None else ():
         with contextlib.suppress(NoCode):
-            library = _Library(function, compiler, flags, calls)
-            if library.key in _loaded or library.path in _begun or library.path.is_file():
-                return
-            library.units  # noqa: B018 -- its C is written here: CasADi works in one thread
-            _begun[library.path] = pool.submit(library.make)
-            begun.append(library.path)
-
-    try:
-        yield begin
-    finally:
-        pool.shutdown(cancel_futures=True)
-        for path in begun:
-            _begun.pop(path, None)
+            library = _Library(function, str(compiler), (), calls)
+            if library.key not in _loaded and not library.path.is_file():
+                library.units  # noqa: B018 -- its C is written here: CasADi works in one thread
+                libraries[library.key] = library
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for one in libraries.values():
+            pool.submit(one.make)
 
 
 def cache_folder() -> Path:
@@ -219,9 +207,6 @@ class _Library:
 
     def load(self) -> ca.Function:
         """Return it from the cache, compiled before where it is not there, or cannot be loaded on this system."""
-        begun = _begun.pop(self.path, None)
-        if begun is not None:
-            wait([begun])
         if self.path.is_file():
             with contextlib.suppress(RuntimeError):
                 return ca.external(f"fpirhc_{self.key}", str(self.path))
