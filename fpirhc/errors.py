@@ -106,10 +106,6 @@ def refuse(reasons: Iterable[str]) -> None:
         require(False, reason)
 
 
-class NoAnswer(NotSupported):
-    """A question that these numbers leave without an answer, as where a run does not stay finite."""
-
-
 class NoCode(NotSupported):
     """A Function that cannot be written as C; it runs in CasADi's virtual machine."""
 
@@ -144,10 +140,6 @@ def not_writable(folder: object, error: OSError, option: str) -> OutputError:
     """The error of a folder for results that cannot be written, with the option that chooses another one."""
     why = "it is a file" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
     return OutputError(f"cannot write to the folder '{folder}': {why}; choose another with {option}")
-
-
-class BaselineError(FpirhcError, ValueError):
-    """A baseline that is missing, damaged, edited by hand, or of another problem or format."""
 
 
 class CompileError(FpirhcError, RuntimeError):
@@ -257,11 +249,6 @@ class Mistakes(list[str]):
             yield
         except FpirhcError as error:
             self.add(f"{where}{error}")
-
-    @property
-    def none(self) -> bool:
-        """Whether there is no mistake so far."""
-        return not self
 
     def unknown(self, what: str, names: Iterable[str], valid: Iterable[str]) -> None:
         """Add a mistake, with the nearest valid name, for each of `names` that is not in `valid`."""

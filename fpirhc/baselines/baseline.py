@@ -18,7 +18,7 @@ from typing import Any
 
 import pandas as pd
 
-from fpirhc.errors import BaselineError, not_writable
+from fpirhc.errors import InvalidValue, not_writable
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.shipped import missing
@@ -103,7 +103,7 @@ def accept(
 ) -> Path:
     """Measure every controller, write the baseline with the reason, and return its path."""
     if not reason.strip():
-        raise BaselineError("a new baseline needs a reason: say why the new numbers are right")
+        raise InvalidValue("a new baseline needs a reason: say why the new numbers are right")
     rows = run_variants(task, Repeats(seed, seeds), processes=processes, compiled=compiled, progress=progress)
     interpreted = run_variants(task, Repeats(seed), processes=processes, compiled=False, progress=progress)
     rows = pd.concat([rows, interpreted])
@@ -246,5 +246,5 @@ def problems_here(folder: Path) -> list[Path]:
         files = [one for one in sorted(inner.glob("*.py")) if one.stem not in unchecked]
         found += [f for f in files if "controllers = " in f.read_text(encoding="utf-8") and not missing(f)]
     if not found:
-        raise BaselineError(f"no problem to check in '{place}'; name one, as in fpirhc check two_mass")
+        raise InvalidValue(f"no problem to check in '{place}'; name one, as in fpirhc check two_mass")
     return found

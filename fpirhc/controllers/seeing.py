@@ -15,7 +15,7 @@ import numpy as np
 from fpirhc.controllers.believed import believe_block, stated_path
 from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
-from fpirhc.errors import NoAnswer
+from fpirhc.errors import NotSupported
 from fpirhc.plant.maps import growth_rates
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import members, slowest, unobservable, values_of
@@ -113,7 +113,7 @@ def check_observed(problem: Problem) -> None:
     fastest = max(float(np.abs(np.linalg.eigvals(a)).max()) for a in slopes)
     if pole >= -_STAYS * fastest:
         hidden = [plant.state.elements[k] for k in members(basis)]
-        raise NoAnswer(
+        raise NotSupported(
             f"{type(observer).__name__}: {' and '.join(hidden)} cannot be observed along the reference from {', '.join(names)}, "
             f"and an error of the estimate does not decay (pole {pole:.3g} 1/{problem.time_unit}); measure {hidden[0]}, or "
             "another quantity that depends on it"
@@ -157,5 +157,5 @@ def _linearised(problem: Problem, names: tuple[str, ...]) -> tuple[np.ndarray, l
             slopes.append(slope)
             seen.append(part)
     if not slopes:
-        raise NoAnswer("observed states: the model has no finite Jacobian along the reference")
+        raise NotSupported("observed states: the model has no finite Jacobian along the reference")
     return np.array(states), slopes, seen

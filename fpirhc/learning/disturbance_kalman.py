@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes, NoAnswer
+from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
 from fpirhc.fields.kinds import Deviation, Positive
 from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
 from fpirhc.plant.chain import disturbance_name, disturbed, quantities, response_names
@@ -115,7 +115,7 @@ class DisturbanceKalman(ParameterEstimator):
 
         Raises:
             InvalidProblem: unknown names; more disturbances than measured quantities.
-            NoAnswer: the rank condition is not met, or no stationary gain exists.
+            NotSupported: the rank condition is not met, or no stationary gain exists.
         """
         mistakes = Mistakes("DisturbanceKalman")
         mistakes.unknown("measured: state, output or response", self.measured, quantities(problem.plant))
@@ -130,7 +130,7 @@ class DisturbanceKalman(ParameterEstimator):
         """Return the stationary gain [K_x; K_w], shape (nx + nw, ny); `problem.plant` is the model with disturbances.
 
         Raises:
-            NoAnswer: the Riccati equation has no stabilising solution.
+            NotSupported: the Riccati equation has no stabilising solution.
         """
         return _GAINS.of((self, problem), (), lambda: self._gain(problem)).copy()
 
@@ -165,7 +165,7 @@ class DisturbanceKalman(ParameterEstimator):
                 if noiseless
                 else "choose a larger drift beside the deviations of what is measured, or measure more states"
             )
-            raise NoAnswer(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
+            raise NotSupported(f"DisturbanceKalman: no stationary gain makes the filter stable; {hint}")
         return np.asarray(gain)
 
     def memory(self, problem: Problem) -> Layout:
@@ -261,7 +261,7 @@ class DisturbanceKalman(ParameterEstimator):
         if rank < needed:
             others = [n for n in quantities(problem.plant) if n not in self.measured]
             helping = [n for n in others if np.equal(*replace(self, measured={**self.measured, n: 1.0})._rank(problem))]
-            raise NoAnswer(
+            raise NotSupported(
                 f"DisturbanceKalman: a constant {disturbances} cannot be determined from {measured}: [A - I, B; C, D] has rank "
                 f"{rank} and needs {needed} (Pannocchia and Rawlings 2003); "
                 + (f"measure {' or '.join(helping)} too" if helping else "estimate fewer disturbances")

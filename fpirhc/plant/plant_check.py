@@ -98,9 +98,9 @@ def _check_response(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add(f"next does not give the value of state '{c}' one step later; return it too")
         else:
             mistakes.add(f"{function} does not give the derivative {c}{chr(39) * r} of {quantity} '{c}'; return it too")
-    if mistakes.none:
+    if not mistakes:
         _check_orders(plant, mistakes)
-    if mistakes.none and plant.inverse is not None:
+    if not mistakes and plant.inverse is not None:
         count = max(plant.orders, default=0) + 2
         if takes(plant.inverse, count):
             with mistakes.caught():

@@ -14,7 +14,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidValue, NotSupported, nearest
+from fpirhc.errors import InvalidName, InvalidValue, nearest, require
 from fpirhc.plant.motion import places
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression
@@ -33,7 +33,17 @@ class Regressor:
     names: Sequence[str]  # parameters that are theta; all others keep the model's approximate values
 
     def __post_init__(self) -> None:
-        _check_plant(self.plant)
+        plant = self.plant
+        require(
+            len(plant.inputs) == len(plant.names) and plant.controlled_names == plant.names,
+            f"a regressor needs a fully actuated plant: {len(plant.names)} coordinates but {len(plant.inputs)} input(s), "
+            f"controlled: {', '.join(plant.controlled_names)}; use ComputedTorque, whose model needs no regressor",
+        )
+        require(
+            not plant.equations.inverse_opaque,
+            "a regressor needs an inverse response made of symbols, and this one needs a root finder; "
+            "give Plant(inverse=...) that solves the response for the inputs",
+        )
         for name in self.names:
             if name not in self.plant.parameters:
                 raise InvalidName(f"Regressor: '{name}' is no parameter.{nearest(name, self.plant.parameters)}")
@@ -60,7 +70,7 @@ class Regressor:
     @cached_property
     def function(self) -> ca.Function:
         """Function (state, response, plant's parameters) -> (Y (n x m), Q0 (n)); theta among the parameters is not read."""
-        x, r, p = self.symbols()
+        x, r, p, _ = self.symbols()
         first, inverse = ca.DM(self.plant.approximate[self.places]), self.plant.equations.inverse
         slope = ca.Function("fpirhc_slope", [x, r, p], [ca.jacobian(inverse(x, r, p), p)[:, self.places]])
         at = self.believed(ca.SX(first), p)
@@ -71,16 +81,14 @@ class Regressor:
     @cached_property
     def force_function(self) -> ca.Function:
         """Function (state, response, theta, plant's parameters) -> Y theta + Q0."""
-        x, r, p = self.symbols()
-        theta = ca.SX.sym("theta", len(self.names))
+        x, r, p, theta = self.symbols()
         y, rest = self.function(x, r, p)
         return ca.Function("fpirhc_force", [x, r, theta, p], [ca.mtimes(y, theta) + rest])
 
     @cached_property
     def mass_function(self) -> ca.Function:
         """Function (state, theta, plant's parameters) -> M (n x n)."""
-        x, r, p = self.symbols()
-        theta = ca.SX.sym("theta", len(self.names))
+        x, r, p, theta = self.symbols()
         mass = ca.jacobian(self.force_function(x, r, theta, p), r)
         mass = ca.substitute(mass, r, ca.SX.zeros(r.numel()))
         return ca.Function("fpirhc_mass", [x, theta, p], [ca.cse(ca.densify(mass))])
@@ -88,8 +96,7 @@ class Regressor:
     @cached_property
     def coriolis_function(self) -> ca.Function:
         """Function (state, theta, plant's parameters) -> C (n x n) with M' - 2 C skew-symmetric."""
-        x, _, p = self.symbols()
-        theta = ca.SX.sym("theta", len(self.names))
+        x, _, p, theta = self.symbols()
         mass = self.mass_function(x, theta, p)
         q, v = x[places(self.plant, 0)], x[places(self.plant, 1)]
         change = ca.jtimes(ca.reshape(mass, -1, 1), q, v).reshape(mass.shape)
@@ -100,8 +107,8 @@ class Regressor:
     @cached_property
     def split_function(self) -> ca.Function:
         """Function (state, v, v', plant's parameters) -> (Y_s (n x m), Q0_s (n)), v a second velocity."""
-        x, v, p = self.symbols()
-        slope, theta = ca.SX.sym("slope", v.numel()), ca.SX.sym("theta", len(self.names))
+        x, v, p, theta = self.symbols()
+        slope = ca.SX.sym("slope", v.numel())
         # M v' + C v + Q(q, q', 0) - C q' is affine in theta as Q is.
         force = self.force_function(x, slope, theta, p)
         force += ca.mtimes(self.coriolis_function(x, theta, p), v - x[places(self.plant, 1)])
@@ -109,31 +116,15 @@ class Regressor:
         rest = ca.substitute(force, theta, ca.SX.zeros(theta.numel()))
         return ca.Function("fpirhc_split", [x, v, slope, p], ca.cse([ca.densify(y), ca.densify(rest)]))
 
-    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Return new symbols of the state, the response and the plant's parameters."""
+    def symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Return new symbols of the state, the response, the plant's parameters and theta."""
         x, _, p = self.plant.symbols()
-        return x, ca.SX.sym("r", len(self.plant.names)), p
-
-
-def _check_plant(plant: Plant) -> None:
-    if len(plant.inputs) != len(plant.names) or plant.controlled_names != plant.names:
-        why = (
-            f"a fully actuated plant: {len(plant.names)} coordinates but {len(plant.inputs)} input(s), "
-            f"controlled: {', '.join(plant.controlled_names)}; use ComputedTorque, whose model needs no regressor"
-        )
-    elif plant.equations.inverse_opaque:
-        why = (
-            "an inverse response made of symbols, and this one needs a root finder; "
-            "give Plant(inverse=...) that solves the response for the inputs"
-        )
-    else:
-        return
-    raise NotSupported(f"a regressor needs {why}")
+        return x, ca.SX.sym("r", len(self.plant.names)), p, ca.SX.sym("theta", len(self.names))
 
 
 def _check_linear(regressor: Regressor) -> None:
     """Look at random points for terms of the second order in the covered parameters, and for those that do not enter."""
-    plant, (x, r, p), places = regressor.plant, regressor.symbols(), regressor.places
+    plant, (x, r, p, _), places = regressor.plant, regressor.symbols(), regressor.places
     force = plant.equations.inverse(x, r, p)
     slope = ca.jacobian(force, p)[:, places]
     function = ca.Function(

@@ -153,7 +153,7 @@ def _check_together(module: ModuleType, facts: dict[str, Any], mistakes: Mistake
     where = _line_of(module, "headline") if headline else ""
     mistakes.unknown(f"{where}headline: controller", headline, controllers)
     pairs = [(pair_of(controllers, name), name) for name, one in controllers.items() if one.deformation.adapts]
-    if headline and mistakes.none and headline not in pairs:
+    if headline and not mistakes and headline not in pairs:
         known = ", ".join(str(pair) for pair in pairs if pair[0]) or "none is here, so leave headline out"
         mistakes.add(f"{where}headline {headline} is no pair of a controller and the same one with adaptation: {known}")
     for picture in facts.get("pictures", ()):

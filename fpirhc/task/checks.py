@@ -43,7 +43,7 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
     with mistakes.caught():
         plant = settled["plant"] = over(problem.plant, problem.period)
         settled["reality"] = problem.reality and problem.reality.over(problem.period)
-    if not mistakes.none:
+    if mistakes:
         return {}
     if plant.step is not None:
         if problem.horizon is not None and any(length % 1 for length in problem.horizon.lengths):
@@ -185,7 +185,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
     plant = problem.plant
     sets = {"approximate": plant.approximate}
     sets |= {} if problem.reality else {"exact": plant.exact}  # with a reality these values move nothing
-    if not mistakes.none or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
+    if mistakes or (plant.controlled is None and len(plant.inputs) != len(plant.chains)):
         return
     state = ", ".join(f"{e} = {v:g}" for e, v in zip(plant.state.elements, problem.start_state, strict=True))
     for which, values in sets.items():

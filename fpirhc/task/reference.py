@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NoReturn
@@ -147,7 +147,12 @@ class Setpoint(Reference):
 
     def _function(self, plant: Plant) -> ca.Function:
         """Function t -> (state, response) along `values`: a sum of step responses."""
-        self._check_names(plant)
+        below = (
+            f"Setpoint(order={self.order}) is below the order {r} of '{n}', whose motion would jump; leave order out"
+            for n, r in plant.chains.items()
+            if self.order is not None and self.order < r
+        )
+        _check(plant, dict.fromkeys(self.values, ca.SX(0)), followed(plant), below)
         t, chains = ca.SX.sym("t"), {}
         for name, order in self._orders(plant).items():
             rest = self._first(name)
@@ -248,18 +253,6 @@ class Setpoint(Reference):
         """Where the filter of a coordinate begins."""
         return pairs(name, self.values[name])[0][1]
 
-    def _check_names(self, plant: Plant) -> None:
-        mistakes = Mistakes("reference")
-        mistakes.unknown("coordinate", self.values, plant.chains)
-        for name, order in plant.chains.items():
-            if name not in self.values:
-                mistakes.add(f"coordinate '{name}' has no set-point; add '{name}' to Setpoint(values=...)")
-            if self.order is not None and self.order < order:
-                mistakes.add(
-                    f"Setpoint(order={self.order}) is below the order {order} of '{name}', whose motion would jump; leave order out"
-                )
-        mistakes.raise_if_any()
-
 
 def _transition(rate: float, time: float | ca.SX, order: int) -> ca.DM | ca.SX:
     """Phi(time), shape (order, order)."""
@@ -280,8 +273,9 @@ def _arranged(plant: Plant, chains: Mapping[str, Sequence[Expression]]) -> tuple
     return ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))
 
 
-def _check(plant: Plant, motion: Mapping[str, Expression], what: str) -> None:
+def _check(plant: Plant, motion: Mapping[str, Expression], what: str, own: Iterable[str] = ()) -> None:
     mistakes = Mistakes("reference")
+    mistakes.join(own)
     known = followed_units(plant)
     slopes = [name for name in motion if name not in known and name.rstrip("'") in known]
     for name in slopes:

@@ -151,7 +151,7 @@ def test_a_step_without_set_points_keeps_the_old_ones():
 def test_bad_references():
     """A wrong set-point is a mistake of the problem: missing, unknown, out of range, or with too low a filter."""
     for changes, words in (
-        ({"values": {"q1": 1.0}}, "'q2' has no set-point"),
+        ({"values": {"q1": 1.0}}, "'q2' has no nominal motion"),
         ({"values": {"q1": 1.0, "q2": 2.0, "q4": 1.0}}, "'q4' is unknown"),
         ({"order": 1}, "below the order 2"),
     ):

@@ -123,8 +123,7 @@ def learning_delays() -> list[Delay]:
 
 def equation_function(regressor: Regressor) -> ca.Function:
     """Return Function (state, response, last command, estimate, parameters) -> (M_hat^-1 Y, h)."""
-    x, r, p = regressor.symbols()
-    u, theta = ca.SX.sym("u", len(regressor.plant.inputs)), ca.SX.sym("theta", len(regressor.names))
+    (x, r, p, theta), u = regressor.symbols(), ca.SX.sym("u", len(regressor.plant.inputs))
     y, rest = regressor.function(x, r, p)
     both = ca.solve(regressor.mass_function(x, theta, p), ca.horzcat(y, u - rest - ca.mtimes(y, theta)))
     return ca.Function("fpirhc_equation", [x, r, u, theta, p], [both[:, :-1], both[:, -1]])
@@ -169,8 +168,7 @@ def _states(problem: Problem) -> np.ndarray:
 
 def _mass_coefficients(regressor: Regressor, states: np.ndarray) -> np.ndarray:
     """M = A_0 + sum_j theta_j A_j at every state, shape (count, m + 1, n, n)."""
-    x, _, p = regressor.symbols()
-    theta = ca.SX.sym("theta", len(regressor.names))
+    x, _, p, theta = regressor.symbols()
     mass = ca.vec(regressor.mass_function(x, theta, p))
     zero = ca.substitute(mass, theta, ca.SX.zeros(theta.numel()))
     function = ca.Function("fpirhc_coefficients", [x, p], [ca.densify(ca.horzcat(zero, ca.jacobian(mass, theta)))])
