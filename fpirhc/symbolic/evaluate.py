@@ -66,12 +66,8 @@ class Evaluator:
         """Evaluate with these arguments and return copies of the results."""
         for array, value in zip(self.arguments, values, strict=True):
             array[...] = np.reshape(value, array.shape)
-        try:
-            self.evaluate()
-        except (RuntimeError, SystemError) as error:
-            raise unwrapped(error) from None
-        if self.failed:
-            raise InvalidValue(f"'{self.function.name()}' fails for these arguments: {values}")
+        if why := self.failure():
+            raise InvalidValue(f"'{self.function.name()}' fails for these arguments ({why}): {values}")
         return tuple(result.copy() for result in self.results)
 
 

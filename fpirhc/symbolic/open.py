@@ -79,17 +79,11 @@ def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
     return NotSupported(f"setting{'s' if len(names) > 1 else ''} {', '.join(names)} cannot be live{where}: {why}")
 
 
-def open_numbers(*values: object) -> dict[str, ca.SX]:
-    """Return the symbols in some values, by path."""
-    found: dict[str, ca.SX] = {}
-
-    def note(number: ca.SX) -> ca.SX:
-        found.update({s.name(): s for s in ca.symvar(number)})
-        return number
-
-    for value in values:
-        _mapped(value, note)
-    return found
+def open_numbers(*values: object) -> list[str]:
+    """Return the paths of the open numbers in some values."""
+    found = list[ca.SX]()
+    _mapped(values, found.append)
+    return list(dict.fromkeys(s.name() for number in found for s in ca.symvar(number)))
 
 
 def number_of(value: ca.SX) -> float:
