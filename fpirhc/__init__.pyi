@@ -39,7 +39,6 @@ from .learning.rules import Projection as Projection
 from .optimisers.fixed_point import FixedPoint as FixedPoint
 from .optimisers.nlp import Fatrop as Fatrop
 from .optimisers.nlp import Ipopt as Ipopt
-from .optimisers.nlp import SequentialQuadratic as SequentialQuadratic
 from .optimisers.plan import Plan as Plan
 from .optimisers.plan import solve as solve
 from .optimisers.published import FullSpaceFixedPoint as FullSpaceFixedPoint

@@ -1,4 +1,4 @@
-"""Nonlinear programming through CasADi by direct multiple shooting: IPOPT, fatrop, and SQP with OSQP.
+"""Nonlinear programming through CasADi by direct multiple shooting: IPOPT and fatrop.
 
     variables    w = (s_0, u_0, s_1, ..., u_{N-1}, s_N),    constraints  s_{i+1} - F(s_i, u_i) = 0,
 
@@ -40,7 +40,6 @@ from fpirhc.symbolic.layout import Layout, Signal
 Setting: TypeAlias = "bool | int | float | str | Sequence[bool] | ca.Function | Mapping[str, Setting]"
 Options: TypeAlias = Mapping[str, Setting]
 _LARGEST_MULTIPLIER = 1e12
-_OSQP_BOUNDED = 2000  # iterations that are a bound of time on a machine
 
 
 @dataclass(frozen=True)
@@ -238,16 +237,6 @@ def program(ocp: OptimalControl, by: Units = Units()) -> dict[str, ca.MX]:  # no
     return {"x": w, "p": flat, "f": value / by.cost, "g": ca.vec(states[:, 1:] - next_states) / by.constraints}
 
 
-def _gauss_newton_hessian(ocp: OptimalControl) -> ca.Function:
-    """Function (x, p, lam_f, lam_g) -> Hessian of the cost alone, block by block, with both triangles."""
-    nlp = program(ocp, units(ocp))
-    hessian, _ = ca.hessian(nlp["f"], nlp["x"])
-    weight, multipliers = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", sizes(ocp)[1])
-    inputs = [nlp["x"], nlp["p"], weight, multipliers]
-    names = ["x", "p", "lam_f", "lam_g"]
-    return ca.Function("nlp_hess_l", inputs, [weight * hessian], names, ["hess_gamma_x_x"])
-
-
 _QUIET: Options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False}
 
 
@@ -316,53 +305,8 @@ class Fatrop(MultipleShooting):
         }
 
 
-@dataclass(frozen=True)
-class SequentialQuadratic(MultipleShooting):
-    """Gauss-Newton SQP: the cost's own second derivatives, the dynamics linearised, the programs inside solved by OSQP.
-
-    Args:
-        tolerance: of the stationarity, in the unit of the inputs.
-        accuracy: of both residuals of OSQP, an operator-splitting method.
-        iterations: of SQP per call; 1 is a real-time iteration.
-        splittings: most iterations of OSQP in one program. CasADi passes no time limit on.
-    """
-
-    accuracy: Accuracy = 1e-8
-    iterations: Count = 20
-    splittings: Count = 20000
-
-    @property
-    def unbounded(self) -> str:
-        if self.splittings <= _OSQP_BOUNDED:
-            return ""
-        return (
-            f"OSQP has no time limit, and an infeasible program takes all {self.splittings} iterations: "
-            f"give SequentialQuadratic(splittings=...), at most {_OSQP_BOUNDED}"
-        )
-
-    plugin = "sqpmethod"
-
-    def options(self, ocp: OptimalControl) -> Options:
-        inner = {"verbose": False, "eps_abs": self.accuracy, "eps_rel": self.accuracy, "max_iter": self.splittings}
-        return {
-            **_QUIET,
-            "print_header": False,
-            "print_iteration": False,
-            "print_status": False,
-            "qpsol": "osqp",
-            "qpsol_options": {"osqp": inner, "error_on_fail": False},
-            "max_iter": self.iterations,
-            "tol_pr": 1e-8,
-            "tol_du": 1e-8,
-            "min_step_size": 1e-12,
-            "hess_lag": _gauss_newton_hessian(ocp),
-        }
-
-
-EXAMPLES = (Ipopt(tolerance=1e-6), Fatrop(tolerance=1e-6), SequentialQuadratic(tolerance=1e-6))
+EXAMPLES = (Ipopt(tolerance=1e-6), Fatrop(tolerance=1e-6))
 CHOICES = {
     "ipopt": ("IPOPT", lambda tolerance: Ipopt(tolerance=tolerance)),
     "fatrop": ("fatrop", lambda tolerance: Fatrop(tolerance=tolerance)),
-    "osqp": ("SQP OSQP", lambda tolerance: SequentialQuadratic(tolerance=tolerance)),
-    "osqp-rti": ("OSQP, one iteration", lambda tolerance: SequentialQuadratic(tolerance=tolerance, iterations=1)),
 }

@@ -134,8 +134,7 @@ class ModelAsPlant:
 def loop_of(problem: Problem, controller: Controller) -> Simulator:
     """Return the closed loop for runs of any duration; it is the same one for problems that differ in their times alone."""
     build = lambda: simulator(problem, controller, compiled=False)  # noqa: E731
-    loop = _LOOPS.of(_untimed(problem), (identity(controller),), build)
-    return build() if loop.remembers else loop
+    return _LOOPS.of(_untimed(problem), (identity(controller),), build)
 
 
 def _untimed(problem: Problem) -> tuple[object, ...]:

@@ -85,12 +85,6 @@ class Simulator:
         counted = planner is not None and getattr(planner.optimiser, "iterations", None) is not None
         return counted and plans_exactly(self.loop, problem, self.controller)
 
-    @property
-    def remembers(self) -> bool:
-        """Whether a solver inside starts a run at its last solution (OSQP does), so that a run depends on the runs before."""
-        return any(f.class_name() == "OsqpInterface" for f in self.loop.function.find_functions())
-
-    @checked_call
     def run(
         self,
         *,
@@ -218,8 +212,7 @@ class ComposedLoop:
         key = worth, hashlib.sha256(self.function.serialize().encode()).digest()
         code = known.get(key) or self._code(compiled)
         result = Simulator(self.problem, ready, self.loop, *code, self.live)
-        if not result.remembers:  # one that does is built anew for every run
-            known[key] = code
+        known[key] = code
         return result
 
     def _code(self, compiled: bool | None) -> Compiled:

@@ -254,7 +254,7 @@ class _Rows:
 
     def _loop(self, name: str) -> Simulator:
         ready = self._loops.get(name)
-        if ready is None or ready.remembers:  # such a loop begins where its last run ended
+        if ready is None:
             ready = self._loops[name] = self.composed[name][0].simulator(self._compiled)
         return ready
 

@@ -105,7 +105,7 @@ class Runner:
     def _built(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:
         key = one.build, tuple(own) if live else tuple(own.items())
         ready = self._loops.pop(key, None)
-        if ready is None or (isinstance(ready, Simulator) and ready.remembers):
+        if ready is None:
             if len(self._loops) >= _LOOPS:
                 self._loops.pop(next(iter(self._loops)))
             ready = self._composed(one, own, live=live)

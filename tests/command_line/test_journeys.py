@@ -292,7 +292,7 @@ def test_a_reader_that_closes_the_output_ends_it_in_silence():
         assert process.wait() == 141
 
 
-HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", "pandas", "osqp", "joblib")
+HEAVY = ("casadi", "numpy", "scipy", "rich", "jinja2", "matplotlib", "control", "pandas", "joblib")
 
 
 @pytest.mark.parametrize(

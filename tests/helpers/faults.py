@@ -24,7 +24,7 @@ class _Guard(ca.Callback):
     def eval(self, arguments: Any) -> Any:
         self.calls += 1
         if Failing.now or (self.at is not None and self.calls > self.at):
-            raise RuntimeError("first line\nOSQP failed")
+            raise RuntimeError("first line\nsolver failed")
         return arguments
 
 

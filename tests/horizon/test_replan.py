@@ -121,7 +121,6 @@ OPTIMISERS = {
     "full space": fp.FullSpaceFixedPoint(iterations=4000, tolerance=1e-3),
     "reduced gradient": fp.ReducedGradient(iterations=60, tolerance=1e-5),
     "interior point": fp.Ipopt(tolerance=1e-6),
-    "sequential quadratic": fp.SequentialQuadratic(tolerance=1e-6),
 }
 
 

@@ -25,13 +25,6 @@ def planned(optimiser: Any, limits: fp.Limits) -> fp.Run:
     return fp.simulate(problem, fp.RecedingHorizon(optimiser), seed=0, compiled=False)
 
 
-def test_osqp_fills_infeasible_answers_with_finite_numbers():
-    """A plan without solution is not called a success."""
-    limits = fp.Limits(inputs={"u": (-0.1, 0.1)}, states={"y": (-0.2, 0.2)})
-    run = planned(fp.SequentialQuadratic(tolerance=1e-3), limits)
-    assert fp.Status.OK not in {fp.Status(int(one)) for one in np.ravel(run["status"])}
-
-
 def test_ipopt_prints_nothing(capfd):
     """Its banner would spoil what --json prints."""
     planned(fp.Ipopt(tolerance=1e-3), fp.Limits())

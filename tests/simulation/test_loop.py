@@ -79,7 +79,7 @@ def test_run_stops_where_a_solver_fails():
     )
     assert whole.stop is None
     assert str(broken.stop).startswith("a solver failed within")
-    assert "OSQP failed" in str(broken.stop)
+    assert "solver failed" in str(broken.stop)
     assert 0 < broken.cycles <= 30 * 20  # a plan every twentieth cycle
     np.testing.assert_array_equal(broken["command"], whole["command"][: broken.cycles])
 

@@ -253,19 +253,14 @@ def test_every_cycle_that_a_solver_fails_is_held_and_counted_once(first, monkeyp
         assert (status(one) == fp.Status.SOLVER_FAILED) == (how == "f")
         if how == "f":
             assert np.array_equal(held, command)
-            assert "OSQP failed" in one.why_failed
+            assert "solver failed" in one.why_failed
         command = held
         counts.append(int(one.trace()["skipped"][0]))
     assert counts == [solving[: k + 1].count("f") for k in range(len(solving))]
 
 
 @pytest.mark.parametrize(
-    ("optimiser", "words"),
-    [
-        (fp.Fatrop(), "fatrop has no time limit"),
-        (fp.Ipopt(), r"give Ipopt\(time_limit"),
-        (fp.SequentialQuadratic(), r"give SequentialQuadratic\(splittings"),
-    ],
+    ("optimiser", "words"), [(fp.Fatrop(), "fatrop has no time limit"), (fp.Ipopt(), r"give Ipopt\(time_limit")]
 )
 def test_solver_without_a_bound_is_refused_on_a_machine(optimiser, words):
     """By name, with a remedy; `bounded=False` accepts it."""
