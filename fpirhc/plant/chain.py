@@ -19,17 +19,7 @@ import numpy as np
 from fpirhc.errors import Mistakes, refuse
 from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, scalar_expression
-from fpirhc.plant.motion import (
-    arguments_of,
-    believed_in,
-    by_name,
-    controlled_places,
-    derivative_unit,
-    followed_units,
-    forcing_units,
-    outside_names,
-    sampling,
-)
+from fpirhc.plant.motion import arguments_of, believed_in, by_name, controlled_places, outside_names, sampling, unit_of
 from fpirhc.plant.parameter import Parameter
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression
@@ -115,10 +105,8 @@ def disturbed(plant: Plant, names: Sequence[str]) -> Plant:
         if name in plant.parameters:
             mistakes.add(f"the plant has a parameter '{name}' already; rename it")
     mistakes.raise_if_any()
-    units = dict(followed_units(plant)) | dict(zip(plant.names, forcing_units(plant), strict=True))
-    if responses:
-        units |= dict(zip(responses, plant.response_signal("_").units, strict=True))
-    added = {disturbance_name(n): Parameter(0.0, 0.0, units[n]) for n in names}
+    orders = dict(zip(plant.names, plant.orders, strict=True))
+    added = {disturbance_name(n): Parameter(0.0, 0.0, unit_of(plant, n + "'" * orders.get(n, 0))) for n in names}
     believed = {**plant.believed, **{n: disturbance_name(n) for n in names}}
     made = replace(plant, parameters={**plant.parameters, **added}, believed=believed)
     return replace(made, inverse=None) if plant.inverse is not None and _mixed(made) else made
@@ -163,15 +151,9 @@ def response_names(plant: Plant) -> tuple[str, ...]:
 
 def quantities(plant: Plant) -> dict[str, str]:
     """Return the unit of all that a sensor may show: states, outputs and their derivatives, and controlled responses."""
-    signals = (plant.state, plant.output)
-    shown = {name: unit for s in signals for name, unit in zip(s.elements, s.entry_units, strict=True)}
-    return shown | dict(zip(response_names(plant), plant.response_signal("realised").entry_units, strict=True))
-
-
-def response_units(plant: Plant) -> tuple[str, ...]:
-    """Return the units of the derivatives that end the chains of all outputs, or coordinates."""
-    units, time = followed_units(plant), plant.time_unit
-    return tuple(derivative_unit(units[name], order, time) for name, order in plant.chains.items())
+    return {
+        name: unit_of(plant, name) for name in (*plant.state.elements, *plant.output.elements, *response_names(plant))
+    }
 
 
 def nominal_responses(

@@ -31,6 +31,12 @@ def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
     return f"{unit}/{time}" if derivative == 1 else f"{unit}/{time}^{derivative}"
 
 
+def unit_of(plant: Plant, quantity: str) -> str:
+    """Return the unit of a coordinate, an output, or a derivative of one: q1''."""
+    units, primes = {**plant.coordinates, **followed_units(plant)}, quantity.count("'")
+    return derivative_unit(units[quantity.rstrip("'")], primes, plant.time_unit)
+
+
 def with_space(unit: str) -> str:
     """Return a unit as it stands behind a number: ' kg', and nothing for '1'."""
     return "" if unit == "1" else f" {unit}"

@@ -17,7 +17,8 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import BelowOne, Positive
-from fpirhc.plant.chain import quantities, response_names, response_units
+from fpirhc.plant.chain import quantities, response_names
+from fpirhc.plant.motion import unit_of
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, Measured, StateObserver
 from fpirhc.symbolic.block import Block
@@ -201,7 +202,7 @@ class Sensing(Checked):
         """
         names = self.measures(plant)
         name = "arrived" if late is not None else "measured"
-        return vector(name, names, [_unit(plant, n) for n in names], [first[n] for n in names])
+        return vector(name, names, [unit_of(plant, n) for n in names], [first[n] for n in names])
 
     def blocks(
         self, plant: Plant, first: Mapping[str, float], late: Queue | None, true: Sequence[Signal]
@@ -264,10 +265,3 @@ class Sensing(Checked):
             return {**results, "sensor_last_next": ca.vertcat(*(seen[n] for n in lossy))} if lossy else results
 
         return Block("sensors", Layout((*true, *drawn)), Layout((measured,)), step, Layout(memory))
-
-
-def _unit(plant: Plant, name: str) -> str:
-    for signal in (plant.state, plant.output):
-        if name in signal.elements:
-            return signal.entry_units[signal.elements.index(name)]
-    return dict(zip(plant.chains, response_units(plant), strict=True))[name.rstrip("'")]

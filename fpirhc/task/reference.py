@@ -25,9 +25,8 @@ from fpirhc.errors import InvalidValue, Mistakes, NotSupported
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
-from fpirhc.plant.chain import response_units
 from fpirhc.plant.maps import time_derivatives
-from fpirhc.plant.motion import followed, followed_units, sampling
+from fpirhc.plant.motion import followed, followed_units, sampling, unit_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
@@ -187,8 +186,8 @@ class Setpoint(Reference):
                 f"{_FILTER}_next": self._later(plant, z, points, period),
             }
 
-        names = given.elements
-        shown = Signal("setpoint", names, given.units), Signal("reference_response", names, response_units(plant))
+        names, units = given.elements, tuple(unit_of(plant, name + "'" * order) for name, order in plant.chains.items())
+        shown = Signal("setpoint", names, given.units), Signal("reference_response", names, units)
         memory = Signal(_FILTER, elements, start=tuple(rest.get(element, 0.0) for element in elements))
         return Block("set_points", Layout((given,)), Layout((*shown, own)), step, Layout((memory,)))
 
