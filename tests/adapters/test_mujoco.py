@@ -103,6 +103,12 @@ def test_an_unstable_body_is_a_bad_answer_of_every_later_cycle(tmp_path, monkeyp
         assert all(mistakes[first:])
 
 
+def test_a_file_is_read_too(tmp_path):
+    (tmp_path / "arm.xml").write_text(REAL)
+    measured: Any = mujoco_body(tmp_path / "arm.xml", MODEL, period=PERIOD).measures
+    assert measured["elbow''"] == "rad/s^2"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -1,12 +1,14 @@
 """Typical mistakes in problem files: each is refused with its file and line, its cause and how to mend it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import pytest
 from mutated_problems import SOURCE, raw_error
 
 import fpirhc as fp
+from fpirhc.contracts import Deformation
 from fpirhc.errors import InvalidField
 
 
@@ -15,6 +17,29 @@ def test_all_mistakes_of_a_value_are_said_together():
     with pytest.raises(InvalidField, match=r"(?s)3 mistakes.*no field 'scal'.*Sigmoid.gain.*Sigmoid.shift") as caught:
         fp.Sigmoid(**wrong)
     assert "test_mistakes.py, line" in str(caught.value)
+
+
+@dataclass(frozen=True)
+class Mine(fp.Affine):
+    """A map of another distribution, which has no line for checks."""
+
+    inner: Deformation | None = None
+    spans: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"inner": fp.Sigmoid}, "Mine.inner: expected a Deformation or None, got the class Sigmoid; write Sig"),
+        ({"spans": {"a": (1.0, "b")}}, r"Mine.spans\['a'\]\[1\]: expected a number, got the text 'b'"),
+        ({"spans": {1: (1.0, 2.0)}}, "Mine.spans: name 1: expected a text, got 1"),
+    ],
+)
+def test_a_class_of_another_distribution_is_checked_without_a_line_of_its_own(settings, message):
+    with pytest.raises(InvalidField, match=message):
+        Mine(gain=-0.5, **settings)
+    whole: Any = np.int64(2)
+    assert Mine(gain=np.float64(-0.5), inner=fp.Affine(-0.2), spans={"a": (1, whole)}).gain == -0.5
 
 
 # --- Random mistakes --------------------------------------------------------------------------------------------------

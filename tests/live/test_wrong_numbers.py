@@ -93,6 +93,8 @@ def test_right_numbers_of_every_kind_are_taken(stepper):
     assert stepper.numbers[GAIN] == -0.5
     assert stepper.setpoints == {"q1": 0.25, "q2": 1.0}
     assert not stepper.set_reference({"q1": [0.1, 0.2]})
+    with pytest.raises(InvalidName, match=r"deformation\.gain"):
+        stepper.change({"deformation.gian": -0.3})
 
 
 NO_TIMES = [np.timedelta64(1, "s"), np.datetime64("2020-01-01"), "0", None, HUGE, [0.0], 1j, True, np.bool_(0)]

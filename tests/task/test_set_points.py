@@ -167,6 +167,15 @@ def test_bad_references():
         )
 
 
+def test_functions_of_time():
+    """A function of time is sampled in every cycle; steps are the function that jumps."""
+    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], compiled=False)
+    functions = {n: lambda t, s=s: [v for at, v in s if at <= t + 1e-9][-1] for n, s in STEPS.items()}
+    sampled, stepped = ready.run(seed=0, setpoints=functions), ready.run(seed=0)
+    np.testing.assert_array_equal(sampled.log, stepped.log)
+    assert sampled.settings["setpoints"] == {"q1": "a function of time", "q2": "a function of time"}
+
+
 def test_run_and_file_record_what_was_in_force(tmp_path):
     """Signal 'setpoint' has it cycle by cycle, the facts have it as steps; the terminal shows it."""
     run = fp.simulate(
@@ -190,3 +199,19 @@ def test_a_slot_has_the_filter_of_its_chain():
     )
     run = fp.simulate(on(task.problem, reference, 1.0), task.controllers["slots"], seed=0, compiled=False)
     assert [run[f"nominal.{name}"][1] for name in ("h2", "h1")] == pytest.approx([rate**2 * -1.4, rate * -2.5])
+
+
+def test_predicted_says_that_set_points_are_late():
+    """With dead time the plant follows later by it; without adaptation errors it is the same motion, shifted."""
+    task = fp.load_problem("delayed_mass")
+    name = task.problem.plant.names[0]
+    problem = on(task.problem, fp.Setpoint({name: [(0.0, 0.0), (0.2, 0.3)]}, rate=6.0), 1.0)
+    controller = task.controllers["CTC+FPI increment"]
+    notes = controller.notes(problem)
+    assert any("follows set-points 0.06 s late" in note for note in notes)
+    assert not any("late" in note for note in controller.notes(task.problem))
+    exact = fp.ExactModel(controller)
+    run = fp.simulate(problem, exact, seed=0, compiled=False)
+    late = round(0.06 / problem.period)
+    lag = run[f"plant_state.{name}"][late:] - run[f"reference.{name}"][:-late]
+    assert np.abs(lag).max() < 0.2 * np.abs(run[f"true_error.{name}"]).max()
