@@ -56,17 +56,6 @@ def test_the_twin_is_the_packages_own_model():
     assert seen == pytest.approx([same._T1, same._T2], abs=0.6)  # noise and the converter's steps
 
 
-def test_adaptation_with_the_heaters_lag_pays_where_nothing_integrates_the_error():
-    task, errors = problem(tclab_body(LAB, period=PERIOD)), {}
-    forms = {"alone": fp.Identity(), "adapted": fp.ModelReferenced(fp.Affine(gain=-0.3), lag=60.0)}
-    for name, form in forms.items():
-        law = fp.Exponential(rate=0.02, integral=False)
-        run = fp.simulate(task, fp.ComputedTorque(law, form), seed=0, compiled=False)
-        assert run.stop is None
-        errors[name] = fp.measure(task, run).rms_error["T1"]
-    assert errors["adapted"] < 0.6 * errors["alone"]
-
-
 def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
     now = [100.0]
 

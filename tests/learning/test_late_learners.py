@@ -62,13 +62,6 @@ def test_parameters_are_found_behind_dead_time(learner, late):
     assert errors[1] > 100 * errors[0]
 
 
-def test_an_estimated_response_teaches_the_parameters():
-    """From positions alone, by a window of 11 samples: within 2 %, and three times further off where its delay is ignored."""
-    problem = spring(sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=11, degree=3)), duration=8.0)
-    result = run(problem, fp.Estimating(TRACK, LEARNERS["RLS"]))
-    assert np.abs(result["estimate"][-1] / [3.0, 1.0] - 1).max() < 0.02
-
-
 # The response in the filter
 
 
@@ -83,18 +76,6 @@ def test_the_gain_of_a_measured_response_is_that_of_the_stationary_filter():
     p = scipy.linalg.solve_discrete_are(a.T, c.T, q, r)
     expected = p @ c.T @ np.linalg.inv(c @ p @ c.T + r)
     np.testing.assert_allclose(filter.gain(replace(problem, plant=filter.model(problem.plant))), expected, rtol=1e-7)
-
-
-def test_a_response_shows_its_disturbance_at_once():
-    """After a step of the push the filter with the response has 90 % in a cycle, the one with positions alone much later."""
-    problem = spring(plant=linear(1.0, 1.0), disturbances={"y": fp.Step(1.0, 2.0)}, duration=2.0)
-    cycles = []
-    for measured in ({"y": 1e-3}, {"y": 1e-3, "y''": 0.05}):
-        estimate = run(problem, fp.Estimating(TRACK, fp.DisturbanceKalman({"y": 5.0}, measured)))["estimate"][:, 0]
-        assert estimate[-1] == pytest.approx(2.0, rel=1e-3)
-        cycles.append(int(np.argmax(estimate > 1.8)) - 100)
-    assert cycles[1] <= 2
-    assert cycles[0] >= 8
 
 
 # Estimates that act in every cycle

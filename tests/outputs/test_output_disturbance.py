@@ -54,30 +54,3 @@ def test_a_disturbed_output_is_the_output_with_the_disturbance_in_it(wave: Any, 
     else:
         assert errors[0] > 0.1
         assert errors[1] < 0.005
-
-
-def shifting(order: int) -> fp.Problem:
-    """A chain of shifts y+ = y + 0.5 u, or one step longer, with a disturbed output."""
-    chain = {
-        "a": lambda x, u, p: {"a": x.a + 0.5 * u.u},
-        "ab": lambda x, u, p: {"a": x.a + 0.2 * x.b, "b": 0.5 * x.b + u.u},
-    }
-    names = "ab"[:order]
-    plant = fp.Plant.discrete(
-        states=dict.fromkeys(names, "m"), inputs={"u": "N"}, parameters={}, next=chain[names], step=0.1,
-        outputs={"y": fp.Output("m", lambda x, p: x.a)},
-    )  # fmt: skip
-    return fp.Problem(
-        plant=plant, reference=fp.Trajectory(lambda t: {"y": 1.0 + 0 * t}), start=dict.fromkeys(names, 1.0), period=0.1,
-        duration=6.0, disturbances={"y": fp.Step(at=2.0, size=0.5)},
-    )  # fmt: skip
-
-
-def test_the_response_of_a_map_has_the_difference_of_the_disturbance() -> None:
-    """Y jumps by the disturbance, the difference shows it once, and the law brings y back to its reference."""
-    run = simulated(shifting(1), fp.ComputedTorque(fp.Exponential(rate=2.0)))
-    assert run["output.y"][20] - run["state.a"][20] == pytest.approx(0.5)
-    assert np.allclose(run["plant_realised.y"][1:], np.diff(run["output.y"]) / 0.1, atol=1e-9)
-    assert run["output.y"][-1] == pytest.approx(1.0, abs=1e-2)
-    with pytest.raises(fp.FpirhcError, match="of a map has relative order 2"):
-        shifting(2)

@@ -23,22 +23,6 @@ def parameter(exact: float, spread: Any, **changes) -> fp.Parameter:
     return fp.Parameter(approximate=exact, exact=exact, unit="1", spread=spread, **changes)
 
 
-SPREADS = (fp.Uniform(absolute=0.4), fp.Uniform(relative=0.3), fp.Normal(relative=0.1), fp.LogNormal(factor=1.3))
-
-
-@pytest.mark.parametrize("spread", SPREADS, ids=repr)
-@pytest.mark.parametrize("exact", [3.0, -2.0])
-def test_laws_of_spreads(spread, exact):
-    """Quantiles rise, are finite at both ends, have the exact value as median, and stand still at share zero."""
-    shares = np.linspace(0.0, 1.0, 21)
-    values = np.array([spread.quantile(exact, 0.7, s) for s in shares])
-    assert np.isfinite(values).all()
-    assert (np.diff(values) > 0).all()
-    assert values[10] == pytest.approx(exact)
-    assert (values[0], values[-1]) == spread.interval(exact, 0.7)
-    assert [spread.quantile(exact, 0.0, s) for s in (0.0, 0.3, 1.0)] == [exact] * 3
-
-
 def test_distributions_are_those_of_scipy():
     """Quantiles of the uniform, and of the normal and log-normal cut off at two standard deviations."""
     shares = np.linspace(0.02, 0.98, 15)

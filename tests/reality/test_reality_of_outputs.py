@@ -5,7 +5,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import pytest
 from scipy.integrate import solve_ivp
 
 import fpirhc as fp
@@ -100,18 +99,6 @@ def run(problem: fp.Problem, controller: Any = TRACK) -> fp.Run:
 
 
 # A reality
-
-
-@pytest.mark.parametrize("controller", [TRACK, PLAN], ids=["computed torque", "receding horizon"])
-def test_adaptation_helps_although_no_state_is_the_models(controller):
-    """The bis and its derivatives are measured; what one compartment cannot say is adapted to: at least three times less error."""
-    problem = task(measure_from=5.0)
-    runs = [run(problem, replace(controller, deformation=d)) for d in (fp.Identity(), FPI)]
-    errors = [fp.measure(problem, one).rms_error["bis"] for one in runs]
-    assert errors[1] < 0.35 * errors[0]
-    assert "plant_state" not in runs[0].layout
-    assert runs[0].layout["reality_state"].elements == tuple(FIRST)
-    np.testing.assert_array_equal(runs[0]["plant_output.bis"], runs[0]["output.bis"])
 
 
 def test_it_moves_as_scipy_says():
