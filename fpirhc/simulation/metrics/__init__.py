@@ -48,7 +48,7 @@ class Metric(Checked):
         title: heading in a report; '': the name.
         short: heading on a terminal; '': the heading in a report.
         text: function that writes a finite number.
-        main: whether the metric stands in short tables; its best value is marked in the report.
+        main: whether the metric stands in the short table of a comparison, where its best value is marked.
         report: whether the metric stands in the report's table.
         shown: the elements that stand in the report's table; None: all.
         floor: size of a difference up to which two numbers count as equal.
