@@ -7,12 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
-from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
-import numpy as np
-
-from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes
+from fpirhc.errors import FpirhcError, InvalidProblem, Mistakes
 from fpirhc.fields.checked import checked_call
 from fpirhc.plant.plant import Plant
 
@@ -44,22 +41,6 @@ def adapter(function: Callable[P, R]) -> Callable[P, R]:
     return adapted
 
 
-def finite_numbers(where: str, values: object, names: Iterable[str]) -> np.ndarray:
-    """Return values as an array with one finite number for each name.
-
-    Raises:
-        InvalidValue: it has other ones, or none.
-    """
-    wanted = tuple(names)
-    try:
-        numbers = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if numbers.shape != (len(wanted),) or not np.isfinite(numbers).all():
-        raise InvalidValue(f"{where}({values!r}): expected a finite number for each of {', '.join(wanted)}")
-    return numbers
-
-
 def require(good: bool, words: str) -> None:
     """Raise where an answer of a device is bad.
 
@@ -89,26 +70,6 @@ def counterparts(
     found = {name: given.get(name, name) for name in own}
     mistakes.unknown(what, found.values(), valid)
     return found
-
-
-def other_types(mistakes: Mistakes, variables: Iterable[Any], *valid: str) -> None:
-    """Add a mistake for each variable (with a name and a type) that an adapter does not take; those that are unknown are None."""
-    for one in variables:
-        if one is not None and one.type not in valid:
-            mistakes.add(f"variable '{one.name}' is of the type {one.type}; expected {' or '.join(valid)}")
-
-
-def from_path_or_text(source: str | Path, by_path: Callable[[str], R], by_text: Callable[[str], R]) -> R:
-    """Return what a package reads from a file of XML, or from its text, which begins with "<".
-
-    Raises:
-        OSError: the file cannot be read; packages say something else of one that is not there.
-    """
-    text = str(source)
-    if text.lstrip().startswith("<"):
-        return by_text(text)
-    Path(text).open("rb").close()
-    return by_path(text)
 
 
 def steps_per_cycle(where: str, model: Plant, period: float, step: float) -> int:

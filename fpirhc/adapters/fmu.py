@@ -11,7 +11,7 @@ from pathlib import Path
 from shutil import rmtree
 from typing import Any
 
-from fpirhc.adapters import adapter, counterparts, other_types, require
+from fpirhc.adapters import adapter, counterparts, require
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
@@ -51,7 +51,9 @@ def fmu_body(
     mistakes.unknown("variable", measures.values(), known)
     mistakes.unknown("parameters: variable", fixed, known)
     sent = counterparts(mistakes, "input", model.inputs, inputs or {}, known)
-    other_types(mistakes, [known.get(name) for name in (*measures.values(), *sent.values())], "Real", "Float64")
+    for one in filter(None, map(known.get, (*measures.values(), *sent.values()))):
+        if one.type not in ("Real", "Float64"):
+            mistakes.add(f"variable '{one.name}' is of the type {one.type}; expected Real or Float64")
     mistakes.raise_if_any()
     folder = fmpy.extract(str(path))
 

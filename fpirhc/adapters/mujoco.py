@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters import adapter, counterparts, derivatives, from_path_or_text, require, steps_per_cycle
+from fpirhc.adapters import adapter, counterparts, derivatives, require, steps_per_cycle
 from fpirhc.errors import Mistakes, package
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
@@ -49,7 +49,10 @@ def mujoco_body(
         InvalidProblem: a name that the body or the model does not have, or a period that is no whole number of time steps.
     """
     mujoco = package("mujoco", "outside")
-    body = from_path_or_text(mjcf, mujoco.MjModel.from_xml_path, mujoco.MjModel.from_xml_string)
+    text = str(mjcf)
+    if not (inside := text.lstrip().startswith("<")):
+        Path(text).open("rb").close()  # the package says something else of a file that is not there
+    body = mujoco.MjModel.from_xml_string(text) if inside else mujoco.MjModel.from_xml_path(text)
     units, mistakes = quantities(model), Mistakes("mujoco_body")
     parts = derivatives(mistakes, units)
     free = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)

@@ -8,16 +8,16 @@ thrust_z are the thrust per nominal mass in the world's axes, m/s^2; the vehicle
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fpirhc.adapters import adapter, finite_numbers, require_seconds
+from fpirhc.adapters import adapter, require_seconds
 from fpirhc.errors import Mistakes, package
-from fpirhc.fields.kinds import NotNegative
+from fpirhc.fields.kinds import Finite, NotNegative
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.plant import Plant
 from fpirhc.task.external_plant import ExternalPlant
@@ -35,7 +35,7 @@ def rotorpy_body(
     *,
     period: float,
     start: Mapping[str, float] | None = None,
-    wind: Sequence[float] = (0.0, 0.0, 0.0),
+    wind: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0),
     payload: NotNegative = 0.0,
     vehicle: Mapping[str, Any] | None = None,
 ) -> ExternalPlant:
@@ -51,8 +51,7 @@ def rotorpy_body(
 
     Raises:
         NotSupported: RotorPy is not installed.
-        InvalidField: a payload below zero.
-        InvalidValue: a wind that is not of three finite numbers.
+        InvalidField: a payload below zero, or a wind that is not of three finite numbers.
         InvalidProblem: the model has other names, or the vehicle lacks parameters.
     """
     require_seconds("rotorpy_body", model)
@@ -65,12 +64,11 @@ def rotorpy_body(
     if lacking := {"mass", "k_eta"} - {*(vehicle or {"mass": 0, "k_eta": 0})}:
         mistakes.add(f"vehicle lacks {min(lacking)}; change a set of the package: {{**quad_params, 'mass': 1.0}}")
     mistakes.raise_if_any()
-    air = finite_numbers("rotorpy_body: wind", wind, _SEEN[:3])
     parameters = vehicle or package("rotorpy.vehicles.hummingbird_params", "outside").quad_params
     at = [(start or {}).get(name, 0.0) for name in _SEEN[:6]]
     hover = np.sqrt(parameters["mass"] * 9.81 / 4 / parameters["k_eta"])  # of rotors that carry the vehicle alone
     upright = {"q": np.array([0.0, 0.0, 0.0, 1.0]), "w": np.zeros(3), "rotor_speeds": np.full(4, hover)}
-    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": air, **upright}
+    first = {"x": np.array(at[:3]), "v": np.array(at[3:]), "wind": np.array(wind), **upright}
     loaded = {**deepcopy(parameters), "mass": parameters["mass"] + payload}
     multirotor = package("rotorpy.vehicles.multirotor", "outside").Multirotor
     flown = multirotor(loaded, initial_state=first, control_abstraction="cmd_acc", aero=True)
