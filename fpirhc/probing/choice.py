@@ -26,10 +26,9 @@ from fpirhc.plant.parameter import outside
 from fpirhc.plant.plant import Plant
 from fpirhc.probing.identification import Estimates
 from fpirhc.sensing.sensing import Sensor
-from fpirhc.simulation.model_as_plant import behind_actuators, shortened
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulator
-from fpirhc.simulation.trials import errors_of, weighed
+from fpirhc.simulation.trials import behind_actuators, errors_of, shortened, weighed
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime

@@ -18,8 +18,8 @@ from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
 from fpirhc.plant.chain import zero_dynamics
 from fpirhc.review.experiments import BUSY, GOOD, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, with_gain
-from fpirhc.simulation.model_as_plant import ModelAsPlant
 from fpirhc.simulation.ranges import TOLERANCE, hard_limits
+from fpirhc.simulation.trials import ModelAsPlant
 from fpirhc.status import Status
 from fpirhc.summary import written_out
 from fpirhc.symbolic.dotted import paths_to

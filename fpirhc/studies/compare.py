@@ -25,14 +25,13 @@ from fpirhc.review.experiments import Bench
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
-from fpirhc.simulation.model_as_plant import ModelAsPlant, shortened
 from fpirhc.simulation.pictures import Picture
 from fpirhc.simulation.ranges import Followed, limits_left
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import ComposedLoop, Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
-from fpirhc.simulation.trials import ErrorPair, errors_of, experiment, harm_in, weighed
+from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, experiment, harm_in, shortened, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
