@@ -96,8 +96,7 @@ def test_broken_problems_are_statuses_and_leave_no_trace(optimiser, capfd):
         for _ in range(3):
             _, diagnostics, memory = step(first, data, *bounds, memory)
         assert int(diagnostics[4]) == fp.Status.OK, name
-    printed = capfd.readouterr()
-    assert printed.out == ""
+    assert capfd.readouterr().out == ""
 
 
 RIDING = {
