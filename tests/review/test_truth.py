@@ -236,25 +236,25 @@ def test_a_weight_on_changes_stills_what_swings_without_adaptation():
 
 
 def test_a_plant_outside_is_asked_by_its_model():
-    """What fails on the model is told, and what works there is unknown of the body, without a gain to take."""
+    """What fails on the model is told; what works there is unknown of the body, with a stated lag too, and no gain is advised."""
 
     class Body:
-        def reset(self, _seed: int) -> list[float]:
+        def step(self, *_: Any) -> list[float]:
             raise AssertionError("a review does not run it")
 
-        def step(self, _time: float, _command: Any) -> list[float]:
-            raise AssertionError("a review does not run it")
+        reset = step
 
     outside = fp.ExternalPlant(Body(), measures={"x": "m", "x'": "m/s", "x''": "m/s^2"})
     problem, law = replace(biased(0.0), sensing=fp.Sensing(), reality=outside), fp.Exponential(6.0)
     adapted = {"CTC+FPI": fp.ComputedTorque(law, fp.ModelReferenced(fp.Affine(-0.8)))}
     ranges = {name: fp.Sensor(range=(-10.0, 10.0)) for name in ("x", "x'", "x''")}
-    for sensors, free in ((dict(list(ranges.items())[:1]), "x', x''"), (ranges, "")):
-        told = fp.review(replace(problem, sensing=fp.Sensing(sensors)), adapted, mismatch=0.0, seed=0).answers
+    for sensors, free, lag in ((dict(list(ranges.items())[:1]), "x', x''", {"F": 0.03}), (ranges, "", {})):
+        behind = replace(problem, sensing=fp.Sensing(sensors), reality=replace(outside, lag=lag))
+        told = fp.review(behind, adapted, mismatch=0.0, seed=0).answers
         [asked] = [a for a in told["problem"] if a.key == "ranges"]
-        assert (asked.verdict, asked.of, "range=" in asked.change) == ("caution" if free else "yes", free, bool(free))
-    verdicts = {a.key: str(a.verdict) for some in told.values() for a in some}
-    assert {k: v for k, v in verdicts.items() if v != "unknown"} == dict.fromkeys(("posed", "ranges", "model"), "yes")
+        assert (asked.of, "range=" in asked.change) == (free, bool(free))
+        known = {a.key: str(a.verdict) for some in told.values() for a in some if a.verdict != "unknown"}
+        assert known == {"posed": "yes", "ranges": "caution" if free else "yes", "model": "yes"}
     unknown = {(a.change, len(a.numbers)) for a in told["CTC+FPI"] if a.verdict == "unknown"}
     assert unknown == {("Only the model was run, and not the plant outside: fpirhc probe asks that one.", 0)}
     away = replace(problem, start={"x": 0.0, "x'": 5.0})
