@@ -99,7 +99,7 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         by_text: dict[str, list[str]] = {}
         for row in table.rows:
             by_text.setdefault(row.cells[k], []).append(row.cells[0])
-        if len(by_text) == 1 or table.columns[k].left:
+        if len(by_text) == 1 or (table.columns[k].left and table.names == 1):  # one name tells a row from others
             most = max(by_text, key=lambda text: len(by_text[text]))
             apart = [f"{text} ({', '.join(names)})" for text, names in by_text.items() if text != most]
             below.append(f"{table.columns[k].head}: {'; '.join([*apart, 'else ' * bool(apart) + (most or '-')])}")

@@ -142,11 +142,11 @@ def _plants(problem: Problem, seed: int) -> Quantity:
 
 
 _GROWS = {
-    "mismatch": "all parameters so many times as far from the model as in the file, up to 64",
-    "plants": f"the width from which {PLANTS} plants are drawn, of which none may fail, up to 99 %",
-    "latency": f"commands later by whole cycles, up to {_FARTHEST}",
-    "noise": "white noise on everything measured, its deviation beside the range of the reference, up to 410 %",
-    "lost": "samples lost at random, up to 98 %",
+    "mismatch": "all parameters are this many times as far from the model as in the file, up to 64",
+    "plants": f"{PLANTS} plants are drawn within this width, none of which may fail, up to 99 %",
+    "latency": f"commands come later by whole cycles, up to {_FARTHEST}",
+    "noise": "all that is measured has white noise of this deviation, up to 410 % of the range of the reference",
+    "lost": "samples are lost at random, up to 98 %",
 }
 QUANTITIES = {"mismatch": _mismatch, "plants": _plants, "latency": _latency, "noise": _noise, "lost": _lost}
 
@@ -167,7 +167,7 @@ class Limits(Study):
     @property
     def view(self) -> View:
         heads = ("controller", "what grows", "holds at", "fails at", "why")
-        shown = Table(f"{self.problem}: where controllers fail", [Column(c) for c in heads])
+        shown = Table(f"{self.problem}: where controllers fail", [Column(c, left=c == "why") for c in heads], names=2)
         rows: Iterator[Any] = self.table.itertuples()
         for row in rows:
             share = row.unit.startswith("of ")  # of the range, of the samples
@@ -180,10 +180,11 @@ class Limits(Study):
             shown.add([row.controller, what, holds, fails, row.why])
         tried = self.table.loc[self.table.unit != ""]
         said = [_most(str(name), some) for name, some in tried.groupby("quantity", sort=False)]
-        grows = "; ".join(f"{name}, {_GROWS[name]}" for name in dict.fromkeys(self.table.quantity))
+        grows = " ".join(f"{name.capitalize()}: {_GROWS[name]}." for name in dict.fromkeys(self.table.quantity))
         about = (
-            f"What grows until a run fails, found to 5 %: {grows}. A run fails if it ends early, leaves a hard limit by "
-            f"{in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the reference's range."
+            f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
+            f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
+            "reference's range."
         )
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
         return View(self, [(text, None) for text in said if text], about, (shown,), facts)
@@ -192,7 +193,7 @@ class Limits(Study):
 def _most(quantity: str, rows: pd.DataFrame) -> str:
     """Who bears most, where somebody bears more than the others."""
     best = rows.loc[rows.fails == rows.fails.max(), "controller"]
-    return f"{quantity}: {', '.join(best)} bear{'s' * (len(best) == 1)} most." if 0 < len(best) < len(rows) else ""
+    return f"{', '.join(best)} bear{'s' * (len(best) == 1)} most ({quantity})." if 0 < len(best) < len(rows) else ""
 
 
 @checked_call

@@ -137,5 +137,5 @@ def test_who_bears_most_is_told():
     task = tasks.made(pump(1.2), {"law": LAW, "law+FPI": ADAPTIVE})
     one = fp.limits(task, over=["mismatch"], compiled=False)
     best = one.table.controller[one.table.fails.idxmax()]
-    assert one.view.sentences == [(f"mismatch: {best} bears most.", None)]
+    assert one.view.sentences == [(f"{best} bears most (mismatch).", None)]
     assert [row.cells[0] for row in one.view.tables[0].rows] == ["law", "law+FPI"]
