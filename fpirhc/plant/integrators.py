@@ -98,16 +98,8 @@ class _Substepped(Integrator):
         return ca.Function("fpirhc_moved", [x, u, p, w], [after], *_NAMES)
 
 
-@dataclass(frozen=True)
 class RungeKutta4(_Substepped):
-    """Classical fourth-order Runge-Kutta with equal sub-steps: local error O(h^5), global O(h^4).
-
-    Args:
-        substeps: steps per cycle.
-
-    Raises:
-        InvalidValue: fewer than one sub-step.
-    """
+    """Classical fourth-order Runge-Kutta with so many equal sub-steps per cycle: local error O(h^5), global O(h^4)."""
 
     def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
         def once(x: Expression, *given: Expression) -> Expression:

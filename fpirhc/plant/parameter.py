@@ -43,7 +43,7 @@ class Parameter(Checked):
 
 
 @checked_call
-def outside(nominal: float, unit: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> Parameter:
+def outside(nominal: float, unit: str) -> Parameter:
     """Return a signal from outside, which is declared among the parameters of a plant.
 
     The response reads it as any other: `p.ambient` where `parameters={"ambient": outside(nominal=293.0, unit="K")}`.
@@ -52,12 +52,8 @@ def outside(nominal: float, unit: str, bounds: tuple[float, float] = (-math.inf,
     Args:
         nominal: value at which the plant is reviewed, and which the model has where it is told nothing.
         unit: of the signal.
-        bounds: least and largest physically possible value.
-
-    Raises:
-        InvalidField: wrong arguments, all together.
     """
-    return Parameter(nominal, nominal, unit, bounds, outside=True)
+    return Parameter(nominal, nominal, unit, outside=True)
 
 
 def check_parameters(parameters: Mapping[str, Parameter], mistakes: Mistakes) -> None:
@@ -186,37 +182,17 @@ class _Wide(Spread, ABC):
         return self.absolute if self.absolute is not None else (self.relative or 0.0) * abs(exact)
 
 
-@dataclass(frozen=True)
 class Uniform(_Wide):
-    """Uniform in exact -+ width.
-
-    Args:
-        absolute: width in the parameter's unit.
-        relative: width as a share of |exact|. One of the two is given.
-
-    Raises:
-        InvalidValue: both or neither are given, or the width is not positive.
-    """
+    """Uniform in exact -+ width, which is absolute, in the parameter's unit, or relative, a share of |exact|."""
 
     def quantile(self, exact: float, share: float, probability: float) -> float:
-        """Return exact + share width (2 probability - 1)."""
         return exact + share * self._width(exact) * (2 * probability - 1)
 
 
-@dataclass(frozen=True)
 class Normal(_Wide):
-    """Normal around exact, cut off at two standard deviations.
-
-    Args:
-        absolute: standard deviation in the parameter's unit.
-        relative: standard deviation as a share of |exact|. One of the two is given.
-
-    Raises:
-        InvalidValue: both or neither are given, or the deviation is not positive.
-    """
+    """Normal around exact, cut off at two standard deviations, which are absolute or relative as the width of `Uniform` is."""
 
     def quantile(self, exact: float, share: float, probability: float) -> float:
-        """Return exact + share deviation z, with z the quantile of the cut standard normal."""
         return exact + share * self._width(exact) * _standard(probability)
 
 

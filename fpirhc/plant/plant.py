@@ -233,11 +233,7 @@ class Plant(Checked):
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:
-        """The outputs, or without any the coordinates, on which tracking and deformation act.
-
-        Raises:
-            NotInvertible: another number of inputs, and `controlled` is None.
-        """
+        """The outputs, or without any the coordinates, on which tracking and deformation act."""
         if self.controlled is not None:
             return tuple(self.controlled)
         names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")

@@ -111,11 +111,7 @@ class Cases(Checked):
         return problem
 
     def check(self, problem: Problem, *names: str) -> None:
-        """Raise where a path or a number of some cases, or of all, does not fit the problem.
-
-        Raises:
-            InvalidProblem: all mistakes together, each with its case and path.
-        """
+        """Raise with all mistakes where a path or a number of some cases, or of all, does not fit the problem."""
         mistakes = Mistakes("cases")
         for name in names or self.names:
             for path in (p for p in self.changes[name] if p not in (_GROUP, _SEED)):

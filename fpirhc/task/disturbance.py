@@ -93,22 +93,9 @@ class Formula(Disturbance):
     expression: Callable[[Expression], Expression]
 
     def values(self, times: np.ndarray, random: np.random.Generator) -> np.ndarray:  # noqa: ARG002
-        """Return the expression's values.
-
-        Raises:
-            InvalidValue: a value is not finite.
-        """
-        return self._evaluated(times, 0)
+        return self.derivative(times, 0)
 
     def derivative(self, times: np.ndarray, order: int) -> np.ndarray:
-        """Return the expression's derivative.
-
-        Raises:
-            InvalidValue: a value is not finite.
-        """
-        return self._evaluated(times, order)
-
-    def _evaluated(self, times: np.ndarray, order: int) -> np.ndarray:
         t = ca.SX.sym("t")
         expression = scalar_expression(
             "disturbance", called("disturbance", self.expression, t), of=self.expression, symbols=(t,)

@@ -26,6 +26,7 @@ _FILLED: Latest[ca.Function] = Latest(16)  # every run asks for those of the pla
 _REAL: Latest[Mapping[str, Exogenous]] = Latest(8)
 
 
+@dataclass(frozen=True, eq=False)
 class Exogenous(Checked):
     """What acts on the plant, and how much of it the model is told: `Known` or `Unknown`."""
 
@@ -33,27 +34,15 @@ class Exogenous(Checked):
     told: ClassVar[bool]  # whether the model has the values, also of the future; else it goes on with the nominal one
 
 
-@dataclass(frozen=True, eq=False)
 class Known(Exogenous):
-    """A signal that the model has as it is, also along a horizon, as from a schedule or a forecast.
+    """A signal that the model has as it is, also along a horizon: `Samples`, an expression as a function of time, or a number."""
 
-    Args:
-        values: `Samples`, a function of time that returns an expression, or a number.
-    """
-
-    values: Course
     told = True
 
 
-@dataclass(frozen=True, eq=False)
 class Unknown(Exogenous):
-    """A signal that the plant gets and the model does not: the model has the nominal value.
+    """The same that the plant gets and the model does not: the model has the nominal value."""
 
-    Args:
-        values: `Samples`, a function of time that returns an expression, or a number.
-    """
-
-    values: Course
     told = False
 
 
