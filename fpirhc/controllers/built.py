@@ -60,6 +60,7 @@ class Built:
     warm_up: float  # number of the first cycle whose response may be used
     sample: tuple[Signal, ...]  # what a step is given
     planned: Problem | None  # the problem as plans have it, with their cost and limits
+    follows: bool = False  # whether what the model has learned corrects the inputs of a plan in every cycle
 
     @property
     def plant(self) -> Plant:
@@ -90,11 +91,10 @@ class Built:
         """Return the reference's own signals inside a step."""
         return [getattr(s, signal.name) for signal in self.own]
 
-    def inner(self, wrapper: Controller, controller: Controller | None = None) -> Built:
-        """Return what the controller inside a wrapper is built from; `controller`: in its place."""
-        wrapped = controller or wrapper.inner
-        assert wrapped is not None
-        return build(wrapper.inner_problem(self.problem), wrapped)
+    def inner(self, wrapper: Controller) -> Built:
+        """Return what the controller inside a wrapper is built from."""
+        assert wrapper.inner is not None
+        return replace(build(wrapper.inner_problem(self.problem), wrapper.inner), follows=self.follows)
 
     def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""

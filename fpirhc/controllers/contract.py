@@ -67,8 +67,6 @@ class Planner:
     # corrected
     consistent: bool | None = False
     adapts: bool = False  # whether a deformation corrects the response
-    # whether a change of the model's parameters changes the command in every cycle, also between plans
-    follows_model: bool = False
     independent: bool = False  # whether a plan depends on the plans before it alone, whatever the plant does
 
     @property

@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.believed import Pairs
 from fpirhc.controllers.built import Built, compose_controller, dependencies_of_command, embedded
-from fpirhc.controllers.contract import ControllerWrapper, Planner, PlantModel, innermost, with_field
+from fpirhc.controllers.contract import ControllerWrapper, PlantModel
 from fpirhc.errors import require
 from fpirhc.learning.disturbance_kalman import DisturbanceKalman
 from fpirhc.learning.estimators import ParameterEstimator, Seen
@@ -95,11 +95,6 @@ class Estimating(ControllerWrapper):
 
     learns = True
 
-    @property
-    def planner(self) -> Planner | None:
-        planner, at_once = self.controller.planner, self.at_once or self.estimator.acts_at_once
-        return replace(planner, follows_model=True) if planner is not None and at_once else planner
-
     def notes(self, problem: Problem) -> tuple[str, ...]:
         notes, model, names = super().notes(problem), self.inner_problem(problem).plant, self.estimator.learned()
         (x, u, p), equations, places = model.symbols(), model.equations, map(model.parameter.elements.index, names)
@@ -130,9 +125,7 @@ class Estimating(ControllerWrapper):
         )
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        follows = self.at_once and hasattr(innermost(self.controller), "follows_model")
-        controller = with_field(self.controller, "follows_model", True) if follows else self.controller
-        within = built.inner(self, controller)
+        within = replace(built.inner(self), follows=self.at_once)
         inner, modelled = compose_controller(within), within.problem
         require(
             "parameters" in dependencies_of_command(inner),

@@ -55,8 +55,6 @@ class RecedingHorizon(Controller):
         consistent: whether a plan on outputs from the measured state starts at the state at which the model has measured outputs
             and derivatives, see `fpirhc.horizon.nominal`; None: where a deformation, or a believed disturbance of the response,
             makes the plant's response that of the plan: the plant then moves as it foresees. Coordinates are always consistent.
-        follows_model: whether the inputs of a plan are corrected in every cycle by what the model has learned since; see
-            `Estimating(at_once=True)`. A model that does not learn changes nothing.
     """
 
     optimiser: Optimiser
@@ -65,12 +63,11 @@ class RecedingHorizon(Controller):
     cost: Cost | None = None
     room: Mapping[str, NotNegative] | None = field(default=None, kw_only=True, hash=False)
     consistent: bool | None = field(default=None, kw_only=True)
-    follows_model: bool = field(default=False, kw_only=True)
 
     @property
     def planner(self) -> Planner:
         law, consistent = self.tracking, self.tracking is not None or self.consistent
-        facts = consistent, self.deformation.adapts, self.follows_model, self.room is not None
+        facts = consistent, self.deformation.adapts, self.room is not None
         return Planner(self.optimiser, self.cost, law, *facts)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
@@ -101,14 +98,14 @@ class RecedingHorizon(Controller):
         parts = from_measurement(built) if self.tracking is None else from_plan(built, self.tracking)
         (before, after, late, remembered), room = parts, _room(problem, self.room)
         same = built.problem, self.optimiser, self.tracking, self.cost, self.room, self.consistent
-        others = self.deformation.adapts, self.follows_model, plans_are_compiled()
+        others = self.deformation.adapts, built.follows, plans_are_compiled()
         plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
         closing, delays = closing_blocks(built, self.deformation, [scalar("_solve_status")])
         if self.planner.starts_consistent(plant):
             before, after = (at_consistent_start(plant, some) for some in (before, after))
             before = [consistent_start(plant), *before]
             closing = closing if self.planner.corrects(plant) else at_consistent_start(plant, closing)
-        if self.follows_model:
+        if built.follows:
             held, own = held_model(problem)
             after, delays = [held, *(as_planned(block, problem) for block in after)], [*delays, own]
         blocks = [reference_block(built), _due_block(cycles), *before, plan, *after, *closing, *late]

@@ -100,10 +100,6 @@ class DisturbanceKalman(ParameterEstimator):
         names = ("", *(f"_{part}{k}" for k in range(1, len(angles) + 1) for part in ("cos", "sin")))
         return Modes(names, moves, np.array([[1.0, *[1.0, 0.0] * len(angles)]]))
 
-    @property
-    def acts_at_once(self) -> bool:
-        return all("'" in name for name in self.drift)
-
     def reads_outputs(self, plant: Plant) -> bool:
         return any(n in plant.output.elements and n not in plant.state.elements for n in self.measured)
 

@@ -54,11 +54,6 @@ class ParameterEstimator(Checked, ABC):
         """Whether it learns from the measured response of this plant; True by default."""
         return True
 
-    @property
-    def acts_at_once(self) -> bool:
-        """Whether what it learns changes the command in every cycle, also between plans; False by default."""
-        return False
-
     def reads_outputs(self, plant: Plant) -> bool:  # noqa: ARG002
         """Whether it learns from the measured outputs of this plant below their responses; False by default."""
         return False
