@@ -52,10 +52,6 @@ class Sigmoid(Deformation):
     shift: Annotated[float, _SHIFTS] = 0.3
     scale: Positive | None = field(default=None, metadata={"automatic": True})
 
-    def with_scale(self, scale: float) -> Self:
-        """Return the same map with scale S."""
-        return replace(self, scale=scale)
-
     @cached_property
     def _tanh_fixed_point(self) -> float:
         """The root y = tanh(x*) of 2 t y^2 + y = t with t = tanh(D), in the form that has no 0/0 at D = 0."""
@@ -137,8 +133,8 @@ class Sigmoid(Deformation):
     def _chosen_scale(self) -> float:
         if self.scale is None:
             raise InvalidValue(
-                "Sigmoid(scale=None): the scale is still to be chosen; give Sigmoid(scale=...) or use with_scale(S), "
-                "with S above the largest change of the desired response in one cycle"
+                "Sigmoid(scale=None): the scale is still to be chosen; give Sigmoid(scale=S), with S above the largest change of "
+                "the desired response in one cycle"
             )
         return self.scale
 
