@@ -18,7 +18,8 @@ from typer.main import get_command
 from fpirhc.cli import list_
 from fpirhc.options import MADE, app
 
-_INTERRUPTED = "interrupted; finished results are kept, and the same command goes on"
+_KEEP = "study", "tune"  # commands that keep what is finished
+_INTERRUPTED = "interrupted"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         remove_empty(MADE)
         MADE.clear()
     if text:
+        text += "; what is finished is kept, and the same command goes on" * (code == 130 and words[0] in _KEEP)
         from fpirhc.summary import printable
 
         print(f"fpirhc: {printable(text)}", file=sys.stderr)

@@ -395,12 +395,12 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
-        among = " with the wrong model" if any(e.exact for e in entries) else ""
-        yield f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
+        among, above = " with the wrong model" * any(e.exact for e in entries), "No controller follows. " * (least > 1)
+        yield f"{above}Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:
-            yield f"{exact.name} is no bound here; smaller errors: {', '.join(beaten)}. Its cost or its rate is another."
+            yield f"{exact.name} is no bound here; smaller errors: {', '.join(beaten)}. A bound has their cost, rate, prediction."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
             lost = [n for n in entry.errors if yard.beyond(entry, n)]
