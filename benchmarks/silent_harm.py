@@ -159,7 +159,7 @@ def judged(problem: fp.Problem, pair: Any) -> tuple[float, bool, str]:
     shares = np.array([[errors[n] / size for n, size in counted] for errors in rms])
     before, after = shares[:, shares.max(axis=0) > max(ROUNDING, MINOR * shares.max(axis=1).min())]
     ratios = [b / max(a, 1e-300) if np.isfinite(a) else 0.0 for a, b in zip(before, after, strict=True)]
-    good = shares[1].max(initial=0.0) <= GOOD and measured[1].values.get("at_limit", {}).get("", 0.0) < HELD
+    good = shares[1].max(initial=0.0) <= GOOD and measured[1].get("at_limit", {}).get("", 0.0) < HELD
     return max(ratios, default=0.0), bool(good), f"shares of the task {before} -> {after}"
 
 

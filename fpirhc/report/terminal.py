@@ -234,9 +234,7 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Pa
 
 def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
     """Print the plans of open-loop solves."""
-    caption = (
-        "K: contraction factor; du <: bound of the error of every input; dV <: bound of the cost above the optimum"
-    )
+    caption = "K: contraction factor; du <: bound of the error of every input; dV <: of the cost above the optimum"
     heads = ("optimiser", "cost", "residual", "iter", "K", "du <", "dV <", "status")
     table = Table(f"{task}, first horizon", [Column(head) for head in heads], caption)
     for one in solved:
@@ -272,7 +270,9 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
             rows = [one for one in shown if one.change == change]
             brief = len(rows) > 1 and rows[0].verdict == "unknown" and not verbose
             for one in rows[: 1 if brief else None]:
-                what = f"{len(rows)} questions" if brief else one.question + f" ({one.evidence})" * bool(one.evidence)
+                every = ", ".join(f"{name} {number(value)}" for name, value in one.numbers.items()) * verbose
+                whole = f"{one.question} {one.evidence}".strip() + f" ({every})" * bool(every)
+                what = f"{len(rows)} questions" if brief else whole
                 say(f"  {one.verdict:7s} {what}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
             say(f"          -> {change}", "bold") if change else None
     advised = {one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}
@@ -282,19 +282,19 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
 
 def show_probe(title: str, answer: Probe) -> None:
     """Print estimates, trials, and the line to paste."""
-    estimates = Table(title, [Column("estimate", left=True), Column("value (interval)")])
+    two = Column("estimate", left=True), Column("value (interval)")
+    estimates = Table(title, two, "Friction biases intervals: they are of a plant that differs by these alone.")
     for estimate, value in answer.facts:
         estimates.add([estimate, value])
     show_table(estimates)
-    names = ("error, of that without", "worst", "passes")
-    trials = Table("trials", [Column("candidate", left=True), *map(Column, names)])
+    tried = map(Column, ("error, of that without", "worst", "passes"))
+    trials = Table("trials", [Column("candidate", left=True), *tried])
     for candidate, one in answer.trials.items():
         trials.add([candidate, written_out(one.error), written_out(one.worst), "yes" if one.passes else "no"])
     if trials.rows:
         show_table(trials)
     for note in answer.notes:
         say(f"note: {note}")
-    found = answer.deformation is not None
-    say(f"{'chosen' if found else 'no adaptation'}: {answer.why}", "bold")
-    if found:
+    say(f"{'chosen' if answer.deformation is not None else 'no adaptation'}: {answer.why}", "bold")
+    if answer.deformation is not None:
         print(f"\nfor the controller:\n\n{answer.lines}")

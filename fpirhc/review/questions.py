@@ -24,11 +24,18 @@ from fpirhc.status import Status
 from fpirhc.summary import written_out
 from fpirhc.symbolic.dotted import paths_to
 from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.task.problem import Problem
 
-MINOR, ROUNDING, NEAR, BAD = 1e-3, 1e-6, 0.2, 1.0  # added error as a share of the largest; errors as shares of the task
+MINOR, ROUNDING = 1e-3, 1e-6  # added error as a share of the largest, and of the task
+NEAR, FAR, BAD = 0.2, 0.5, 1.0  # errors as shares of the task: it follows, it does not, and adaptation shows nothing
 MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loop; push that latency leaves; of a limit
-CALM, CHATTER = 0.1, 0.01  # step of a command a cycle, as a share of what it covers: mean, and rms from noise
+CALM, CHATTER, RINGING = 0.1, 0.01, 0.9  # step of a command a cycle: mean, rms from noise; what a swing leaves
 SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
+GROWS = "a push leaves {largest_factor:5} of itself a cycle later"
+MOVES = "commands change by {mean_step:%} of what they cover a cycle"
+RINGS = "it swings with a period of {period} {time}, and a swing leaves {swing:%} of the last"
+BUSIER = "the total variation of {of} is {movement:r}| {movement_without:r} without adaptation"
+RESERVE = "the relative error is {error:%}| {error_at_twice:%} at twice the gain| {error_without:%} without adaptation"
 SAID = {1.0: "error", -1.0: "error_turned", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
 Numbers = Mapping[str, float]
 
@@ -49,6 +56,7 @@ class Fact(NamedTuple):
     unit: str = ""  # where it is no unit of a followed quantity or an input
     ways: str = ""  # to try before those of the row
     root: bool = False  # whether a no is the cause of the others: its advice stands there too
+    says: str = ""  # in place of the row's numbers, where others decide
 
 
 @dataclass(frozen=True)
@@ -58,15 +66,10 @@ class Question:
     key: str
     text: str
     ask: Callable[[Case], Fact | None]  # None: the question has no meaning here
-    says: str  # the numbers in words, in parts behind "| " that are there where their numbers are
+    says: str  # the numbers that decide in words, in parts behind "| " that are there where their numbers are
     change: str  # what to do where the answer is not good and no way passes
     ways: str = ""  # kinds of changes that are run
     of: str = "controller"  # or 'problem', which asks the loop of the first controller, or 'adaptive'
-
-
-def graded(value: float, good: float, bad: float) -> Verdict:
-    """Return yes up to `good`, no from `bad` on, caution between."""
-    return Verdict.YES if value <= good else Verdict.CAUTION if value < bad else Verdict.NO
 
 
 def _turns(case: Case) -> Fact | None:
@@ -76,27 +79,29 @@ def _turns(case: Case) -> Fact | None:
 
 def _posed(case: Case) -> Fact | None:
     finite = np.isfinite(needed_commands(case.problem, case.bench.nominal["plant_state"])).all(axis=1)
-    by_run = case.problem.plant.equations.hidden  # states that are taken from the run
-    verdict = Verdict.YES if finite.all() else Verdict.CAUTION if by_run else Verdict.NO
-    return Fact(verdict, {"share_finite": finite.mean()}, root=True) if len(finite) else None
+    bad = Verdict.CAUTION if case.problem.plant.equations.hidden else Verdict.NO  # states that are taken from the run
+    return (
+        Fact(Verdict.YES if finite.all() else bad, {"share_finite": finite.mean()}, root=True) if len(finite) else None
+    )
 
 
 def _ranges(case: Case) -> Fact | None:
-    if not case.outside:
-        return None
     shown, sensors = case.problem.sensing.measures(case.problem.plant), case.problem.sensing.sensors
     free = [n for n in shown if n not in sensors or sensors[n].range is None]
-    return Fact(Verdict("caution" if free else "yes"), {"without": len(free), "measured": len(shown)}, ", ".join(free))
+    numbers = {"without": len(free), "measured": len(shown)}
+    return Fact(Verdict("caution" if free else "yes"), numbers, ", ".join(free)) if case.outside else None
 
 
 def _follows(case: Case) -> Fact:
     bench, (name, share) = case.bench, case.bench.worst(case.bench.nominal)
-    rms, errors, verdict = bench.errors(bench.nominal)[name], bench.nominal["true_error"], graded(share, NEAR, BAD)
+    planner = bench.controller.planner  # whose cost may weigh no error
+    far = share >= (BAD if planner and getattr(planner.cost or case.problem.cost, "tracked", None) is None else FAR)
+    rms, errors = bench.errors(bench.nominal)[name], bench.nominal["true_error"]
     numbers = {"rms_error": rms, "error": share, "size": bench.sizes[name]}
     column, by = errors[bench.first(len(errors)) :, case.problem.judged_names.index(name)], predictor(bench.controller)
     offset = by is not None and not by.residual_time and abs(column.mean()) > OFFSET * rms and 0.01 < share < math.inf
     numbers |= {"mean_error": abs(column.mean())} if offset else {}  # of a wrong model in the prediction
-    return Fact(Verdict.CAUTION if offset and verdict == Verdict.YES else verdict, numbers, name)
+    return Fact(Verdict.NO if far else Verdict.CAUTION if offset or share > NEAR else Verdict.YES, numbers, name)
 
 
 def _saturates(case: Case) -> Fact | None:
@@ -126,8 +131,8 @@ def _saturates(case: Case) -> Fact | None:
     numbers |= {"period": 2 * plain.span[at] / moves} if swings else {}  # of a square wave
     short = not room and "needed" in numbers
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
-    verdict = Verdict.NO if lost or swings else graded(held, SATURATED, math.inf)
-    ways = "Predicted weight" if swings else "speed limits" * short
+    verdict = Verdict.NO if lost or swings else Verdict.CAUTION if held > SATURATED else Verdict.YES
+    ways = "model Predicted weight" if swings else "model speed limits" * short
     return Fact(verdict, numbers, names[at], ways=ways, root=bool(swings or short))
 
 
@@ -135,14 +140,16 @@ def _returns(case: Case) -> Fact:
     bench = case.bench
     require(bench.held(bench.nominal) <= MOSTLY, "A command at its limits is no loop: see whether it follows.")
     back, far, step = bench.back, bench.along[0], bench.steps(bench.start)
-    worst = max(one.factor for one in bench.along)
-    calm = back.left <= GOOD and worst < 1 and step <= CALM
+    worst, stuck = max(one.factor for one in bench.along), max(back.held, far.held)
+    calm = not (rings := back.swing > RINGING and back.left > LEFT) and back.left <= GOOD and worst < 1 and step <= CALM
     verdict = Verdict.YES if calm else Verdict.NO if bench.lost else Verdict.CAUTION
     numbers = {"left": back.left, "left_of_ten_times": far.left, "factor": back.factor, "largest_factor": worst}
     numbers |= {"time_constant": -case.problem.period / math.log(back.factor)} if 0 < back.factor < 1 else {}
-    stuck = max(back.held, far.held)
+    numbers |= {"swing": back.swing, "period": back.cycles * case.problem.period} if back.swing else {}
     numbers |= {"mean_step": step} | ({"at_a_limit": stuck} if stuck else {})
-    return Fact(verdict, numbers, ways="limits" if stuck > max(SATURATED, bench.held(bench.start)) else "")
+    says = GROWS if worst >= 1 else MOVES if step > CALM else RINGS * rings
+    limited = stuck > max(SATURATED, bench.held(bench.start))
+    return Fact(verdict, numbers, ways="limits" * limited, says=says * (back.left <= GOOD))
 
 
 def _plans(case: Case) -> Fact | None:
@@ -167,19 +174,17 @@ def _horizon(case: Case) -> Fact | None:
     if horizon is None or bench.controller.planner is None:
         return None
     short = bench.start.first(bench.cycles // 2)
-    errors, helps = [own := bench.share(short)], own > SLIGHT  # else there is nothing that a longer one could mend
-    while helps and len(errors) < 5:
-        lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
-        horizon = replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
-        with compiled_plans(yes=False):  # a loop for one run
-            longer = replace(bench, problem=replace(bench.problem, horizon=horizon))
-            errors.append(bench.share(longer.run(cycles=short.cycles)))
-        helps = errors[-1] < errors[-2] / WORSE and errors[-2] - errors[-1] > SLIGHT
-    numbers = dict(zip(("error", "error_with_twice_the_horizon"), errors, strict=False))
-    if len(errors) <= 2:
+    numbers = {"error": (own := bench.share(short))}
+    if own <= SLIGHT:  # there is nothing that a longer one could mend
         return Fact(Verdict.YES, numbers)
-    numbers["recommended_stages"] = horizon.stages / (2 - helps)
-    return Fact(Verdict.NO if own > BAD >= errors[1] else Verdict.CAUTION, numbers)
+    lengths = (*horizon.lengths, *horizon.lengths[-1:] * horizon.stages)
+    longer = replace(horizon, stages=2 * horizon.stages, blocks=2 * horizon.blocks, lengths=lengths)
+    with compiled_plans(yes=False):  # a loop for one run
+        run = replace(bench, problem=replace(bench.problem, horizon=longer)).run(cycles=short.cycles)
+    numbers |= {"error_with_twice_the_horizon": (long := bench.share(run))}
+    helps = long < own / WORSE and own - long > SLIGHT
+    numbers |= {"recommended_stages": longer.stages} if helps else {}
+    return Fact(Verdict.YES if not helps else Verdict.NO if own > BAD >= long else Verdict.CAUTION, numbers)
 
 
 def _box(case: Case) -> Fact | None:
@@ -208,15 +213,16 @@ def _latency(case: Case) -> Fact:
     bench, plain, base = case.bench, case.plain, case.bench.run(latency=0.5)
     calm, most = bench.steps(bench.start), max(2 * bench.share(bench.start), 0.1)
     numbers = {"error": bench.share(base), "mean_step": bench.steps(base), "mean_step_without": calm}
+    says = f"{MOVES}| {{mean_step_without:%}} without latency" * (numbers["error"] <= most)
     bears = numbers["error"] <= most and numbers["mean_step"] <= BUSY * max(CALM / 20, calm)
     if bears:
-        numbers["left"] = bench.pushed(base=base, latency=0.5)[0].left
+        says, numbers["left"] = "", bench.pushed(base=base, latency=0.5)[0].left
         bears = numbers["left"] <= min(max(2 * bench.back.left, LEFT), 1.0)
     if bears and bench.built.controller.deformation.adapts:
         alone = plain.run(latency=0.5)
         numbers["error_without"] = plain.share(alone)
         bears = _added(case, plain.errors(alone), bench.errors(base), SLIGHT)[2] <= WORSE
-    return Fact(Verdict.YES if bears else Verdict.CAUTION, numbers)
+    return Fact(Verdict.YES if bears else Verdict.CAUTION, numbers, says=says)
 
 
 def _left(case: Case) -> Fact | None:
@@ -232,10 +238,9 @@ def _left(case: Case) -> Fact | None:
 
 
 def _inner(case: Case) -> Fact | None:
-    problem, bench = case.problem, case.bench
-    if sum(problem.plant.response_orders.values()) >= problem.plant.state.size or problem.plant.step is not None:
+    problem, bench, run, plant = case.problem, case.bench, case.bench.nominal, case.problem.plant
+    if sum(plant.response_orders.values()) >= plant.state.size or plant.step is not None:
         return None
-    run, plant = bench.nominal, problem.plant
     same = run["plant_state"].shape[1] == plant.state.size and run.cycles
     require(same, "What moves has other states than the model.")
     at = np.linspace(0, run.cycles - 1, 9).astype(int)
@@ -272,6 +277,13 @@ def set_gain(controller: Controller, times: float) -> str:
     return f"Set {' and '.join(paths) or f'the {name}'} to {times * value:.4g}."
 
 
+def apart(problem: Problem) -> dict[str, float]:
+    """How many times the plant's value the model's is, of parameters that are apart by a power of ten."""
+    known = problem.plant.parameters.items() if problem.reality is None else ()
+    ratios = {n: p.approximate / p.exact for n, p in known if not p.outside and p.exact}
+    return {n: ratio for n, ratio in ratios.items() if ratio and not 0.1 < abs(ratio) < 10}
+
+
 def recommended_gain(case: Case) -> Fact:
     """What a run shows of the gain, and another one to take, with which its own review says yes."""
     fact, controller, good = gain_by_run(case)._replace(root=True), case.bench.controller, None
@@ -285,11 +297,13 @@ def recommended_gain(case: Case) -> Fact:
         seen, times = [*seen, times], times * then.numbers.get("recommended_times", 0.0)
     numbers = {name: v for name, v in fact.numbers.items() if not name.startswith("recommended")}
     if not good:
-        return fact._replace(numbers=numbers, ways="gain")
+        return fact._replace(numbers=numbers, ways="model gain")
     (times, rung), worst = good, list(case.problem.plant.inputs).index(fact.of)
     numbers |= {"recommended_times": times, "recommended_gain": times * own_gain(controller.deformation)[1]}
     numbers |= {"error_recommended": rung.error, "movement_recommended": rung.moves[worst]}
-    return fact._replace(numbers=numbers, change=set_gain(controller, times) + price(numbers["error"], rung.error))
+    change = set_gain(controller, times) + price(numbers["error"], rung.error)
+    ways = "model gain" * bool(apart(case.problem) and fact.verdict == Verdict.NO)
+    return fact._replace(numbers=numbers, change=change, ways=ways)
 
 
 def price(before: float, after: float) -> str:
@@ -321,13 +335,16 @@ def gain_by_run(case: Case) -> Fact:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
         best = 1.0
+    lost = ("a push grows" if own.admitted else "it is refused") * (own.error < found.alone)
+    says = lost if not right else "" if not poor else RESERVE if calm else BUSIER
     if own.turned:  # also where a turned gain works
         return Fact(Verdict.NO, numbers, of, f"{own.turned}.")
     if verdict != Verdict.YES and best in (0.0, 1.0):
         tried = min(rungs, key=lambda times: rungs[times].error)
         numbers |= {"best_gain": tried * value, "error_at_best": rungs[tried].error}
-        return Fact(verdict, numbers, of, "Mend the loop without adaptation first." * (verdict == Verdict.UNKNOWN))
-    return Fact(verdict, numbers | {"recommended_times": best, "recommended_gain": best * value}, of)
+        first = "Mend the loop without adaptation first." * (verdict == Verdict.UNKNOWN)
+        return Fact(verdict, numbers, of, first, says=says)
+    return Fact(verdict, numbers | {"recommended_times": best, "recommended_gain": best * value}, of, says=says)
 
 
 def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) -> tuple[str, dict[str, float], float]:
@@ -351,7 +368,11 @@ def _model(case: Case) -> Fact:
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
     name, numbers, harms = _added(case, without, adapted, SLIGHT)
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
-    no = spoils and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
+    no = (
+        spoils
+        and not case.outside
+        and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
+    )
     verdict = Verdict.NO if no else Verdict.CAUTION if spoils and harms > WORSE else Verdict.YES
     return Fact(verdict, numbers, name)
 
@@ -367,54 +388,46 @@ def _pays(case: Case) -> Fact:
 
 
 QUESTIONS = (
-    Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns, "jumps of {of} in {whole}: "
-             "{jumps}", "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its error.", of="problem"),
-    Question("posed", "Has the reference finite commands?", _posed, "by the model in {share_finite:%} of the cycles of {whole}",
+    Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns, "{jumps} of {of}",
+             "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its error.", of="problem"),
+    Question("posed", "Has the reference finite commands?", _posed, "by the model in {share_finite:%} of the cycles",
              "Give it the derivatives that the plant's order needs, away from singular states.", of="problem"),
-    Question("ranges", "Is it stated what working sensors show?", _ranges, "{without} of {measured} quantities are without| {of}",
-             "State it, so that a failed sensor is not believed: Sensor(range=(lower, upper)).", of="problem"),
-    Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of the plans of {whole} did not converge| relative "
-             "rms error {error:%} ({start})| {error_with_more_iterations:%} with 8 times the iterations", "Give the optimiser "
-             "more iterations, or a smaller tolerance, before anything else."),
-    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change at a limit in "
-             "{at_a_limit:%} of the cycles ({counted})| largest {of} {largest:u}, {share_of_the_limit:%} of its limit| by the "
-             "model or the plant the reference needs {needed:%}| without adaptation it swings with a period of {period} {time}",
-             "", "gain rate weight window Predicted limits speed"),
-    Question("gain", "Is the gain admissible?", recommended_gain, "relative rms error {error:%} ({tried})| {error_without:%} "
-             "without adaptation| {error_recommended:%} at {recommended_gain:4}| {error_at_half:%} at half of the gain| "
-             "{error_at_twice:%} at twice| {error_at_best:%} at the best that was run, {best_gain:4}| total variation of {of} "
-             "{movement:r} ({start})| {movement_recommended:r} as recommended| {movement_without:r} without adaptation", "No gain "
-             "that was run helps, is calm, and has reserve.", "filter form Predicted window sensors without", "adaptive"),
-    Question("follows", "Does it follow the reference?", _follows, "rms error of {of} {rms_error:u} ({counted}), {error:%} of its "
-             "motion of {size:u}| mean {mean_error:u}", "", "residual_time gain without rate weight window Predicted limits speed"),
-    Question("returns", "Does it come back from a push?", _returns, "{left:%} of a push by 1 % of the states' ranges is left "
-             "after {pushed}| {left_of_ten_times:%} of one by 10 % after {halfway}| a command at a limit in {at_a_limit:%} of the "
-             "way back| time constant {time_constant} {time}| a cycle leaves {largest_factor:5} at worst| commands change by "
-             "{mean_step:%} of what they cover a cycle", "", "gain rate weight window Predicted form without limits"),
-    Question("horizon", "Is the horizon long enough?", _horizon, "relative rms error {error:%} ({half})| "
-             "{error_with_twice_the_horizon:%} with twice the stages", "Give the horizon {stages} stages."),
+    Question("ranges", "Is it stated what working sensors show?", _ranges, "not for {of}", "State it, so that a failed sensor is "
+             "not believed: Sensor(range=(lower, upper)).", of="problem"),
+    Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of them did not converge| with 8 times the "
+             "iterations the relative error is {error_with_more_iterations:%} in place of {error:%}", "Give the optimiser more "
+             "iterations, or a smaller tolerance, before anything else."),
+    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change is at a limit in "
+             "{at_a_limit:%} of the cycles| and the reference needs {needed:%} of the limit| without adaptation it swings with a "
+             "period of {period} {time}", "", "gain rate weight window Predicted limits speed"),
+    Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}| {error_without:%} without "
+             "adaptation| {error_recommended:%} at {recommended_gain:4}", "No gain that was run helps, is calm, and has reserve.",
+             "filter form Predicted window sensors without", "adaptive"),
+    Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
+             "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain without rate weight window Predicted "
+             "limits speed"),
+    Question("returns", "Does it come back from a push?", _returns, "{left:%} of the push is left after {pushed}", "",
+             "model gain rate weight window Predicted form without limits"),
+    Question("horizon", "Is the horizon long enough?", _horizon, "the relative error is {error:%}| "
+             "{error_with_twice_the_horizon:%} with twice the stages", "Give the horizon {recommended_stages:.0f} stages."),
     Question("box", "Does it come back for every plant in the range of the parameters?", _box, "{share_that_come_back:%} of "
-             "{plants} plants| in the worst case {left:%} of a push left after {pushed}| relative rms error {error:%} ({start})",
-             "Narrow the range of the parameters.", "gain rate limits without", of="loop"),
-    Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it comes back at {least} to {most} "
-             "times their gain", "", "gain form rate weight window", of="loop"),
-    Question("latency", "Does it bear half a cycle of latency?", _latency, "relative rms error {error:%} ({start})| "
-             "{error_without:%} without adaptation| commands change by {mean_step:%} of what they cover a cycle| "
-             "{mean_step_without:%} without latency| {left:%} of a push left after {pushed}", "Run it where no command is late.",
+             "{plants} plants do", "Narrow the range of the parameters.", "gain rate limits without", of="loop"),
+    Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it bears {least} to {most} times "
+             "their gain", "", "gain form rate weight window", of="loop"),
+    Question("latency", "Does it bear half a cycle of latency?", _latency, "the relative error is then {error:%}| "
+             "{error_without:%} without adaptation| {left:%} of a push is left", "Run it where no command is late.",
              "gain form rate weight window", of="loop"),
-    Question("limits", "Do states, rates and paths keep their limits?", _left, "beyond a limit in {share_of_cycles:%} of the "
-             "cycles of {whole}| {of} by at most {excess:u}, {beyond:%} of its range, at t = {time_of_it} {time}", "A command "
-             "keeps limits of inputs and their rates alone: leave room to the others.", "gain rate weight speed"),
-    Question("inner", "Are the zero dynamics stable?", _inner, "largest real part {rate_with_outputs_held} 1/{time}| {left:%} of a "
-             "push left after {pushed}", "States without a task go off: weigh them in the cost, or control another output."),
-    Question("noise", "Is the chatter from noise small?", _noise, "noise changes {of} by {rms_change:u} rms per cycle, "
-             "{rms_step:%} of what it covers ({start})| total variation {movement:r}| {movement_without_noise:r} without noise",
-             "Measure the response with less noise.", "gain filter window rate weight"),
-    Question("model", "Would it do little harm if the model were right?", _model, "the model was run as the plant, so that there "
-             "is nothing to correct: rms error of {of} {error_without:u} without adaptation| {error_with:u} with it ({counted})",
-             "", "form window gain without", "adaptive"),
-    Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "rms error of {of} {error_without:u} without "
-             "adaptation| {error_with:u} with it ({counted})| {ratio}", "", "gain form window Predicted sensors without",
-             "adaptive"),
+    Question("limits", "Do states, rates and paths keep their limits?", _left, "a limit of {of} is left in {share_of_cycles:%} of "
+             "the cycles| by at most {excess:u}", "A command keeps limits of inputs and their rates alone: leave room to the "
+             "others.", "gain rate weight speed"),
+    Question("inner", "Are the zero dynamics stable?", _inner, "the largest real part is {rate_with_outputs_held} 1/{time}",
+             "States without a task go off: weigh them in the cost, or control another output."),
+    Question("noise", "Is the chatter from noise small?", _noise, "noise moves {of} by {rms_step:%} of what it covers a cycle| "
+             "its total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with less "
+             "noise.", "gain filter window rate weight"),
+    Question("model", "Would it do little harm if the model were right?", _model, "the rms error of {of} is then "
+             "{error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides, where it may cure more.",
+             "form window gain without", "adaptive"),
+    Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "the rms error of {of} is {error_without:u} "
+             "without adaptation| {error_with:u} with it", "", "gain form window Predicted sensors without", "adaptive"),
 )  # fmt: skip
-OF_MODEL = "turns", "posed", "ranges", "model"  # which ask the file or the model, and no plant outside

@@ -317,7 +317,7 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     name = max(ratios, key=ratios.__getitem__)
     text = f"{run.controller} measures its response without noise. White noise of {in_percent(NOISE)} of its range (rms) would "
     text += f"multiply the rms error of {name} by {written_out(ratios[name])} and the total variation of the command "
-    return Finding(f"{text}by {written_out(moves)} ({bench.since(quiet.cycles)}).", ratios=ratios)
+    return Finding(f"{text}by {written_out(moves)}.", ratios=ratios)
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one

@@ -22,8 +22,8 @@ NAMES = {  # of numbers by key, which scripts read
              "movement_recommended", "movement_without"},
     "follows": {"rms_error", "error", "size", "mean_error"},
     "input_limits": {"at_a_limit", "largest", "share_of_the_limit", "needed", "period"},
-    "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "mean_step", "at_a_limit"},
-    "horizon": {"error", "error_with_twice_the_horizon", "recommended_stages"},
+    "returns": {"left", "left_of_ten_times", "factor", "largest_factor", "time_constant", "mean_step", "at_a_limit", "swing",
+                "period"}, "horizon": {"error", "error_with_twice_the_horizon", "recommended_stages"},
     "box": {"share_that_come_back", "plants", "left", "error"},
     "input_gain": {"most", "least"}, "limits": {"excess", "beyond", "time_of_it", "share_of_cycles"},
     "latency": {"left", "error", "error_without", "mean_step", "mean_step_without"}, "inner": {"rate_with_outputs_held", "left"},
@@ -112,13 +112,13 @@ def test_the_limit_cycle_of_an_encoder_is_no_answer_to_a_push():
 
 
 def test_a_set_point_is_judged_beside_the_plant_that_is_left_alone():
-    """A room starts .1 K off, and the sun heats it by 2.5 K: a law that leaves .2 K of that follows, one with .94 K hardly."""
+    """A room starts .1 K off, and the sun heats it by 2.5 K: laws leave 1.4, .94 and .2 K of that."""
     room = fp.Plant(
         {"T": "K"}, {"u": "K/s"}, {"a": fp.Parameter(1.0, 1.2, "1/s")}, lambda x, u, p: {"T": u.u - p.a * x.T}, order=1
     )
     usual = {"period": 0.01, "duration": 10.0, "measure_from": 5.0, "disturbances": {"u": fp.Step(at=1.0, size=3.0)}}
     problem = fp.Problem(room, fp.Trajectory(lambda t: {"T": 0 * t}), {"T": 0.1}, **usual)
-    for rate, verdict in ((3.0, "caution"), (15.0, "yes")):
+    for rate, verdict in ((2.0, "no"), (3.0, "caution"), (15.0, "yes")):
         told = answers(problem, fp.ComputedTorque(fp.Exponential(rate, integral=False)))["follows"]
         sizes = {"size": pytest.approx(3 / 1.2, rel=0.01), "rms_error": pytest.approx(3 / (rate + 0.2), rel=0.02)}
         assert (told.verdict, {n: told.numbers[n] for n in sizes}) == (verdict, sizes)
@@ -134,4 +134,5 @@ def test_the_command_writes_fixed_names_and_says_no_by_its_exit_code(tmp_path: P
     for answer in (a for some in told["answers"].values() for a in some):
         assert set(answer) == {"key", "question", "verdict", "numbers", "of", "change", "evidence"}
         assert set(answer["numbers"]) <= NAMES[answer["key"]]
+        assert re.fullmatch(r"([A-Z0-9][^()]*\.)?", answer["evidence"])
         assert answer["key"] != "gain" or (answer["numbers"]["recommended_times"] < 0) is (code == 1)
