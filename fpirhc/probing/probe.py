@@ -149,7 +149,7 @@ def _facts(problem: Problem, shown: Sequence[str], channels: Sequence[Channel]) 
     names = plant.controlled_names
     for row, one in zip(names, channels, strict=True):
         for column, gain in zip(names, one.gains, strict=True):
-            yield f"gain of {row}{f' by {column}' if len(names) > 1 else ''}", _interval(gain)
+            yield f"gain ratio of {row}{f' by {column}' if len(names) > 1 else ''}, plant over model", _interval(gain)
     by_input = list(zip(plant.inputs, channels, strict=True))
     yield from ((f"dead time of {name}, cycles", _interval(one.dead_time)) for name, one in by_input)
     yield from ((f"lag of {name}, {time}", _interval(one.lag)) for name, one in by_input)
@@ -174,7 +174,7 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates) -> Iterato
         wide = max(gain.high - gain.low for gain in one.gains) / 2 / max(abs(one.gains[row].value), 1e-300)
         if (more := wide / _WIDE) > 1 and not estimates.refused:
             mend = f"{more:.2g} times the amplitude, or {more**2:.2g} times the cycles, would make that {100 * _WIDE:.0f} %"
-            yield f"the gain of {name} is only known to {100 * wide:.0f} %: {mend}"
+            yield f"the gain ratio of {name} is only known to {100 * wide:.0f} %: {mend}"
         if limited > _LIMITED:
             yield f"{u} is at a limit in {100 * limited:.0f} % of the cycles, which tells little: excite less, or widen its limits"
         around, known = problem.dead_time.measurement, problem.dead_time.inputs.get(u, 0.0)
