@@ -152,7 +152,8 @@ class Comparison(Study):
         for e in self.entries:
             marked = [k for k, c in enumerate(shown, 1) if not e.exact and c in best and c.number(e.metrics) == best[c]]
             texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
-            status = f"ended early: {e.run.stop}" if e.run.stop else status_shares(e.metrics.statuses)
+            why = "" if str(e.run.stop) in self.findings[0].text else f": {e.run.stop}"  # which stands above the table
+            status = f"ended early{why}" if e.run.stop else status_shares(e.metrics.statuses)
             status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
             cycle = f"{round(e.cycle, 1):g}" if e.cycle else ""
             table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
