@@ -85,6 +85,7 @@ class Simulator:
         counted = planner is not None and getattr(planner.optimiser, "iterations", None) is not None
         return counted and plans_exactly(self.loop, problem, self.controller)
 
+    @checked_call
     def run(
         self,
         *,
