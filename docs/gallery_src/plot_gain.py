@@ -2,10 +2,9 @@
 How large may the gain be?
 ==========================
 
-The contraction factor follows from the symbols, before anything runs: with the
-eigenvalues of the response Jacobian between 1.3 and 1.5 (the model's masses over the
-plant's) every small error dies out up to the *linear limit*. Eq (6) is steeper on one
-side than at its fixed point, so large errors die out only up to the *sector limit*.
+The contraction factor follows from the symbols, before anything runs. With gain ratios
+between 1.3 and 1.5 (the model's masses over the plant's) every small error dies out up
+to the *linear limit*. Eq (6) is steeper on one side than at its fixed point, so large errors die out only up to the *sector limit*.
 Between the two lies a range in which a loop that is already quiet stays quiet, and one
 that is not may oscillate for ever.
 """
