@@ -198,7 +198,7 @@ class Units(NamedTuple):
 
 
 def units(ocp: OptimalControl) -> Units:
-    """Return the units of `bounds.scales`, so that a program sees numbers of size one.
+    """Return the units of `scales`, so that a program sees numbers of size one.
 
     A state without limits has at most the one that a unit of the inputs in all stages moves it by.
     """
