@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5b4a9c", "#8c6d1f", "#7f7f7f", "#111111")
 BANDS = ("#7f7f7f", "#e69f00", "#56b4e9", "#cc79a7")  # of time slots, drawn pale
 _RESPONSES = {"nominal": "#009e73", "desired": "#0072b2", "deformed": "#e69f00", "realised": "#d55e00"}
-_POINTS = 2000  # drawn per line
+_INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 _SHORTEST = 12  # characters of a name that was cut
 _LABEL, _NAME = 28, 48  # characters of a label of an axis, a name in a legend
 _TALL = 20  # largest over usual size from which the range of a panel is cut, so that one spike does not hide the rest
@@ -74,11 +75,23 @@ def draw_bands(axis: Axes, run: Run) -> None:
         axis.axvspan(start, end, color=BANDS[slot % len(BANDS)], alpha=0.12, lw=0, label=f"slot {name}")
 
 
+def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values of the extremes of equal intervals in their order; a short series as it is.
+
+    Every n-th value alone would show a command that alternates from cycle to cycle as a smooth line.
+    """
+    if values.size <= 2 * _INTERVALS:
+        return times, values
+    edges = np.linspace(0, values.size, _INTERVALS + 1).astype(int)
+    parts = [(a, values[a:b]) for a, b in pairwise(edges)]
+    places = np.array([sorted((a + int(np.argmin(v)), a + int(np.argmax(v)))) for a, v in parts]).ravel()
+    return times[places], values[places]
+
+
 def draw_line(axis: Axes, run: Run, column: str, label: str, color: str, style: str = "-") -> None:
     """Draw one column of a run over time; its unit stands in the legend."""
     name = literal(f"{label} [{run.unit(column)}]")
-    every = slice(None, None, max(1, run.cycles // _POINTS))
-    axis.plot(run.time[every], run[column][every], style, color=color, lw=1, label=name)
+    axis.plot(*extremes(run.time, run[column]), style, color=color, lw=1, label=name)
     axis.grid(visible=True, alpha=0.25)
 
 

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
-from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
 import casadi as ca
@@ -29,9 +28,6 @@ from fpirhc.symbolic.layout import Layout
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-INTERVALS = 2000  # of a line over time, each drawn by its two extremes
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +83,6 @@ def label(run: Run, what: str | Quantity) -> str:
     return drawing.literal(f"{name} [{unit}]")
 
 
-def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and values of the extremes of equal intervals in their order; a short series as it is.
-
-    Every n-th value alone would show a command that alternates from cycle to cycle as a smooth line.
-    """
-    if values.size <= 2 * INTERVALS:
-        return times, values
-    edges = np.linspace(0, values.size, INTERVALS + 1).astype(int)
-    parts = [(a, values[a:b]) for a, b in pairwise(edges)]
-    places = np.array([sorted((a + int(np.argmin(v)), a + int(np.argmax(v)))) for a, v in parts]).ravel()
-    return times[places], values[places]
-
-
 @dataclass(frozen=True, eq=False)
 class OverTime(Picture):
     """Panels below each other that share the time axis.
@@ -135,7 +118,7 @@ class OverTime(Picture):
             up = ""
             for name, run in runs.items():
                 late = run.time >= self.since
-                axis.plot(*extremes(run.time[late], numbers(run, what)[late]), lw=1, label=name)
+                axis.plot(*drawing.extremes(run.time[late], numbers(run, what)[late]), lw=1, label=name)
                 up = label(run, what)
             for level in self.levels.get(what if isinstance(what, str) else what.name, ()):
                 axis.axhline(level, color="#777777", lw=0.8, ls="--")

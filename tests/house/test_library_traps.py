@@ -1,7 +1,6 @@
 """Traps of the libraries below fpirhc: what they do wrong without saying so, and that a guard here catches it."""
 
 import pickle
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -17,17 +16,12 @@ PLANT = fp.Plant(
 REST = fp.Trajectory(lambda t: {"y": 0 * t})
 
 
-def planned(optimiser: Any, limits: fp.Limits) -> fp.Run:
-    """Two cycles of plans from (2 m, 1 m/s)."""
-    cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.1})
-    horizon, start = fp.Horizon(5, 0.2), {"y": 2.0, "y'": 1.0}
-    problem = fp.Problem(PLANT, REST, start, period=0.1, duration=0.2, limits=limits, horizon=horizon, cost=cost)
-    return fp.simulate(problem, fp.RecedingHorizon(optimiser), seed=0, compiled=False)
-
-
 def test_ipopt_prints_nothing(capfd):
     """Its banner would spoil what --json prints."""
-    planned(fp.Ipopt(tolerance=1e-3), fp.Limits())
+    cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.1})
+    horizon, start = fp.Horizon(5, 0.2), {"y": 2.0, "y'": 1.0}
+    problem = fp.Problem(PLANT, REST, start, period=0.1, duration=0.2, horizon=horizon, cost=cost)
+    fp.simulate(problem, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-3)), seed=0, compiled=False)
     assert capfd.readouterr().out == ""
 
 

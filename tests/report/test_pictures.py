@@ -58,22 +58,24 @@ def test_a_line_over_time_is_the_signal(runs):
 
 
 def made_run(values: np.ndarray) -> fp.Run:
-    """A run with this signal 'state.q', a value each millisecond."""
-    signals = scalar("time", "s"), Signal("state", ("q",), ("m",))
-    log = np.column_stack([np.arange(len(values)) * 1e-3, values])
+    """A run whose signals are all this one, a value each millisecond."""
+    names = "state", "reference", "error", "command", "nominal", "desired", "deformed", "realised"
+    signals = scalar("time", "s"), *(Signal(name, ("q",), ("m",)) for name in names)
+    log = np.column_stack([np.arange(len(values)) * 1e-3, *[values] * len(names)])
     return fp.Run("case", "made", 0, 1e-3, Layout(signals), log, None, False, {})
 
 
 def test_an_alternating_signal_is_drawn_as_wide_as_it_is():
-    """Extremes of intervals, not every n-th value; in their order, and nothing but values of the series."""
+    """Extremes of intervals, not every n-th value; in their order, and values of the series alone. Of the plot of a run too."""
     values = np.where(np.arange(20_000) % 2, 60.0, -60.0) * (np.arange(20_000) > 5000)
     figure = Figure()
     fp.OverTime("t", panels=("state.q",)).draw(figure, {"made": made_run(values)})
-    when, what = (np.asarray(one) for one in figure.axes[0].lines[0].get_data())
-    assert what.size <= 4000
-    assert np.all(np.diff(when) >= 0)
-    assert (what[-100:].min(), what[-100:].max()) == (-60.0, 60.0)
-    np.testing.assert_array_equal(what, values[np.rint(when * 1e3).astype(int)])
+    for axis in (*figure.axes, *made_run(values).plot().axes):
+        when, what = (np.asarray(one) for one in axis.lines[0].get_data())
+        assert what.size <= 4000
+        assert np.all(np.diff(when) >= 0)
+        assert (what[-100:].min(), what[-100:].max()) == (-60.0, 60.0)
+        np.testing.assert_array_equal(what, values[np.rint(when * 1e3).astype(int)])
 
 
 def test_a_portrait_has_a_panel_for_each_run(runs):
