@@ -61,23 +61,9 @@ class Shifted(Reference):
 
     def motion_now(self, plant: Plant, ahead: float = 0.0) -> ca.Function:
         """Function (t, own signals) -> (state, response), now or after some time with the shift held."""
-        t, own, shift = self._symbols(plant)
+        t, *own, shift = ca.SX.sym("t"), *(ca.SX.sym(signal.name, signal.size) for signal in self.own(plant))
         state, response = self.reference.motion_now(plant, ahead)(t, *own)
         return ca.Function("fpirhc_target", [t, *own, shift], [state + _places(plant) @ shift, response])
-
-    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
-        """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at the nodes of a horizon."""
-        t, own, shift = self._symbols(plant)
-        known, function = self.reference.preview(plant, nodes), self.reference.function(plant)
-        at_nodes = [] if known is not None else [function(t + float(time)) for time in nodes]
-        states, responses = known(t, *own) if known is not None else map(ca.horzcat, *at_nodes)
-        shifted = states + ca.repmat(_places(plant) @ shift, 1, len(nodes))
-        return ca.Function("fpirhc_target_preview", [t, *own, shift], [shifted, responses])
-
-    def _symbols(self, plant: Plant) -> tuple[Expression, list[Expression], Expression]:
-        """Time, the own signals of the reference, and the shift."""
-        *own, shift = (ca.SX.sym(signal.name, signal.size) for signal in self.own(plant))
-        return ca.SX.sym("t"), own, shift
 
 
 def _shift_signal(plant: Plant, name: str) -> Signal:

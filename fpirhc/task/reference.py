@@ -89,9 +89,14 @@ class Reference(Checked, ABC):
             return function
         return ca.Function("fpirhc_reference_ahead", [t], list(function(t + ahead)), ["t"], ["state", "response"])
 
-    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:  # noqa: ARG002
+    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function | None:
         """Function (t, own signals) -> (states (nx, N + 1), responses (n, N + 1)) at times from t on; None without own signals."""
-        return None
+        t, own = ca.SX.sym("t"), [ca.SX.sym(signal.name, signal.size) for signal in self.own(plant)]
+        if not own:
+            return None
+        columns = [self.motion_now(plant, ahead)(t, *own) for ahead in nodes.tolist()]
+        tables = [ca.horzcat(*parts) for parts in zip(*columns, strict=True)]
+        return ca.Function("fpirhc_reference_preview", [t, *own], tables)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,26 +197,11 @@ class Setpoint(Reference):
         return Block("set_points", Layout((given,)), Layout((*shown, own)), step, Layout((memory,)))
 
     def motion_now(self, plant: Plant, ahead: float = 0.0) -> ca.Function:
-        own, z, points = self._symbols(plant)
+        own = ca.SX.sym("own", self.own(plant)[0].size)
+        z, points = ca.vertsplit(own, [0, len(self._elements(plant)), own.numel()])
         motion = self._motion(plant, self._later(plant, z, points, ahead) if ahead else z, points)
         arguments, names = [ca.SX.sym("t"), own], ["t", "own"]
         return ca.Function("fpirhc_reference_now", arguments, list(motion), names, ["state", "response"])
-
-    def preview(self, plant: Plant, nodes: np.ndarray) -> ca.Function:
-        own, z, points = self._symbols(plant)
-        columns = [self._motion(plant, z, points)]
-        for length in np.round(np.diff(nodes) / nodes[1], 12).tolist():  # equal stages are equal to the last bit
-            z = self._later(plant, z, points, nodes[1] * length)
-            columns.append(self._motion(plant, z, points))
-        tables = [ca.horzcat(*parts) for parts in zip(*columns, strict=True)]
-        arguments, names = [ca.SX.sym("t"), own], ["t", "own"]
-        return ca.Function("fpirhc_reference_preview", arguments, tables, names, ["states", "responses"])
-
-    def _symbols(self, plant: Plant) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """The own signal, and of it the state of all filters and the set-points."""
-        own = ca.SX.sym("own", self.own(plant)[0].size)
-        z, points = ca.vertsplit(own, [0, len(self._elements(plant)), own.numel()])
-        return own, z, points
 
     def _later(self, plant: Plant, z: Expression, points: Expression, time: float) -> Expression:
         """The state of all filters after a time with the set-points held; at rest every difference is exactly zero."""
