@@ -246,7 +246,7 @@ class NumbersNow:
     @property
     def settings(self) -> Layout:
         """The vector of the live settings among `reads`, 'settings'; an element is a path."""
-        return self._composite.settings
+        return Layout(tuple(s for s in self._composite.reads.signals if s.name == SETTINGS))
 
     def bounds(self) -> dict[str, Interval]:
         """Return for each live setting the interval of the numbers that a device without Python may accept, by path.

@@ -147,11 +147,6 @@ class Composite:
         shared = ca.cse([ca.SX(v) for v in graph.call(inputs)])
         return ca.Function(graph.name(), inputs, shared, graph.name_in(), graph.name_out())
 
-    @property
-    def settings(self) -> Layout:
-        """The signal of the settings, where it is read."""
-        return Layout(tuple(s for s in self.reads.signals if s.name == SETTINGS))
-
     @cached_property
     def opaque(self) -> bool:
         """Whether some block holds operations that scalar expressions cannot."""
