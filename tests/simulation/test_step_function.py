@@ -70,11 +70,10 @@ def _of(name: str):
 
 def test_bounds_are_where_the_check_begins_to_refuse():
     """Every number inside is accepted, and one a little beyond an end is refused; limits of inputs end at those of the build."""
-    stepper = fp.Stepper(
-        *_of("CTC+FPI"), live=["deformation.gain", "tracking.rate", "limits.inputs.Q1.1"], compiled=False
-    )
+    live = ["deformation.gain", "tracking.rate", "limits.inputs.Q1.0", "limits.inputs.Q1.1"]
+    stepper = fp.Stepper(*_of("CTC+FPI"), live=live, compiled=False)
     bounds, build = stepper.bounds(), dict(stepper.numbers)
-    assert list(bounds) == ["deformation.gain", "tracking.rate", "limits.inputs.Q1.0", "limits.inputs.Q1.1"]
+    assert list(bounds) == live
     for path in ("deformation.gain", "tracking.rate"):
         for end, away in zip(bounds[path], (-1, 1), strict=True):
             size = max(abs(build[path]), abs(end)) if np.isfinite(end) else 1.0
