@@ -180,7 +180,7 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates) -> Iterato
         around, known = problem.dead_time.measurement, problem.dead_time.inputs.get(u, 0.0)
         if problem.foreign and not hidden and one.dead_time.low - (around + known) / problem.period > 1 - 1e-9:
             time = f"dead_time=fp.DeadTime(inputs={{'{u}': {one.dead_time.value * problem.period - around:.6g}}})"
-            yield f"state {time}: reviews and predictions need it; a deformation to paste has its own cycles, and stays"
+            yield f"state {time} in the problem too: predictions need it, and a review fails the deformation without it"
 
 
 def _by_name(what: str, setting: Any, names: Sequence[str], least: float, words: str) -> dict[str, float] | None:

@@ -23,7 +23,6 @@ UNWRAP = "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its e
 WRAP = "Wrap the controllers: Predicted(controller, inputs=1.5)  # s, all dead times"
 Pick = Callable[[], tuple[fp.Problem, dict[str, Any]]]
 LEAVE = "Leave the deformation out."
-EFFORT = "Weigh the distance from what holds the plant: Quadratic(deviation=...) in place of effort."
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
 
 
@@ -165,7 +164,7 @@ CASES: dict[str, Case] = {
     ),
     "an effort that keeps a room cold": Case(
         lambda: (replace(reviewed.slow_room(), cost=fp.Quadratic({"T": 1e-2}, effort={"u": 1.0})), plans()),
-        changes={("RHC", "follows"): EFFORT},
+        changes={("RHC", "follows"): "Move the weights of effort to deviation: it leaves out what holds the plant."},
     ),
     "a mass in grams": Case(
         lambda: (biased(0.0).with_exact(np.array([1e-3])), plans()),
@@ -256,7 +255,9 @@ def test_a_plant_outside_is_asked_by_its_model():
         assert known == {"posed": "yes", "ranges": "caution" if free else "yes", "model": "yes"}
     unknown = {(a.change, len(a.numbers)) for a in told["CTC+FPI"] if a.verdict == "unknown"}
     assert unknown == {("Only the model was run, and not the plant outside: fpirhc probe asks that one.", 0)}
-    away = replace(problem, start={"x": 0.0, "x'": 5.0})
+    late, away = fp.DeadTime({"F": 0.05}), replace(problem, start={"x": 0.0, "x'": 5.0})
+    model = reviewed.answers(replace(problem, dead_time=late), fp.ComputedTorque(law, fp.Affine(-0.8)))["model"]
+    assert model.verdict == "caution"  # the plant may be another one
     lost = reviewed.answers(away, fp.ComputedTorque(fp.Exponential(1e-3)))["follows"]
     assert (lost.verdict, lost.change.partition("1/4. ")[2]) == ("no", "(run on the model alone)")
 
