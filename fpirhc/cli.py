@@ -100,12 +100,13 @@ def review(
     task = _task(problem)
     from dataclasses import asdict
 
-    from fpirhc.report.terminal import show_review
+    from fpirhc.report.terminal import progress_bars, show_review
     from fpirhc.review.review import review as ask
     from fpirhc.studies import to_json
     from fpirhc.studies.compare import select
 
-    found = ask(task.problem, select(task, controllers), mismatch=mismatch, seed=seed)
+    with progress_bars() as progress:
+        found = ask(task.problem, select(task, controllers), mismatch=mismatch, seed=seed, progress=progress)
     if json:
         answers = {n: [asdict(a) for a in some] for n, some in found.answers.items()}
         print(to_json({"ready": found.ready, "answers": answers}))

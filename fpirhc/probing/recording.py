@@ -77,7 +77,7 @@ def _record(
     still = np.ptp(commands, axis=0) <= 1e-9 * np.abs(commands).max(axis=0)  # NaN moves
     if still.any():
         one = f"the input '{list(plant.inputs)[int(np.argmax(still))]}' never changes, so nothing can be known of its gain"
-        raise InvalidValue(f"{where}: {one}; record a run in which it steps, or leave it room within its limits")
+        raise InvalidValue(f"{where}: {one}; let it step, leave it room within its limits, or check the model's sign")
     told, parameters = model_values(plant, problem.signals), plant.approximate
     known = parameters if told is None else told.map(len(times) - 1)(times[None, 1:], parameters)
     modelled = np.array(plant.equations.controlled_response(states[1:].T, commands[:-1].T, known)).T
