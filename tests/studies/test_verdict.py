@@ -349,7 +349,7 @@ def test_what_noise_of_the_response_costs_is_what_it_costs():
     one = tasks.van_der_pol
     names = [*one.headline]
     [told] = [f for f in fp.compare(one, seed=0, controllers=names).findings if "without noise" in f.text]
-    said = float(re.findall(r"variation of the command by (\S+) ", told.text)[0])
+    said = float(re.findall(r"variation of the command by (\S+)\.$", told.text)[0])
     quiet = fp.simulate(one.problem, one.controllers[names[1]], seed=0).first(1000)
     noise = fp.Noise(1e-3 * float(np.ptp(quiet["realised"])))
     noisy = replace(one.problem, sensing=fp.Sensing({"q''": fp.Sensor(noise=noise)}))
