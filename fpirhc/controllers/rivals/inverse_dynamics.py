@@ -87,8 +87,7 @@ class INDI(Undeformed):
 
     def filter(self, period: float) -> tuple[float, float]:
         """Return (c_1, c_2) of H for cycles of that period: y_k = (1 - c_1 - c_2) x_k + c_1 y_{k-1} + c_2 y_{k-2}."""
-        if self.frequency is None:
-            return 0.0, 0.0
+        assert self.frequency is not None
         decay = ca.exp(-_DAMPING * self.frequency * period)
         return 2 * decay * ca.cos(self.frequency * period * ca.sqrt(1 - _DAMPING * _DAMPING)), -decay * decay
 
@@ -97,7 +96,7 @@ class INDI(Undeformed):
 
     def _increment_block(self, built: Built) -> Block:
         """Block (state, last command, realised, desired) -> command; before the first response it is the model's inverse."""
-        plant, warm_up_cycles, coefficients = built.plant, built.warm_up, self.filter(built.period)
+        plant, warm_up_cycles = built.plant, built.warm_up
         gain, response, inverse = (
             plant.equations.input_gain,
             plant.equations.controlled_response,
@@ -110,12 +109,11 @@ class INDI(Undeformed):
         def filtered(s: Signals) -> tuple[dict[str, Expression], dict[str, Expression]]:
             """Command and response behind the filter, which begins settled, and what it remembers."""
             now = {"filtered_command": s._command_before, "filtered_response": s.realised}
-            if not memory.names:
+            if self.frequency is None:
                 return now, {}
-            values, begun = {}, s.filter_begun > 0.5
+            values, begun, (first, second) = {}, s.filter_begun > 0.5, self.filter(built.period)
             for name, x in now.items():
                 last, before = getattr(s, name), getattr(s, f"{name}_before")
-                first, second = coefficients
                 values[name] = ca.if_else(begun, (1 - first - second) * x + first * last + second * before, x)
             usable = ca.logic_and(is_finite(ca.vertcat(*values.values())), s.warm_up > warm_up_cycles - 0.5)
             after = {f"{name}_next": ca.if_else(usable, value, getattr(s, name)) for name, value in values.items()}
