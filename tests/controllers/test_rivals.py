@@ -58,6 +58,8 @@ def test_pid_starts_without_a_jump_and_its_integral_waits_for_the_actuator():
     """The first command is zero; while the command is clipped the integral goes no further into the limit."""
     controller = fp.PID({"y": 40.0}, {"y": 60.0}, {"y": 12.0})
     assert simulate(resting(chain(2)), controller)["command"][0, 0] == pytest.approx(0.0, abs=1e-12)
+    plain = simulate(resting(chain(2)), replace(controller, integral={}))
+    assert plain["command"][0, 0] == pytest.approx(40.0 * plain["error"][0, 0]) != 0
     weak = resting(chain(2), limits=fp.Limits(inputs={"u": (-0.8, 0.8)}), duration=6.0)
     run = simulate(weak, replace(controller, bumpless=False))
     clipped = run["clipped"][1:, 0] > 0.5

@@ -130,8 +130,9 @@ class PID(Undeformed):
             direct = [
                 total(g * e for g, e in zip(k[1:], chain, strict=True)) for k, chain in zip(gains, errors, strict=True)
             ]
-            # The integral with which the first command is zero.
-            starts = [_quotient(-d, k[0]) if self.bumpless else 0 * d for k, d in zip(gains, direct, strict=True)]
+            # The integral with which the first command is zero; without its gain, which may be open, there is none.
+            known = [ca.SX(k[0]) if self.bumpless else ca.SX(0) for k in gains]
+            starts = [ca.if_else(k == 0, 0, -d / k) for k, d in zip(known, direct, strict=True)]
             integral = ca.if_else(s.warm_up > 0.5, s._integral_before, ca.vertcat(*starts))
             command = ca.vertcat(*(k[0] * integral[i] + d for i, (k, d) in enumerate(zip(gains, direct, strict=True))))
             return {
@@ -157,13 +158,6 @@ _CUT_OFF = "_command_cut_off"
 
 def _cut_off(plant: Plant) -> Signal:
     return vector(_CUT_OFF, plant.controlled_names)
-
-
-def _quotient(over: Expression, number: float) -> Expression:
-    """A quotient; zero where the number, which may be open, is zero."""
-    if isinstance(number, ca.SX):
-        return ca.if_else(number == 0, 0 * over, over / number)
-    return over / number if number else 0 * over
 
 
 EXAMPLES = (
