@@ -131,7 +131,7 @@ def drawn(seed):
 
 
 def condensed(ocp, first, data):
-    """The horizon as a quadratic program in the inputs, by automatic differentiation: solution of CasADi's active-set method."""
+    """The horizon as a quadratic program in the inputs, by automatic differentiation: solution of OSQP."""
     n, nu = ocp.stages, ocp.input.size
     inputs, s, total, states = ca.MX.sym("U", nu * n), ca.MX(first), 0, []
     for i in range(n):
@@ -144,7 +144,7 @@ def condensed(ocp, first, data):
     rows = ca.vertcat(*states)
     values = ca.Function("f", [inputs], [hessian, slope, ca.jacobian(rows, inputs), rows, total])
     h, g, a, at, _ = (np.asarray(v.full()) for v in values(np.zeros(nu * n)))
-    solver = ca.conic("qp", "qrqp", {"h": ca.DM(h).sparsity(), "a": ca.DM(a).sparsity()}, QUIET)
+    solver = ca.conic("qp", "osqp", {"h": ca.DM(h).sparsity(), "a": ca.DM(a).sparsity()}, EXACT)
     result = solver(
         h=h,
         g=g,
@@ -157,7 +157,8 @@ def condensed(ocp, first, data):
     return solver.stats()["success"], np.asarray(result["x"].full()).ravel(), float(values(result["x"])[4])
 
 
-QUIET = {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False}
+SETTINGS = {"verbose": False, "polish": True, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 200_000}
+EXACT = {"osqp": SETTINGS, "error_on_fail": False}
 
 
 def test_random_linear_plants_have_the_optimum_of_a_quadratic_program():
