@@ -140,7 +140,7 @@ one controller
     RecedingHorizon(...)}
 start outside the limits
   fp.Limits(inputs={"torque": (-15.0, 15.0)}) -> fp.Limits(inputs={"torque": (-15.0, 15.0)}, states={"angle": (0.5, 2.5)})
-    no Do states, rates and paths keep their limits? ... angle by at most 0.5 rad, 25 % of its range
+    no Do states, rates and paths keep their limits? ... A limit of angle is left ... by at most 0.5 rad
 gain of the wrong sign
   gain=-2.6 -> gain=2.6
     no Is the gain admissible? ... Set deformation.gain to -
