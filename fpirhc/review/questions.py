@@ -335,8 +335,9 @@ def gain_by_run(case: Case) -> Fact:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
         best = 1.0
-    lost = ("a push grows" if own.admitted else "it is refused") * (own.error < found.alone)
-    says = lost if not right else "" if not poor else RESERVE if calm else BUSIER
+    lost = "a push grows" if own.admitted else "it is refused"
+    lost += "| the relative error is {error:%}| {error_without:%} without adaptation"
+    says = lost * (own.error < found.alone) if not right else "" if not poor else RESERVE if calm else BUSIER
     if own.turned:  # also where a turned gain works
         return Fact(Verdict.NO, numbers, of, f"{own.turned}.")
     if verdict != Verdict.YES and best in (0.0, 1.0):
