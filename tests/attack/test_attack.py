@@ -1,5 +1,8 @@
 """A machine survives what sensors, actuators, clocks and disks do: a share of the attacks here, all of them with `-m slow`."""
 
+import os
+import subprocess
+import sys
 from contextlib import suppress
 from dataclasses import replace
 
@@ -8,6 +11,7 @@ import pytest
 from helpers.attack.commands import prepared, random_line, raw_end
 from helpers.attack.faults import FAULTS
 from helpers.attack.harness import PROBLEMS, Bench, shipped
+from helpers.machine import needs_compiler
 from helpers.plants import simulated
 
 import fpirhc as fp
@@ -34,6 +38,20 @@ def test_every_fault_of_the_loop(problem):
             bench = Bench(task, controller)
             wrong |= {f"{label}: {fault.name}": bench.wrong(fault) for fault in FAULTS}
     assert {k: v for k, v in wrong.items() if v} == {}
+
+
+@pytest.mark.slow
+@needs_compiler
+def test_compilations_survive_their_kills(tmp_path):
+    """A process is killed while it loads, compiles or runs: the next one has the same numbers."""
+    command, logs = [sys.executable, "-m", "fpirhc", "run", "two_mass", "CTC", "--out", str(tmp_path)], set()
+    for seconds in np.linspace(0.1, 6.0, 12):
+        place = {**os.environ, "FPIRHC_CACHE": str(tmp_path / f"{seconds}")}
+        with suppress(subprocess.TimeoutExpired):
+            subprocess.run(command, env=place, capture_output=True, timeout=seconds)
+        subprocess.run(command, env=place, capture_output=True, check=True)
+        logs.add(fp.load_run(tmp_path / "CTC.npz").log.tobytes())
+    assert len(logs) == 1
 
 
 @pytest.mark.parametrize("flips", [40, pytest.param(400, marks=pytest.mark.slow)])

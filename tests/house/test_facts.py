@@ -23,9 +23,6 @@ LOOKING_AHEAD = {
 FILTER = fp.DisturbanceKalman(drift={"q": 1e-3}, measured={"q": 1e-4, "q'": 1e-4}, noise={"q": 1e-3})
 
 
-# What a user writes
-
-
 @dataclass(frozen=True)
 class Named(Controller):
     """A user's own wrapper, which adds nothing."""
@@ -48,9 +45,6 @@ class Named(Controller):
 def twice(controller: Controller) -> Named:
     """A user's wrapper of a user's wrapper."""
     return Named(Named(controller), label="outer")
-
-
-# Controllers
 
 
 @pytest.mark.parametrize(

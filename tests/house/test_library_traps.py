@@ -1,27 +1,18 @@
 """Traps of the libraries below fpirhc: what they do wrong without saying so, and that a guard here catches it."""
 
 import pickle
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
 import fpirhc as fp
 
-PLANT = fp.Plant(
-    coordinates={"y": "m"},
-    inputs={"u": "N"},
-    parameters={"m": fp.Parameter(approximate=1.0, exact=1.0, unit="kg")},
-    response=lambda q, v, u, p: {"y": (u.u - 0.1 * v.y - 0.1 * q.y) / p.m},
-)
-REST = fp.Trajectory(lambda t: {"y": 0 * t})
-
 
 def test_ipopt_prints_nothing(capfd):
     """Its banner would spoil what --json prints."""
-    cost = fp.Quadratic(states={"y": 1.0, "y'": 0.1}, effort={"u": 0.1})
-    horizon, start = fp.Horizon(5, 0.2), {"y": 2.0, "y'": 1.0}
-    problem = fp.Problem(PLANT, REST, start, period=0.1, duration=0.2, horizon=horizon, cost=cost)
-    fp.simulate(problem, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-3)), seed=0, compiled=False)
+    short = replace(fp.load_problem("two_mass").problem, duration=0.01, measure_from=0.0)
+    fp.simulate(short, fp.RecedingHorizon(fp.Ipopt(tolerance=1e-3)), seed=0, compiled=False)
     assert capfd.readouterr().out == ""
 
 
@@ -35,8 +26,7 @@ def test_a_power_has_no_finite_derivatives_at_its_kink():
 
     assert not np.isfinite(derivatives(ca.sign(e) * ca.fabs(e) ** 1.5)).all()
     slope, curvature = derivatives(fp.signed_power(e, 1.5))
-    assert 0 < slope < 1e-2
-    assert np.isfinite(curvature)
+    assert 0 < slope < 1e-2 > abs(curvature)
 
 
 def test_the_package_is_pickled_by_its_name():
