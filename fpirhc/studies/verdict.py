@@ -274,7 +274,7 @@ FLAGS = (
     Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], 0.2,
          "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
-    Flag(_chatters, 10.0, "the total variation of its command is {value} times that without adaptation: it chatters", True),
+    Flag(_chatters, 10.0, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),

@@ -139,7 +139,7 @@ FLAGS: dict[str, tuple[Facts, Facts, str, str]] = {
     "growth pauses": (*GROWTH(1.0, 3.0, 3.6, 10.8), "better", "none"),
     "growth slows": (*GROWTH(1.0, 4.0, 8.0, 16.0), "better", "none"),
     "limit": (Facts(), Facts(0.1, sends="full", size=0.4), "doubtful", "in 31.4 % of cycles (without it 0 %)"),
-    "chatter": (Facts(), Facts(0.1, sends="zigzag", size=0.0131), "doubtful", "chatters"),
+    "chatter": (Facts(), Facts(0.1, sends="zigzag", size=0.0131), "doubtful", "it chatters, see fpirhc review"),
     "moves once, far": (Facts(size=0.1), Facts(0.1, size=1.2), "better", "variation of its command is 12 times"),
     "moves twice": (Facts(), Facts(0.1, size=2.2), "better", "variation of its command is 2.2 times"),
     "moves a bit more": (Facts(), Facts(0.1, size=1.9), "better", "none"),
