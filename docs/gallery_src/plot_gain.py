@@ -44,7 +44,7 @@ jacobians = jacobians_along(
 )
 spectrum = Spectrum(np.linalg.eigvals(jacobians))
 report = assess_gain(fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), spectrum)
-print(textwrap.fill(f"{report.text}. Admissible: {report.admissible}.", 85))
+print(textwrap.fill(f"{report.text}. It converges for {report.converging}.", 85))
 
 figure, axis = plt.subplots(figsize=(8, 3.4), layout="constrained")
 axis.loglog(-gains, errors, "o-", ms=4)

@@ -177,7 +177,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
         top = max(eigenvalues, key=abs)
         raise NotContractive(
             f"{what} is too large",
-            f"use {interval}, where the iteration converges: the input gain of the plant, over that of the model, is up to "
+            f"use {interval}, where the iteration alone converges: the input gain of the plant, over that of the model, is up to "
             f"{top.real if top.imag == 0 else top:.3g} at the start",
         )
     estimator, of_estimator = problem.sensing.estimator, problem.sensing.delay(problem.plant, problem.period)

@@ -222,7 +222,7 @@ class ContractionReport:
     linear_limit: tuple[float, float]  # interval of the effective gain in which small errors converge
     sector_limit: tuple[float, float]  # interval of the effective gain in which errors of any size converge
     text: str  # the verdict, for a reader
-    admissible: str = ""  # the gains that converge, behind an estimator too; empty where its own does not
+    converging: str = ""  # the gains that converge, behind an estimator too; empty where its own does not
 
 
 def assess_gain(
@@ -230,8 +230,8 @@ def assess_gain(
 ) -> ContractionReport:
     """Return whether a deformation converges on plants with these eigenvalues, with the fault and what would do instead.
 
-    A gain between the sector and the linear limit is no fault. Where the response is late by some cycles, the limits are those
-    without this delay, and the text says so; the admissible gains end at the `largest` one behind it, where that is finite.
+    A gain between the sector and the linear limit is no fault. Where the response is late by some cycles, the factor is that
+    without this delay, and the text says so; the limits end at the `largest` gain behind it, where that is finite.
     """
     gain, (name, value) = deformation.effective_gain(), own_gain(deformation)
     predicted = predicted_factor(spectrum.eigenvalues, gain)
@@ -243,10 +243,11 @@ def assess_gain(
         none = (0.0, 0.0)
         return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error))
     scale, what, fault = value / gain, with_its_gain(deformation), ""
-    ends = [abs(scale) * min(abs(sum(limit)), largest) for limit in (linear, sector)]  # one end of a limit is zero
-    admissible = f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, 0 < |{name}| < {ends[0]:.3g}"
+    near, any_size = ((max(lower, -largest), min(upper, largest)) for lower, upper in (linear, sector))
+    ends = [abs(scale * sum(limit)) for limit in (near, any_size)]  # one end of a limit is zero
+    converging = f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, 0 < |{name}| < {ends[0]:.3g}"
     if not np.isclose(ends[0], ends[1]):
-        admissible += f", and below {ends[1]:.3g} to converge from errors of any size"
+        converging += f", and below {ends[1]:.3g} to converge from errors of any size"
     behind = f", without the response's delay of {late:.4g} cycles" if late else ""
     text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle{behind}"
     if not sector[0] < gain < sector[1]:
@@ -256,8 +257,8 @@ def assess_gain(
     elif abs(gain) >= abs(sum(linear)):
         fault = f"{what} is too large: errors grow by the factor {predicted:.3g} per cycle"
     if fault:
-        text, admissible = f"{fault}; use {admissible}{behind if largest == np.inf else ''}", ""
-    return ContractionReport(predicted, gain, (name, scale), linear, sector, text, admissible)
+        text, converging = f"{fault}; use {converging}{behind if largest == np.inf else ''}", ""
+    return ContractionReport(predicted, gain, (name, scale), near, any_size, text, converging)
 
 
 _WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the transient of a useful gain is shorter

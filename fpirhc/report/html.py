@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
+from fpirhc.contraction.spectrum import predicted_factor
 from fpirhc.errors import FpirhcError, OutputError
 from fpirhc.simulation.drawing import (
     BANDS,
@@ -352,21 +353,25 @@ def _draw_factor(
     axis: Axes, gain: str, scale: float, entries: Sequence[tuple[str, Contraction]], colours: dict[str, str]
 ) -> None:
     first = entries[0][1]
-    limit = max(first.report.linear_limit, key=abs) or 1.0
+    limit = max((end for _, one in entries for end in one.report.linear_limit), key=abs) or 1.0
     gains = np.linspace(0, _BEYOND * limit, 300)
     factors = np.abs(1 - gains[:, None] * first.spectrum.eigenvalues.ravel()).max(axis=1)
     axis.plot(scale * gains, factors, color="#444444", lw=1.2)
     axis.axhline(1.0, color="#aa0000", lw=0.8)
-    axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit: small errors")
-    sectors: dict[float, str] = {}
+    if predicted_factor(first.spectrum.eigenvalues, limit) > 0.999:
+        axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit: small errors")
+    ends: dict[tuple[float, str], str] = {}
     for name, one in entries:
         own, colour = scale * one.report.effective_gain, colours[name]
         axis.plot(own, one.report.predicted, "o", ms=9, mfc="none", mew=1.5, color=colour, label=literal(name))
         axis.plot(own, one.measured, "x", ms=7, mew=1.5, color=colour, zorder=5)
-        sectors.setdefault(round(float(max(one.report.sector_limit, key=abs)), 3), colour)
-    for sector, colour in sectors.items():
-        if sector and abs(sector) < 0.999 * abs(limit):
-            axis.axvline(scale * sector, color=colour, lw=1.6, ls=":", label="sector limit: errors of any size")
+        linear, sector = (max(ends_of, key=abs) for ends_of in (one.report.linear_limit, one.report.sector_limit))
+        if linear and predicted_factor(one.spectrum.eigenvalues, linear) < 0.999:
+            ends.setdefault((round(linear, 3), "limit with the response's delay"), colour)
+        if sector and abs(sector) < 0.999 * abs(linear):
+            ends.setdefault((round(sector, 3), "sector limit: errors of any size"), colour)
+    for (end, what), colour in ends.items():
+        axis.axvline(scale * end, color=colour, lw=1.6, ls=":", label=what)
     axis.set_ylim(0, 1.6)
     axis.locator_params(axis="x", nbins=7)
     axis.ticklabel_format(axis="x", scilimits=(-3, 4))

@@ -76,14 +76,15 @@ class Contraction:
     spectrum: Spectrum
 
     def said(self, run: Run, lost: Collection[str]) -> str:
-        """What it leaves of an error, what is admissible, and the rms distance of every response from what was desired."""
+        """What it leaves of an error, which gains converge, and the rms distance of every response from what was desired."""
         near = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1]) ** 2, axis=0))
-        units = (with_space(run.unit(f"desired.{n}")) for n in run.layout["desired"].elements)
-        each = (f"{n} {written_out(v)}{u}" for n, v, u in zip(run.layout["desired"].elements, near, units, strict=True))
+        named = zip(run.layout["desired"].elements, near, strict=True)
+        each = (f"{n} {written_out(v)}{with_space(run.unit(f'desired.{n}'))}" for n, v in named)
         one, factor = self.report, f"Measured factor {written_out(self.measured)}"
-        if one.admissible:  # a fit is right within two hundredths
+        if one.converging:  # a fit is right within two hundredths
             factor += ": the bound does not hold in this run" * (self.measured > one.predicted + 0.02)
-            factor = factor if run.controller in lost else f"Admissible: {one.admissible}. {factor}"
+            alone = f"The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review. "
+            factor = alone * (run.controller not in lost) + factor
         return f"{one.text}. {factor}; realised - desired, rms: {', '.join(each)}."
 
 

@@ -24,7 +24,7 @@ def affine(gain, around=lambda m: m):
 @pytest.mark.parametrize("gain", [-1.01 * LARGEST, -5.0, -1e300])
 def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
     """Built in, as a live setting of a run, of a stepper, and during a run: one message with the limit and a remedy."""
-    message = r"too large; use 0 < \|gain\| < 2.67, where the iteration converges"
+    message = r"too large; use 0 < \|gain\| < 2.67, where the iteration alone converges"
     path = "deformation.gain"
     for make in (fp.Stepper, fp.simulator):
         with pytest.raises(NotContractive, match=message):
@@ -37,7 +37,7 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
     stepper = fp.Stepper(brief(), affine(-0.5), compiled=False, live=[path])
     assert not stepper.change({path: gain})
     assert (stepper.refused, stepper.numbers[path]) == (1, -0.5)
-    assert "use 0 < |gain| < 2.67, where the iteration converges" in stepper.why_refused
+    assert "use 0 < |gain| < 2.67, where the iteration alone converges" in stepper.why_refused
 
 
 @pytest.mark.parametrize("gain", [-0.99 * LARGEST, -0.1])
