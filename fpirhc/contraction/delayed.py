@@ -186,7 +186,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     # These remedies stay beside an advice on the gain, because all but the first change something else.
     raise NotContractive(
         f"{what}: the response comes {delay:.4g} cycles late ({estimator if delay == of_estimator else apart}), so the iteration "
-        f"does not converge with this {name}; what helps: {', '.join([*remedies, 'a shorter window or time constant'])}"
+        f"alone does not converge with this {name}; it does with: {', '.join([*remedies, 'a shorter window or time constant'])}"
     )
 
 

@@ -249,7 +249,7 @@ def test_delay_that_makes_the_loop_unstable_is_refused_with_remedies_that_are_ac
     limit = 0.7 * limit_of(WINDOW.estimator.weights(2, 1e-3), 0.0)
     with pytest.raises(NotContractive) as refused:
         run(problem, fp.ComputedTorque(tracking, wild))
-    for part in ("14.5 cycles late", f"0 < |gain| < {2 * limit:.3g}", "Paired(map, cycles=14.5)", "shorter window"):
+    for part in ("14.5 cycles", f"with: 0 < |gain| < {2 * limit:.3g}", "Paired(map, cycles=14.5)", "shorter window"):
         assert part in str(refused.value)
     shorter = replace(problem, sensing=fp.Sensing(estimator=fp.SavitzkyGolay(window=5, degree=2)))
     paired = fp.Paired(wild, cycles=problem.response_delay)
