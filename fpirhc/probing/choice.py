@@ -52,9 +52,9 @@ class Choice:
 
     def __init__(
         self, problem: Problem, bare: Controller, estimates: Estimates, noise: Mapping[str, float],
-        chatter: Mapping[str, float], progress: Progress,
+        chatter: Mapping[str, float], progress: Progress, own: Controller,
     ) -> None:  # fmt: skip
-        self._given, self._estimates, self._progress = problem, estimates, progress
+        self._given, self._estimates, self._progress, self._own = problem, estimates, progress, own.deformation
         moved = estimates.drift, noise
         self.problem = estimated_problem(problem, estimates.gains, *estimates.likely, *moved)
         known = estimates.ends.items()
@@ -68,8 +68,7 @@ class Choice:
     def _forms(self, share: float, pole: float) -> dict[str, Deformation]:
         """The forms by name, with a share of the deadbeat gain: 1 / the largest eigenvalue of Lambda, or its inverse."""
         known, age = self._estimates, self._given.sensing.delay(self._given.plant, self._given.period)
-        low, value, high = known.dead
-        likely = np.where(high > low, np.ceil((low + high) / 2), value)
+        low, likely, high = known.dead[0], known.counted, known.dead[2]
         late, cycles, lag = bool(likely.any()), _one(likely), _one(known.lag[1])
         wrong = float(max((high - likely).max(), (likely - low).max(), 1.0))
         leak = _rounded(default_pole(min(max(1 / known.largest, 1.0), 1.99), wrong)) if late else None
@@ -115,6 +114,9 @@ class Choice:
     def on_plant(self, seed: int) -> None:
         """Run the candidates, each with other gains as long as they help; the best one has to bear 1.4 times its gain."""
         starts = list(self.candidates)
+        if self._own.adapts:
+            self.candidates[own := f"{type(self._own).__name__}, as it is"] = self._own
+            self._tried(own, 0, math.inf, seed)
         for done, form in enumerate(starts, 1):
             error, place = self._tried(form, 0, math.inf, seed), 0
             for step, share in ((1, _CLEARLY), (-1, math.inf)):
@@ -127,6 +129,8 @@ class Choice:
             larger, limit = _times(self.candidates[name], MARGIN), _LARGER * self.results[name].error
             more = [self._real.of(larger, other, loud=True) for other in range(seed, seed + _SEEDS)]
             if all(one.passes and one.error <= limit for one in more):
+                if abs(self._places[name][1]) == _FARTHEST:
+                    self.notes.append(f"{name} is at the edge of what was tried: a gain beyond it may do better")
                 return
             self.notes.append(f"{name} is not kept: on the plant it does not bear {MARGIN:g} times its gain")
             form, at = self._places[name]
@@ -143,13 +147,12 @@ class Choice:
 
     def _tried(self, form: str, place: float, least: float, seed: int) -> float:
         """The error with another gain; infinity where it does not pass, or is not below `least`, so that it does not count."""
-        one = _times(self.candidates[form], _STEP**place)
+        one = _times(self.candidates[form], _STEP**place) if place else self.candidates[form]
         outcome = self._real.of(one, seed)
         name = f"{form}, {_STEP**place:.3g} times its gain" if place else form
-        if outcome.error < least:
+        if counts := outcome.error < least:
             self._places[name], self.candidates[name], self.results[name] = (form, place), one, outcome
-            return outcome.error if outcome.passes else math.inf
-        return math.inf
+        return outcome.error if counts and outcome.passes else math.inf
 
 
 class Trials:

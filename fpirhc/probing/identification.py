@@ -213,6 +213,8 @@ class Estimates:
             np.array([(one.low, one.value, one.high) for one in some]).T
             for some in zip(*((one.dead_time, one.lag) for one in channels), strict=True)
         )
+        ends = np.ceil((self.dead[0] + self.dead[2]) / 2)
+        self.counted = np.where(self.dead[2] > self.dead[0], ends, self.dead[1])  # what forms count, cycles
         self.drift = np.column_stack([one.drift for one in channels])  # by cycle, shape (cycles, n)
         self.likely = tuple(self.dead[1].tolist()), tuple(self.lag[1].tolist())  # dead times and lags
         # Dead times, lags and gains of plants that the likelihood allows: of the best, and at both ends of dead times and lags.

@@ -99,19 +99,18 @@ def probe(
         if recording is not None and given is not None:
             wrong = f"{setting} is of an excitation, and a recording has been excited"
             raise InvalidValue(f"{wrong}: leave one of them out")
-    bare, listened = without_deformation(resolved(problem, controller)), recording is None
+    bare, listened = without_deformation(own := resolved(problem, controller)), recording is None
     asked = CYCLES if cycles is None else cycles, amplitudes, seed
     record = excited(problem, bare, *asked) if listened else read_recording(Path(str(recording)), problem)
-    columns = record.measured, record.modelled, problem.period, record.usable, record.differences
-    estimates = Estimates(identify(*columns), seed)
+    channels = identify(record.measured, record.modelled, problem.period, record.usable, record.differences)
+    estimates = Estimates(channels, seed)
     trying, notes = trials and listened, [f"the run ended early: {record.stop}"] if record.stop else []
-    notes += _cautions(problem, record, estimates)
     choice, name, why = None, None, estimates.refused or ("" if trying else estimates.unbounded)
     if not why:
         notes += filter(None, [estimates.unbounded])
         noise = dict(zip(record.shown, (one.noise for one in estimates.channels), strict=True))
         try:
-            choice = Choice(problem, bare, estimates, noise, budget or {}, progress)
+            choice = Choice(problem, bare, estimates, noise, budget or {}, progress, own)
         except FpirhcError as error:
             why = f"the plant as estimated cannot be run ({error})"
         else:
@@ -126,14 +125,14 @@ def probe(
     elif choice and choice.candidates:
         name = next(iter(choice.candidates))
         why = f"{name}, not tried on the plant"
+    chosen = choice.candidates[name] if choice and name else None
     by = lambda names, what: {n: getattr(one, what) for n, one in zip(names, estimates.channels, strict=True)}  # noqa: E731
     return Probe(
         gain={name: dict(zip(names, gains, strict=True)) for name, gains in by(names, "gains").items()},
         dead_time=by(inputs, "dead_time"), lag=by(inputs, "lag"), noise=by(names, "noise"), drift=by(names, "drifting"),
-        deformation=choice.candidates[name] if choice and name else None, why=why,
-        trials=choice.results if choice else {}, candidates=choice.candidates if choice else {},
-        problem=choice.problem if choice else None, notes=tuple(notes),
-        facts=tuple(_facts(problem, record.shown, estimates.channels)),
+        deformation=chosen, why=why, trials=choice.results if choice else {},
+        candidates=choice.candidates if choice else {}, problem=choice.problem if choice else None,
+        notes=(*notes, *_cautions(problem, record, estimates, chosen)), facts=tuple(_facts(problem, record, estimates.channels)),
     )  # fmt: skip
 
 
@@ -144,7 +143,7 @@ def runs_made(problem: Problem, *, trials: bool, **settings: Any) -> str:
     return "no run is made" if settings["recording"] else f"{count} to excite the plant{after}"
 
 
-def _facts(problem: Problem, shown: Sequence[str], channels: Sequence[Channel]) -> Iterator[tuple[str, str]]:
+def _facts(problem: Problem, record: Record, channels: Sequence[Channel]) -> Iterator[tuple[str, str]]:
     plant, time, units = problem.plant, problem.time_unit, followed_units(problem.plant)
     names = plant.controlled_names
     for row, one in zip(names, channels, strict=True):
@@ -153,14 +152,15 @@ def _facts(problem: Problem, shown: Sequence[str], channels: Sequence[Channel]) 
     by_input = list(zip(plant.inputs, channels, strict=True))
     yield from ((f"dead time of {name}, cycles", _interval(one.dead_time)) for name, one in by_input)
     yield from ((f"lag of {name}, {time}", _interval(one.lag)) for name, one in by_input)
-    for name, seen, one in zip(names, shown, channels, strict=True):
+    for name, seen, one in zip(names, record.shown, channels, strict=True):
         size = number(one.noise) if one.noise else "not resolved"
         yield f"noise of {seen}, {derivative_unit(units[name], seen.count(chr(39)), time)}", size
-    for name, unit, one in zip(names, plant.response_signal("realised").entry_units, channels, strict=True):
-        yield f"drift of {name}, {unit}/{time}^0.5", number(one.drifting)
+    for k, (name, unit) in enumerate(zip(names, plant.response_signal("realised").entry_units, strict=True)):
+        yield from ((f"amplitude of {name}, {unit}", number(size)) for size in record.amplitude[k : k + 1])
+        yield f"drift of {name}, {unit}/{time}^0.5", number(channels[k].drifting)
 
 
-def _cautions(problem: Problem, record: Record, estimates: Estimates) -> Iterator[str]:
+def _cautions(problem: Problem, record: Record, estimates: Estimates, chosen: Deformation | None) -> Iterator[str]:
     """Sentences on how far the estimates are to be trusted."""
     own = problem.sensing.delay(problem.plant, problem.period)
     hidden = [name for name in record.shown if name not in problem.sensing.measures(problem.plant)]
@@ -179,8 +179,11 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates) -> Iterato
             yield f"{u} is at a limit in {100 * limited:.0f} % of the cycles, which tells little: excite less, or widen its limits"
         around, known = problem.dead_time.measurement, problem.dead_time.inputs.get(u, 0.0)
         if problem.foreign and not hidden and one.dead_time.low - (around + known) / problem.period > 1 - 1e-9:
-            time = f"dead_time=fp.DeadTime(inputs={{'{u}': {one.dead_time.value * problem.period - around:.6g}}})"
-            yield f"state {time} in the problem too: predictions need it, and a review fails the deformation without it"
+            time = f"dead_time=fp.DeadTime(inputs={{'{u}': {estimates.counted[row] * problem.period - around:.6g}}})"
+            counts = chosen is None or np.any(chosen.form.cycles)
+            yield f"state {time} in the problem too: predictions need it, and a review may fail without it" if counts else (
+                f"do not state {time} in the problem: this form counts none, and would harm a model that is as late. Where plans "
+                "predict, state it, take ModelReferenced without cycles=0, and compare")  # fmt: skip
 
 
 def _by_name(what: str, setting: Any, names: Sequence[str], least: float, words: str) -> dict[str, float] | None:

@@ -65,6 +65,7 @@ class Record:
     differences: tuple[int, ...]  # how often
     limited: np.ndarray  # share of the cycles in which each command stands at a limit
     stop: str  # why the run ended early; empty where it did not
+    amplitude: tuple[float, ...] = ()  # of the excitation of every response; empty: a recording
 
 
 def _record(
@@ -127,7 +128,8 @@ def excited(
             measures = problem.sensing.measures(plant)
             seen = _preferred(dict(zip(measures, raw.T[-len(measures) :], strict=True)), seen)
         seen = {name: np.where(np.isnan(raw).any(axis=1), np.nan, column) for name, column in seen.items()}
-        return run, _record(problem, "probe", run.time, run["state"], run["command"], seen, run.stop or "")
+        record = _record(problem, "probe", run.time, run["state"], run["command"], seen, run.stop or "")
+        return run, replace(record, amplitude=amplitude)
 
     names = problem.plant.controlled_names
     if amplitude is not None:

@@ -103,12 +103,11 @@ def test_an_excited_run_finds_what_suits_the_plant():
     gain, dead, lag = 1.6, 2, 0.03
     problem = replace(body_problem(gain, dead, lag, 0.1), duration=1.5)
     assert isinstance(problem.reality, fp.ExternalPlant)
-    late = {"reality": replace(problem.reality, lag={"u": lag}), "dead_time": fp.DeadTime(inputs={"u": dead * PERIOD})}
-    left: dict[str, int] = {}
-    found = fp.probe(
-        replace(problem, **late), RHC, cycles=150, progress=lambda what, n, of: left.update({what: of - n})
-    )
-    assert set(left.values()) == {0}
+    late, lagging = fp.DeadTime(inputs={"u": dead * PERIOD}), replace(problem.reality, lag={"u": lag})
+    stated = replace(problem, reality=lagging, dead_time=late)
+    adaptive, left = replace(RHC, deformation=fp.ModelReferenced(fp.Affine(gain=-0.2))), dict[str, int]()
+    found = fp.probe(stated, adaptive, cycles=150, progress=lambda what, n, of: left.update({what: of - n}))
+    assert (set(left.values()), "ModelReferenced, as it is" in found.trials) == ({0}, True)
     assert found.dead_time["u"].value == dead
     assert found.gain["q"]["q"].low <= gain <= found.gain["q"]["q"].high
     assert found.lag["u"].low <= lag <= found.lag["u"].high
@@ -117,11 +116,12 @@ def test_an_excited_run_finds_what_suits_the_plant():
     real = replace(problem, duration=found.problem.duration, measure_from=found.problem.measure_from)
     predicted, true = (error(one, fp.Identity()) for one in (found.problem, real))
     assert predicted == pytest.approx(true, rel=0.1)
-    assert found.deformation is not None
     assert error(problem, found.deformation) < 0.6 * error(problem, fp.Identity())
     assert all(name.startswith(type(one).__name__) for name, one in found.candidates.items())
-    kept = [one for name, one in found.trials.items() if found.candidates[name] == found.deformation]
-    assert all(one.worst <= 1.03 for one in kept)
+    assert all(t.worst <= 1.03 for n, t in found.trials.items() if found.candidates[n] == found.deformation)
+    unstated = fp.probe(problem, RHC, cycles=150, amplitude=2.0, trials=False)
+    assert dict(unstated.facts)["amplitude of q, m/s^2"] == "2"
+    assert ("cycles=0" in unstated.lines) == ("do not state dead_time" in " ".join(unstated.notes))
 
 
 def error(problem: fp.Problem, deformation: Deformation | None) -> float:
