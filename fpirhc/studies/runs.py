@@ -209,11 +209,11 @@ def _answers(
 ) -> Iterator[Row]:
     metrics, compiled = how
     if joblib.effective_n_jobs(processes) == 1 or sum(len(some) for _, some in jobs) <= FEW:
-        for name, group in _by_name(jobs).items():
-            runner = Runner(task, name, metrics, compiled=compiled)
-            yield from runner.rows(every[k] for k in group)
+        for name in dict.fromkeys(name for name, _ in jobs):
+            own = [k for n, some in jobs if n == name for k in some]
+            yield from Runner(task, name, metrics, compiled=compiled).rows(every[k] for k in own)
         return
-    path, told, names = str(task.path.resolve()), _told(task), tuple(one.name for one in metrics)
+    path, told, names = str(task.path.resolve()), _told(task), {one.name for one in metrics}
     _require_same(load_problem(path), told)
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered", batch_size=1)
     answers = work(joblib.delayed(_remote)(path, told, variants, n, some, compiled, names) for n, some in jobs)
@@ -228,13 +228,6 @@ def _answers(
     finally:
         with contextlib.suppress(Exception):
             answers.close()
-
-
-def _by_name(jobs: Sequence[tuple[str, tuple[int, ...]]]) -> dict[str, list[int]]:
-    found: dict[str, list[int]] = {}
-    for name, some in jobs:
-        found.setdefault(name, []).extend(some)
-    return found
 
 
 def _deaths() -> tuple[type[BaseException], ...]:
@@ -260,13 +253,7 @@ _OWN = threading.local()  # a worker of Dask has threads, and a loop serves one
 
 
 def _remote(
-    path: str,
-    told: str,
-    variants: Variants,
-    name: str,
-    some: Sequence[int],
-    compiled: bool | None,
-    names: tuple[str, ...],
+    path: str, told: str, variants: Variants, name: str, some: Sequence[int], compiled: bool | None, names: set[str]
 ) -> list[Row]:
     """The rows of some variants, in a process that keeps the loops of one study."""
     with contextlib.suppress(ValueError):  # a thread

@@ -14,17 +14,17 @@ import numpy as np
 import pandas as pd
 
 from fpirhc.fields.checked import checked_call
-from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import CasesOf, Draws, Variants
-from fpirhc.studies.verdict import Objective, Outcome, objective
+from fpirhc.studies.verdict import CHATTERS, STILL, TO_AND_FRO, Objective, Outcome, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
 
 _TAIL, _MOVES = 0.025, "total_variation."  # on either side of an interval; the metric of movement
 _ABREAST, _EVEN = 2, 1e-6  # panels of a picture; by how much equal steps of an axis differ
-_CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than"}
+_CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than", Outcome.DOUBTFUL: "doubtfully beats"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,6 +39,7 @@ class VariantStudy(Study):
         groups: the same of every group of cases.
         figure: the number that is judged.
         variants: of the study.
+        chatter: of every controller whose command chatters somewhere, by variant how many times its partner's movement it has.
     """
 
     table: pd.DataFrame
@@ -46,6 +47,7 @@ class VariantStudy(Study):
     groups: dict[str, pd.DataFrame]
     figure: Objective
     variants: Variants
+    chatter: dict[str, dict[str, float]]
 
     @property
     def count(self) -> int:
@@ -56,12 +58,11 @@ class VariantStudy(Study):
     def view(self) -> View:
         title = f"{self.problem}: {self.count} variants"
         tables = [self._shown(name, some) for name, some in {title: self.summary, **self.groups}.items()]
-        facts = {
-            "problem": self.problem,
-            "variants": str(self.variants),
-            "metric": self.figure.column,
+        facts: Any = {"problem": self.problem, "variants": str(self.variants), "metric": self.figure.column}
+        facts |= {
             "summary": self.summary.reset_index().to_dict("records"),
             "groups": {g: some.reset_index().to_dict("records") for g, some in self.groups.items()},
+            "chatter": self.chatter,
             "versions": self.versions,
         }
         shares = "" if self.figure.metric else " Errors are rms, in % of the range of the reference."
@@ -121,9 +122,23 @@ def study(
     table = run_variants(task, variants, controllers=list(chosen), metrics=own, keep=keep, **how)
     named = table.loc[table.group != ""]
     groups = {str(g): summarised(some, aim) for g, some in named.groupby("group", sort=False)}
-    facts = circumstances(task, chosen, command, begin)
+    facts = {**circumstances(task, chosen, command, begin), "chatter": _chatter(table, task)}
     summary = summarised(table, aim)
     return VariantStudy(table=table, summary=summary, groups=groups, figure=aim, variants=variants, **facts)
+
+
+def _chatter(table: pd.DataFrame, task: Task) -> dict[str, dict[str, float]]:
+    """How many times as much as its partner a controller moves, by variant, where its command goes to and fro."""
+    good: Any = {(r["controller"], r["variant"]): r for r in table.to_dict("records") if r["outcome"] == "finished"}
+    pairs, found = {name: pair_of(task.controllers, name) for name, _ in good}, dict[str, dict[str, float]]()
+    for (name, variant), own in good.items():
+        plain = good.get((pairs[name], variant))
+        for column in map(str, table.filter(like=_MOVES)) if plain else ():
+            moved, size = own[column], own[column.replace(_MOVES, "effort.")]
+            before, time = max(plain[column], STILL * size), task.problem.duration - task.problem.measure_from
+            if moved > CHATTERS * before and moved * time >= TO_AND_FRO * size:
+                found.setdefault(name, {})[variant] = moved / before
+    return found
 
 
 def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
@@ -192,7 +207,8 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     for row in _rows(summary.iloc[1:]):
         share = f"{than} in {row.better} of {row.variants}.{''.join(_moved(result, row.controller))}"
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
-        clear = Outcome.BETTER if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
+        better = Outcome.DOUBTFUL if row.controller in result.chatter else Outcome.BETTER
+        clear = better if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
         few = math.isnan(row.low)  # for an interval
         said = "against" if few else _CLEAR.get(clear, "is not clearly different from")
         yield f"{row.controller} {said} {summary.index[0]} by {aim.column}: {share}", None if few else clear
@@ -216,11 +232,14 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
 
 
 def _moved(result: VariantStudy, name: str) -> Iterator[str]:
-    """What a controller pays: the inputs that move more than twice as much as with the first controller."""
+    """What a controller pays: the inputs that move more than twice as much as with the first controller; where they chatter."""
     for column, moved in result.summary.filter(like=_MOVES).items():
         if moved[name] > 2 * moved.iloc[0]:
             what, unit = str(column).removeprefix(_MOVES), result.table.attrs["units"].get(column, "1")
             yield f" Total variation of {what} {written_out(moved[name])} against {written_out(moved.iloc[0])} {unit}."
+    if chatter := sorted(result.chatter.get(name, {}).items(), key=lambda one: -one[1]):
+        which = f"{', '.join(variant for variant, _ in chatter[:4])}{', ...' * (len(chatter) > 4)}"
+        yield f" It chatters in {len(chatter)} ({which}): total variation up to {written_out(chatter[0][1])} times its partner's."
 
 
 def _rows(frame: pd.DataFrame) -> Iterator[Any]:

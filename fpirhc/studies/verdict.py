@@ -141,7 +141,8 @@ class Finding:
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
-_STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
+STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
+CHATTERS, TO_AND_FRO = 10.0, 10  # times the total variation of the partner; times its own size
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
 _SAMPLES = 2000
 
@@ -233,7 +234,7 @@ def _moved(pair: Pair) -> dict[str, float]:
     """How many times as much each input moves; what stands still counts as moving by a millionth of its size."""
     before, after = (e.metrics.total_variation for e in (pair.plain, pair.adaptive))
     size = pair.adaptive.metrics["effort"]
-    return {n: v / max(before[n], _STILL * size[n]) for n, v in after.items() if v > 0}
+    return {n: v / max(before[n], STILL * size[n]) for n, v in after.items() if v > 0}
 
 
 def _moves(pair: Pair) -> float:
@@ -243,7 +244,7 @@ def _moves(pair: Pair) -> float:
 def _chatters(pair: Pair) -> float:
     """The same of inputs that move many times their own span: a command that settles once moves by its span."""
     moved, run = _moved(pair), pair.adaptive.run
-    back_and_forth = {n for n in moved if np.abs(np.diff(c := run[f"command.{n}"])).sum() >= 10 * np.ptp(c)}
+    back_and_forth = {n for n in moved if np.abs(np.diff(c := run[f"command.{n}"])).sum() >= TO_AND_FRO * np.ptp(c)}
     return max((moved[n] for n in back_and_forth), default=math.nan)
 
 
@@ -274,7 +275,7 @@ FLAGS = (
     Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], 0.2,
          "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
-    Flag(_chatters, 10.0, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
+    Flag(_chatters, CHATTERS, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),

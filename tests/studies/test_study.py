@@ -213,18 +213,9 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a field that is misspelt": (of_case({"dead_tme.measurement": 0.1}), r"'dead_tme.*Did you mean 'dead_time'\?"),
     "outside its bounds": (of_case({"exact.b": -70.0}), r"'exact\.b': expected 0\.5 to 2\.4 1/kg, got -70"),
     "no number": (of_case({"exact.b": "1.2"}), r"'exact\.b': expected a finite number, got the text '1\.2'"),
-    "a misspelt metric": (
-        lambda t: fp.study(t, fp.Draws(1), metric="rms_eror.y", compiled=False),
-        "Did you mean 'rms_error.y'",
-    ),
-    "a metric without a better": (
-        lambda t: fp.study(t, fp.Draws(1), metric="effort.u", compiled=False),
-        "no better direction",
-    ),
-    "a metric of plans": (
-        lambda t: fp.study(t, fp.Draws(1), metric="cost.total", compiled=False),
-        r"needs Problem\(horizon=",
-    ),
+    "a misspelt metric": (lambda t: rows(t, fp.Draws(1), metric="rms_eror.y"), "Did you mean 'rms_error.y'"),
+    "a metric without a better": (lambda t: rows(t, fp.Draws(1), metric="effort.u"), "no better direction"),
+    "a metric of plans": (lambda t: rows(t, fp.Draws(1), metric="cost.total"), r"needs Problem\(horizon="),
 }
 
 
@@ -275,6 +266,20 @@ def test_a_summary_is_that_of_the_rows(task):
     assert few.view.sentences[0] == ("CTC against CTC+FPI by error: smaller in 0 of 4.", None)  # it moves less
     headed = fp.study(replace(task, headline=("CTC+FPI", "CTC")), fp.Draws(1), compiled=False)
     assert [*headed.summary.index][:2] == turned
+
+
+def test_chatter_in_some_plants_makes_a_study_doubtful(task):
+    """Near the limit of its gain the command goes to and fro in some plants: less error in all of them is no success yet."""
+    eager = fp.with_settings(task.controllers["CTC+FPI"], {"deformation.gain": -2.4})
+    own = {"CTC": task.controllers["CTC"], "CTC+FPI": eager}
+    problem = replace(task.problem, disturbances={"u": fp.Noise(1e-3)})
+    found = fp.study(replace(task, problem=problem, controllers=own), fp.Draws(12, 20.0, 5), compiled=False)
+    moved = found.table.pivot(index="variant", columns="controller", values="total_variation.u")
+    times = moved["CTC+FPI"] / moved["CTC"]
+    assert found.chatter == {"CTC+FPI": times[times > 10].to_dict()}
+    [(text, outcome), *_] = found.view.sentences
+    assert (str(outcome), found.summary.better["CTC+FPI"]) == ("doubtful", 12)
+    assert f"It chatters in {(times > 10).sum()} ({times.idxmax()}, " in text
 
 
 def test_failures_are_counted_and_worse_than_any_error(task):
