@@ -156,8 +156,8 @@ class Limits(Study):
     """The result of `limits`.
 
     Args:
-        table: a row per controller and quantity: unit, holds (NaN where the problem as it stands fails), fails (infinite where
-            nothing does), and why.
+        table: a row per controller and quantity: unit, holds (NaN where the problem as it stands fails), error (largest relative
+            one there), fails (infinite where nothing does), and why.
         fails: relative error from which a run has failed.
     """
 
@@ -166,7 +166,7 @@ class Limits(Study):
 
     @property
     def view(self) -> View:
-        heads = ("controller", "what grows", "holds at", "fails at", "why")
+        heads = ("controller", "what grows", "holds at", "error there", "fails at", "why")
         shown = Table(f"{self.problem}: where controllers fail", [Column(c, left=c == "why") for c in heads], names=2)
         rows: Iterator[Any] = self.table.itertuples()
         for row in rows:
@@ -177,14 +177,15 @@ class Limits(Study):
                 "as it stands" if math.isnan(row.holds) and row.unit else "none tried" if row.fails > 1e300 else fails
             )
             what = f"{row.quantity} [{'% ' if share else ''}{row.unit}]" if row.unit else row.quantity
-            shown.add([row.controller, what, holds, fails, row.why])
+            there = "" if math.isnan(row.error) else in_percent(row.error)
+            shown.add([row.controller, what, holds, there, fails, row.why])
         tried = self.table.loc[self.table.unit != ""]
         said = [_most(str(name), some) for name, some in tried.groupby("quantity", sort=False)]
         grows = " ".join(f"{name.capitalize()}: {_GROWS[name]}." for name in dict.fromkeys(self.table.quantity))
         about = (
             f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
-            "reference's range."
+            "reference's range. What holds may have a large error."
         )
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
         return View(self, [(text, None) for text in said if text], about, (shown,), facts)
@@ -271,12 +272,13 @@ def _why(row: Row, fails: float) -> str:
 
 
 def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float) -> Mapping[str, object]:
-    reasons: dict[float, str] = {}
+    reasons, errors = dict[float, str](), dict[float, float]()
 
     def failed(value: float) -> bool:
         if value not in reasons:
             try:
-                rows = runner.rows(quantity.at(value))
+                rows = [*runner.rows(quantity.at(value))]
+                errors[value] = max(row["error"] for row in rows)
                 reasons[value] = next(filter(None, map(partial(_why, fails=fails), rows)), "")
             except FpirhcError as error:
                 if value <= quantity.first:
@@ -289,8 +291,9 @@ def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float)
         start = failed(quantity.start)
         holds, ends = (math.nan, quantity.start) if start else bracket(failed, quantity)
     except FpirhcError as error:
-        return {"unit": "", "holds": math.nan, "fails": math.nan, "why": f"not tried: {error}"}
-    return {"unit": quantity.unit, "holds": holds, "fails": ends, "why": reasons.get(ends, "")}
+        return {"unit": "", "holds": math.nan, "error": math.nan, "fails": math.nan, "why": f"not tried: {error}"}
+    largest, why = errors.get(holds, math.nan), reasons.get(ends, "")
+    return {"unit": quantity.unit, "holds": holds, "error": largest, "fails": ends, "why": why}
 
 
 def bracket(failed: Callable[[float], bool], of: Quantity) -> tuple[float, float]:

@@ -88,7 +88,9 @@ def test_noise_is_limited_by_its_variance():
     """e+ = e - T rate (e + w): Var e = T rate s^2 / (2 - T rate), and the error is 0.1 of the range at s = 0.3 of it."""
     slow = {"period": 0.1, "duration": 1000.0, "measure_from": 20.0}
     problem = pump(reference=fp.Trajectory(lambda t: {"y": 0.5 * ca.sin(0.1 * t)}), start={"y": 0.0}, **slow)
-    assert near(limit_of("noise", problem, fails=0.1), 0.1 * math.sqrt(2 / (0.1 * RATE) - 1), 0.05)
+    one = limit_of("noise", problem, fails=0.1)
+    assert near(one, 0.1 * math.sqrt(2 / (0.1 * RATE) - 1), 0.05)
+    assert 0.09 < one.error <= 0.1  # where it holds
 
 
 def test_lost_samples_are_limited_by_the_held_command():
@@ -120,13 +122,8 @@ def test_a_controller_that_fails_as_the_problem_stands():
 
 def test_a_state_that_leaves_its_limits_has_failed():
     """The error is small, and y passes the limit of 0.9 m that its reference keeps. Beside a limit of 0 its own size counts."""
-    problem = pump(
-        reference=fp.Trajectory(lambda t: {"y": 0.8 * ca.sin(t)}),
-        start={"y": 0.0},
-        limits=fp.Limits(states={"y": (-0.9, 0.9)}),
-        duration=40.0,
-        measure_from=0.0,
-    )
+    wave, limits = fp.Trajectory(lambda t: {"y": 0.8 * ca.sin(t)}), fp.Limits(states={"y": (-0.9, 0.9)})
+    problem = pump(reference=wave, start={"y": 0.0}, limits=limits, duration=40.0, measure_from=0.0)
     assert limit_of("latency", problem).why == "a hard limit is left"
     touching = fp.Trajectory(lambda t: {"y": 0.4 * (1 - ca.cos(t))})
     above = replace(problem, reference=touching, limits=fp.Limits(states={"y": (0.0, math.inf)}))
