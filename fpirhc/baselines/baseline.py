@@ -196,7 +196,7 @@ def check(
         return Judgement(
             task.name,
             none,
-            unusable=f"there is no baseline '{path.name}'; write one: fpirhc accept PROBLEM --reason ...",
+            unusable=f"there is no baseline '{path.name}'; write one: fpirhc accept {task.path} --reason ...",
         )
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         return Judgement(

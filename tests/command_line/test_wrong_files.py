@@ -314,7 +314,7 @@ compare two_mass --out notes.txt => cannot write to the folder 'notes.txt': it i
 new arm --dir notes.txt => cannot write to the folder 'notes.txt': it is a file; choose another with --dir
 """
 NO_BASELINE = """
-check mine.py => there is no baseline 'mine.json'; write one: fpirhc accept
+check mine.py => there is no baseline 'mine.json'; write one: fpirhc accept mine.py --reason
 """
 
 
