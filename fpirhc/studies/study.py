@@ -19,7 +19,7 @@ from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import CasesOf, Draws, Variants
-from fpirhc.studies.verdict import CHATTERS, STILL, TO_AND_FRO, Objective, Outcome, objective
+from fpirhc.studies.verdict import STILL, TO_AND_FRO, WILD, Objective, Outcome, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
 
 _TAIL, _MOVES = 0.025, "total_variation."  # on either side of an interval; the metric of movement
@@ -136,7 +136,7 @@ def _chatter(table: pd.DataFrame, task: Task) -> dict[str, dict[str, float]]:
         for column in map(str, table.filter(like=_MOVES)) if plain else ():
             moved, size = own[column], own[column.replace(_MOVES, "effort.")]
             before, time = max(plain[column], STILL * size), task.problem.duration - task.problem.measure_from
-            if moved > CHATTERS * before and moved * time >= TO_AND_FRO * size:
+            if moved > WILD * before and moved * time >= TO_AND_FRO * size:
                 found.setdefault(name, {})[variant] = moved / before
     return found
 

@@ -142,7 +142,7 @@ class Finding:
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
 STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
-CHATTERS, TO_AND_FRO = 10.0, 10  # times the total variation of the partner; times its own size
+WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own size: chatter
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
 _SAMPLES = 2000
 
@@ -275,7 +275,7 @@ FLAGS = (
     Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], 0.2,
          "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
-    Flag(_chatters, CHATTERS, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
+    Flag(_chatters, WILD, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),
