@@ -301,7 +301,7 @@ def recommended_gain(case: Case) -> Fact:
     (times, rung), worst = good, list(case.problem.plant.inputs).index(fact.of)
     numbers |= {"recommended_times": times, "recommended_gain": times * own_gain(controller.deformation)[1]}
     numbers |= {"error_recommended": rung.error, "movement_recommended": rung.moves[worst]}
-    change = set_gain(controller, times) + price(numbers["error"], rung.error)
+    change = set_gain(controller, times) + price(numbers["error"], rung.error) * ladder(case).rungs[1.0].admitted
     ways = "model gain" * bool(apart(case.problem) and fact.verdict == Verdict.NO)
     return fact._replace(numbers=numbers, change=change, ways=ways)
 

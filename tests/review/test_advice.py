@@ -56,9 +56,8 @@ def test_a_refusal_names_another_gain_than_the_one_that_is_refused():
 def lift() -> fp.Problem:
     """It is pushed away from where it should be, and its mass is half as much again as in the model."""
     known = {"m": fp.Parameter(400.0, 650.0, "kg"), "k": fp.Parameter(0.0, 9000.0, "N/m")}
-    plant = fp.Plant(
-        {"h": "m"}, {"F": "N"}, known, lambda q, v, u, p: {"h": (u.F + p.k * q.h - 1500 * v.h) / p.m - 9.81}
-    )
+    moves = lambda q, v, u, p: {"h": (u.F + p.k * q.h - 1500 * v.h) / p.m - 9.81}  # noqa: E731
+    plant = fp.Plant({"h": "m"}, {"F": "N"}, known, moves)
     wave = fp.Trajectory(lambda t: {"h": 0.5 - 0.4 * ca.cos(0.8 * t)})
     return fp.Problem(plant, wave, {"h": 0.1}, period=5e-3, duration=8.0, measure_from=2.0,
                       limits=fp.Limits(inputs={"F": (-2e4, 3e4)}))  # fmt: skip
@@ -77,11 +76,14 @@ def test_the_rate_that_is_named_is_the_one_that_passes():
     assert vain.startswith("No run with one of these passes: rate 0.25, 1, 0.125, 2; limits 2x")
 
 
+def test_a_window_is_looked_for_up_to_eight_times_the_own():
+    seen = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(2e-4))}, fp.SavitzkyGolay(window=5, degree=2))
+    assert "to 41." in answers(motor(1.0, sensing=seen), fp.ComputedTorque(fp.Exponential(8.0)))["noise"].change
+
+
 def test_limits_are_named_where_a_push_is_lost_at_them():
     """A mass that a spring pushes away comes back from a tenth of its range alone with a larger force."""
-    plant = fp.Plant(
-        {"q": "m"}, {"u": "N"}, {"k": fp.Parameter(4.0, 4.0, "N/m")}, lambda q, v, u, p: {"q": p.k * q.q + u.u}
-    )
+    plant = fp.Plant({"q": "m"}, {"u": "N"}, {}, lambda q, v, u, p: {"q": 4 * q.q + u.u})
     wave = fp.Trajectory(lambda t: {"q": 0.05 * ca.sin(t)})
     usual: dict[str, Any] = {"start": {"q": 0.0, "q'": 0.05}, "period": 1e-2, "duration": 10.0}
     far = fp.Problem(plant, wave, limits=fp.Limits(inputs={"u": (-0.2505, 0.2505)}), **usual)
@@ -94,9 +96,8 @@ def test_limits_are_named_where_a_push_is_lost_at_them():
 
 def test_the_worked_review_of_the_page_is_what_the_command_prints(tmp_path: Path, monkeypatch, capsys):
     """From no to yes: what is advised is set, and nothing is left to do; --verbose has the rows that are yes."""
-    [shown] = re.findall(
-        r"```text\n(RHC.*?)```", (Path(__file__).parents[2] / "docs" / "review.md").read_text(), re.DOTALL
-    )
+    page = (Path(__file__).parents[2] / "docs" / "review.md").read_text()
+    [shown] = re.findall(r"```text\n(RHC.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
     assert main(["new", "my_plant"]) == 0
     text, told = Path("my_plant.py").read_text(), []
@@ -104,17 +105,16 @@ def test_the_worked_review_of_the_page_is_what_the_command_prints(tmp_path: Path
         Path("my_plant.py").write_text(text.replace("gain=-1.0", f"gain={gain}"))
         assert main(["review", "my_plant.py", "-c", "RHC+FPI", *options]) == code
         told.append(" ".join(capsys.readouterr().out.split()))
-    parts = (re.escape(" ".join(part.split())) for part in shown.split("..."))
-    assert re.search(".*".join(parts), told[0])
-    assert (told[0].count("->"), told[1].count("->"), told[2].count("yes Do")) == (2, 0, 7)
-    assert "RHC+FPI: 11 yes" in told[1]
+    assert re.search(".*".join(re.escape(" ".join(part.split())) for part in shown.split("...")), told[0])
+    counts = told[0].count("->"), told[1].count("->"), told[2].count("yes Do"), told[1].count("RHC+FPI: 11 yes")
+    assert counts == (2, 0, 7, 1)
 
 
 def test_rows_of_one_controller_agree_on_its_gain():
     """By itself one row would lower the gain and another leave adaptation out, which mends both."""
     plan = {"horizon": fp.Horizon(15, 2e-2), "cost": fp.Quadratic({"q": 1e2, "q'": 1.0}, deviation={"u": 1e-2})}
-    limits = fp.Limits(inputs={"u": (-30.0, 30.0)}, states={"q'": (-1.0, 1.0)})
+    ends = fp.Limits(inputs={"u": (-30.0, 30.0)}, states={"q'": (-1.0, 1.0)})
     fast = {"reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(5 * t)}), "start": {"q": 0.3}, "period": 5e-3}
-    problem = mass(limits=limits, measure_from=1.0, **plan, **fast)
-    told = answers(problem, fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(-1.0))))
+    own = fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(-1.0)))
+    told = answers(mass(limits=ends, measure_from=1.0, **plan, **fast), own)
     assert {told[key].change for key in ("follows", "pays")} == {"Leave the deformation out."}
