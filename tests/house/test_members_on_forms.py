@@ -101,7 +101,7 @@ for family, found in (
 # Pairs that are not served, with the sentence that their user reads
 
 WRONG_SIGN = "has the wrong sign, so every cycle enlarges the error"
-WRONG_PAIR = "so the iteration does not converge with this gain"
+WRONG_PAIR = "so the iteration alone does not converge with this gain"
 NEEDS = (
     "{} needs derivatives below the response, and {}; use ComputedTorque, with a deformation where the model is wrong"
 )
