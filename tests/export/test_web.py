@@ -15,7 +15,7 @@ from helpers.kinds import slow_but
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)"),
     "plan": ("two_mass", "RHC+FPI"),
-    "outputs": ("anaesthesia", "RHC+FPI"),
+    "outputs": ("anaesthesia", "CTC+FPI"),  # with RHC+FPI rounding grows: a replay does not feed the answer back
 }
 LIVE = {"torque": ("deformation.gain", "limits.inputs.Q1.0", "limits.inputs.Q1.1")}
 
