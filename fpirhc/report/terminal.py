@@ -53,7 +53,7 @@ _IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, a
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
 _DRAWN = 0.1  # s from one picture of a bar to the next
-_QUIET = 2.0  # s in which a command without a terminal says nothing
+_QUIET = 2.0  # s between two lines of a command without a terminal
 _EDGES = 2  # columns left and right of a table
 
 
@@ -175,7 +175,7 @@ def _grid(table: Table, part: Sequence[int]) -> Grid:
 
 @contextmanager
 def progress_bars() -> Iterator[Report]:
-    """Yield a function (name, done, total) that shows bars on standard error; or, without a terminal, a line per controller."""
+    """Yield a function (name, done, total) that shows bars on standard error; or, without a terminal, lines."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -190,12 +190,10 @@ def progress_bars() -> Iterator[Report]:
     def report(name: str, done: int, total: int) -> None:
         now = time.monotonic()
         if not out.is_terminal:
-            if done >= total and now - begin > _QUIET:
-                print(
-                    f"fpirhc: {printable(name)}: {total} of {total} after {now - begin:.0f} s",
-                    file=sys.stderr,
-                    flush=True,
-                )
+            if done >= total and now - told.get("", begin) > _QUIET:
+                told[""] = now
+                said = f"fpirhc: {printable(name)}: {total} of {total} after {now - begin:.0f} s"
+                print(said, file=sys.stderr, flush=True)
             return
         if done < total and now - told.get(name, -math.inf) < _DRAWN:
             return  # the time left is computed anew from all that was told, which takes longer than a short run
