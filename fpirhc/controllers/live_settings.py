@@ -53,7 +53,9 @@ class LiveSettings:
         return {path: float(self._content(path)) for path in self.paths}
 
     def composed(self, compose: Callable[[Built], Composite]) -> Composite:
-        """Return what `compose` makes of the controller that is built with open numbers."""
+        """Return what `compose` makes of the controller that is built with open numbers, if there are any."""
+        if not self.paths:
+            return compose(build(self.problem, self.controller))
         checked(self.problem, self.controller)
         opened = Opened(self.start)
         try:

@@ -30,7 +30,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
-from fpirhc.symbolic.open import ANEW, expressed, not_live, numbers, open_numbers
+from fpirhc.symbolic.open import expressed, numbers
 from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
@@ -88,7 +88,7 @@ class RecedingHorizon(Controller):
                 "RecedingHorizon: room is what plans leave for `tracking`; give the law, or leave it out"
             )
         _room(problem, self.room)
-        self.optimiser.check(_optimal_control(self.planner.planned(problem), self.optimiser))
+        self.optimiser.check(_optimal_control(self.planner.planned(problem)))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         problem, plant = built.planned, built.plant
@@ -120,11 +120,8 @@ class RecedingHorizon(Controller):
 _PLANS: Latest[Block] = Latest(8)  # controllers that differ in their deformation alone plan alike
 
 
-def _optimal_control(problem: Problem, optimiser: Optimiser) -> OptimalControl:
+def _optimal_control(problem: Problem) -> OptimalControl:
     """The horizon; open numbers of cost and limits are among its settings."""
-    live = open_numbers(optimiser)
-    if live:
-        raise not_live(live, f"the code of the optimiser is computed from it while the loop is built; {ANEW}", " here")
     assert problem.horizon is not None
     assert problem.cost is not None
     ahead, limits, start = model_values(problem.plant, problem.signals), problem.limits, problem.start_state
@@ -168,7 +165,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     assert problem.horizon is not None
     assert problem.cost is not None
     optimiser, restarts = controller.optimiser, controller.tracking is None
-    plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem, optimiser)
+    plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem)
     preview, corrected = problem.reference.preview(plant, horizon.nodes), controller.planner.feeds_back(plant)
     data_of = ocp.data_of(previewed=preview is not None)
     memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))

@@ -171,8 +171,6 @@ def run_figure(run: Run) -> Figure:
         draw(axis, run, names, signal)
         axis.set_ylabel(quantity_label(run, signal, names, what))
         draw_bands(axis, run)
-        for time, _ in run.in_force[1:]:
-            axis.axvline(time, color="#777777", lw=0.8, ls=":", label="change of settings")
         draw_legend(axis)
     axes[-1].set_xlabel(time_label(run))
     return figure

@@ -18,7 +18,6 @@ from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.gate import INNER, LOST, Gate
-from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import followed_units
@@ -34,19 +33,20 @@ from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
 from fpirhc.task.problem import Problem
 
 
-def close_loop(problem: Problem, controller: Controller, live: LiveSettings | None = None) -> Composite:
+def close_loop(problem: Problem, controller: Controller) -> Composite:
     """Return the closed loop as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
 
     With an `ExternalPlant` the step also reads its measurements, and returns the inputs that it is sent.
 
-    Both parameter sets are part of the memory (constant), so that other values need no new Function; live settings likewise. The
+    Both parameter sets are part of the memory (constant), so that other values need no new Function; open numbers likewise. The
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
     `setpoints` only where the reference is given some.
     """
-    return _closed(build(problem, controller)) if live is None else live.composed(_closed)
+    return closed_loop(build(problem, controller))
 
 
-def _closed(built: Built) -> Composite:
+def closed_loop(built: Built) -> Composite:
+    """Return the closed loop of a controller that is built."""
     problem = built.problem
     mover, inner = moving(problem), built.step
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
@@ -71,7 +71,7 @@ def start_memory(
 
     Args:
         problem: the problem of the loop, or one that differs from it in the exact parameters only.
-        numbers: of all live settings, by path; None: those of the build.
+        numbers: all open ones, by path; None: those of the build.
     """
     mover, whole = moving(problem), loop.memory.start()
     blocks = (*sensing_blocks(mover, predicts=False), *seeing_blocks(problem)[0])

@@ -8,16 +8,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import Built, build
+from fpirhc.controllers.built import Built
 from fpirhc.controllers.gate import Gate, was_skipped
-from fpirhc.controllers.live_settings import LiveSettings
 from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.deformation.base import of_last_pair
 from fpirhc.describe import describe
@@ -188,19 +187,24 @@ def _count_block() -> Block:
     return Block("count", Layout((scalar("status"),)), Layout((scalar(SKIPPED),)), step, Layout((count,)))
 
 
-def composed_step(live: LiveSettings, ready: Controller, monitor: RunMonitor) -> tuple[Composite, Layout]:
+def composed_step(
+    composed: Callable[[Callable[[Built], Composite]], Composite],
+    problem: Problem,
+    ready: Controller,
+    monitor: RunMonitor,
+) -> tuple[Composite, Layout]:
     """Return the step behind its gate, and the layout of its memory.
 
-    Gate and monitor have the numbers of the build, and no live ones.
+    `composed`: what is made of the built controller; gate and monitor have the numbers of the problem and of `ready`.
     """
     gates: list[Gate] = []
 
     def compose(built: Built) -> Composite:
-        samples = known_samples(live.problem)
-        gates.append(Gate(live.problem, built.step, ranges=sensor_ranges(live.problem), samples=samples))
-        return machine_step(live.problem, ready, gates[-1], monitor)
+        ranges, samples = sensor_ranges(problem), known_samples(problem)
+        gates.append(Gate(problem, built.step, ranges=ranges, samples=samples))
+        return machine_step(problem, ready, gates[-1], monitor)
 
-    composite = live.composed(compose) if live.paths else compose(build(live.problem, ready))
+    composite = composed(compose)
     return composite, gates[-1].named(composite.memory)
 
 

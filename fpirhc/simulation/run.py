@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from fpirhc.errors import InvalidName, OutputError, nearest
-from fpirhc.fields.checked import ByName, FoundByName, checked_call
+from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.status import Status
 from fpirhc.summary import in_percent, in_units, line
 from fpirhc.symbolic.layout import Layout, Signal
@@ -81,12 +81,6 @@ class Run(FoundByName):
     def time_unit(self) -> str:
         """Unit of time, as the plant names it."""
         return self.unit("time")
-
-    @property
-    def in_force(self) -> tuple[tuple[float, Mapping[str, float]], ...]:
-        """Times from which numbers of live settings were in force, with the numbers by path; empty without live settings."""
-        record = cast(Sequence[tuple[float, Mapping[str, float]]], self.settings.get("live", ()))
-        return tuple((float(time), ByName(numbers, "Run.in_force")) for time, numbers in record)
 
     @property
     def cycles(self) -> int:

@@ -20,13 +20,13 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.loop import close_loop, cycles_per_call, plans_exactly, start_memory
+from fpirhc.simulation.loop import closed_loop, cycles_per_call, plans_exactly, start_memory
 from fpirhc.simulation.moved import Exchange, moving
 from fpirhc.simulation.ranges import Dropped
 from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
-from fpirhc.simulation.tables import Changes, in_force, run_tables
+from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.layout import Layout
@@ -71,7 +71,7 @@ class Simulator:
     def built_for(self, problem: Problem) -> Simulator:
         """Return the loop of another form of the problem; it is not compiled again where its code is the same."""
         live = live_settings(problem, self.live.unresolved, self.live.paths)
-        loop = close_loop(problem, live.controller, live if live.paths else None)
+        loop = live.composed(closed_loop)
         if loop.function.serialize() == self.loop.function.serialize():
             return replace(self, problem=problem, controller=live.controller, loop=loop, live=live)
         anew = ComposedLoop.of(problem, self.live.unresolved, self.live.paths)
@@ -95,7 +95,6 @@ class Simulator:
         disturbed: bool = True,
         progress: Progress | None = None,
         settings: Numbers | None = None,
-        changes: Changes | None = None,
         setpoints: Setpoints | None = None,
     ) -> Run:
         """Run the loop once and return its signals.
@@ -108,23 +107,23 @@ class Simulator:
             disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build. None: all have them.
-            changes: numbers of live settings from a time on, by time in s.
             setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
 
         Raises:
             InvalidName: a setting that is not live; a coordinate without set-point.
-            InvalidValue: a number that a setting does not accept; a change outside the run; a set-point that cannot be reached.
+            InvalidValue: a number that a setting does not accept; a set-point that cannot be reached.
             NotContractive: a gain with which the deformation cannot converge.
         """
         problem = variant or self.problem
         own = self.built_for(problem) if self.outdated_by(problem) else self
-        given = {} if settings is None else settings, {} if changes is None else changes
-        force = in_force(own.live, own.loop, problem, *given)
-        problem, controller = force.problem, force.controller
-        start = start_memory(own.loop, problem, controller, force.numbers)
-        rows, talk = _padded(problem, force.patches), moving(problem).exchange(seed)
+        live = replace(own.live, problem=problem)
+        controller, numbers = own.controller, live.start
+        if settings:
+            problem, controller, numbers = live.changed(settings)
+        start = start_memory(own.loop, problem, controller, numbers)
+        rows, talk = _padded(problem, ()), moving(problem).exchange(seed)
         tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints)
-        logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress, force.patches)
+        logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress)
         layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)
         model, gain = controller.plant_model(problem), float(controller.deformation.effective_gain())
@@ -139,8 +138,8 @@ class Simulator:
         }
         if controller.deformation.form.weights is not None:
             facts["weights"] = [list(row) for row in controller.deformation.form.weights]
-        if force.record:
-            facts["live"] = [[time, dict(values)] for time, values in force.record]
+        if numbers:
+            facts["live"] = numbers
         points = set_point_record(problem, setpoints)
         if points:
             facts["setpoints"] = points
@@ -183,7 +182,12 @@ class ComposedLoop:
     def of(cls, problem: Problem, controller: Controller, live: Sequence[str] = ()) -> Self:
         """Return the loop of problem and controller; arguments and errors as in `simulator`."""
         settings = live_settings(problem, controller, live)
-        return cls(problem, settings, close_loop(problem, settings.controller, settings if live else None))
+        return cls(problem, settings, settings.composed(closed_loop))
+
+    @property
+    def controller(self) -> Controller:
+        """The controller with its automatic settings chosen."""
+        return self.live.controller
 
     @property
     def function(self) -> ca.Function:
@@ -192,7 +196,7 @@ class ComposedLoop:
 
     def worth_compiling(self, compiled: bool | None) -> bool:
         """Return whether a compiler is asked; `compiled` as in `simulator`."""
-        horizon, plans = self.problem.horizon, innermost(self.live.controller).planner is not None
+        horizon, plans = self.problem.horizon, innermost(self.controller).planner is not None
         long = self.problem.cycles * (horizon.stages if plans and horizon is not None else 1) > _SHORT_RUN
         return bool(compiled or (compiled is None and long))
 
@@ -207,7 +211,7 @@ class ComposedLoop:
         A loop whose code is `known` is not compiled again, and `known` gets that of every other one: loops of one code differ in
         their first memory alone, as those of most starts do.
         """
-        ready, worth = self.live.controller, self.worth_compiling(compiled)
+        ready, worth = self.controller, self.worth_compiling(compiled)
         if known is None:
             return Simulator(self.problem, ready, self.loop, *self._code(compiled), self.live)
         key = worth, hashlib.sha256(self.function.serialize().encode()).digest()
@@ -235,8 +239,6 @@ def simulate(
     name: str = "",
     compiled: bool | None = True,
     progress: Progress | None = None,
-    settings: Numbers | None = None,
-    changes: Changes | None = None,
     setpoints: Setpoints | None = None,
 ) -> Run:
     """Run the closed loop of problem and controller and return every signal.
@@ -251,13 +253,10 @@ def simulate(
         name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
         compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
         progress: called with (cycles done, cycles in all).
-        settings: numbers of settings by path, in place of those of the controller and the problem.
-        changes: numbers of settings from a time on, by time in s.
         setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
     """
-    live = tuple(dict.fromkeys(path for numbers in (settings or {}, *(changes or {}).values()) for path in numbers))
-    ready = simulator(problem, controller, compiled=compiled, live=live)
-    return ready.run(seed=seed, name=name, progress=progress, settings=settings, changes=changes, setpoints=setpoints)
+    ready = simulator(problem, controller, compiled=compiled)
+    return ready.run(seed=seed, name=name, progress=progress, setpoints=setpoints)
 
 
 def run_cycles(

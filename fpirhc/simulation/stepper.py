@@ -73,7 +73,7 @@ class ComposedStep:
         ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
-        composite, memory = composed_step(settings, ready, monitor or RunMonitor())
+        composite, memory = composed_step(settings.composed, problem, ready, monitor or RunMonitor())
         replay = Replay.of(settings.problem, composite, bridged)
         return cls(problem, controller, settings, ready, composite, memory, replay)
 

@@ -1,25 +1,18 @@
-"""What the cycles of a run read: disturbances, the random series of sensors, set-points, and settings from a time on."""
+"""What the cycles of a run read: disturbances, the random series of sensors, and set-points."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.contract import Controller
-from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.errors import InvalidValue
 from fpirhc.simulation.step_arguments import Setpoints, set_point_table
-from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.layout import Expression, Signal
-from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.problem import Problem
 
 SIGNAL = "disturbance"  # what a loop reads in every cycle
 LOGGED = "output_disturbance"
-Changes = Mapping[float, Numbers]  # by time, s
 
 
 def run_tables(
@@ -81,36 +74,3 @@ def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expres
     own = {e: v for e, v in values.items() if e.rstrip("'") in orders}
     below = [own.get(e, 0) for e in plant.output.elements]
     return ca.vertcat(*below), ca.vertcat(*(own.get(n + "'" * orders.get(n, 0), 0) for n in plant.controlled_names))
-
-
-@dataclass(frozen=True, eq=False)
-class InForce:
-    """The settings of one run."""
-
-    problem: Problem  # the problem with the numbers at the start
-    controller: Controller  # the controller with them
-    numbers: Mapping[str, float]  # of all live settings at the start, by path
-    # (first cycle, places in the memory, values) of every change, in the order of time
-    patches: Sequence[tuple[int, np.ndarray, np.ndarray]] = ()
-    # what was in force when, as plain data: pairs of a time in s and {path: number}
-    record: Sequence[tuple[float, Mapping[str, float]]] = ()
-
-
-def in_force(live: LiveSettings, loop: Composite, problem: Problem, settings: Numbers, changes: Changes) -> InForce:
-    """Return the settings of a run, checked before it starts."""
-    for time in changes:
-        if not 0 <= time < problem.duration:
-            raise InvalidValue(f"a change of settings at {time!r} s: expected a time in [0, {problem.duration:g}) s")
-    first = replace(live, problem=problem)
-    if not settings and not changes:  # a variant of the problem runs as it does without live settings
-        return InForce(problem, live.controller, first.start, (), [(0.0, first.start)] if live.paths else [])
-    now = first.flat(settings)
-    ready, controller, numbers = first.changed(now)
-    patches, record = [], [(0.0, numbers)]
-    places = np.arange(loop.memory.size)[loop.memory.slice(SETTINGS)] if live.paths else np.zeros(0, dtype=int)
-    for time in sorted(changes):
-        now |= first.flat(changes[time])
-        values, cycle = first.changed(now)[2], int(np.ceil(time / problem.period - 1e-9))
-        patches.append((cycle, places, np.array(list(values.values()), dtype=float)))
-        record.append((cycle * problem.period, values))
-    return InForce(ready, controller, numbers, patches, record if numbers else [])

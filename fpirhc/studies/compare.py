@@ -248,7 +248,7 @@ class _Rows:
         problem = self._task.problem
         loop = ComposedLoop.of(problem, resolved(problem, self._controllers[name]))
         facts: dict[str, Any] = {"bounded": False, "broken": []}
-        step = attempted("the time of a cycle", ComposedStep.of, problem, loop.live.controller, **facts)
+        step = attempted("the time of a cycle", ComposedStep.of, problem, loop.controller, **facts)
         self.composed[name] = loop, step
         if loop.worth_compiling(self._compiled):
             self.wanted += [(loop.function, loop.calls), *([(step.function, 0)] if step is not None else [])]

@@ -31,7 +31,7 @@ def run(of: str, controller: str, moved: dict[str, float], live: list[str]) -> f
             parameters[name] = replace(parameters[name], **{side: value})
     variant = replace(task.problem, plant=replace(task.problem.plant, parameters=parameters))
     changes = {path: value for path, value in moved.items() if path in live}
-    return ready.run(seed=0, variant=variant, changes={0.0: changes} if changes else {})
+    return ready.run(seed=0, variant=variant, settings=changes)
 
 
 def same_curves(data: Any, columns: list[list[float]], of: fp.Run) -> None:

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -56,18 +55,6 @@ def test_a_changed_loop_is_the_rebuilt_one_bit_by_bit(compiled):
             assert np.abs(one - other).max() <= 1e-4 * np.abs(other).max()
 
 
-def test_a_change_during_a_run_is_that_of_a_loop_that_goes_on_with_the_number():
-    """Before the change the run is the one without it; a change at the start is a run with the number."""
-    ready = fp.simulator(brief(), by_plan(), live=FIVE)
-    numbers = {"deformation.gain": -0.9, "cost.states.q1": 400.0}
-    changed, plain = ready.run(seed=0, changes={0.1234: numbers}), ready.run(seed=0)
-    assert np.array_equal(changed.log[:124], plain.log[:124])
-    assert not np.array_equal(changed["deformed"][124:130], plain["deformed"][124:130])
-    record: Any = changed.settings["live"]
-    assert [time for time, _ in record] == [0.0, 0.124]
-    assert record[1][1]["deformation.gain"] == -0.9
-
-
 def test_a_compiler_that_fails_is_an_error(monkeypatch):
     """A loop without live settings runs in the virtual machine then; one with live settings must not hide what went wrong."""
     monkeypatch.setenv("FPIRHC_CC", "false")
@@ -79,17 +66,11 @@ def test_a_compiler_that_fails_is_an_error(monkeypatch):
     assert not fp.simulator(short, by_torque(), live=["deformation.gain"]).compiled
 
 
-CHANGED = {0.1: {"deformation.gain": -0.9}, 0.2: {"deformation.gain": -0.9, "deformation.scale": 3.0}}
-
-
-def test_a_run_knows_what_was_in_force_when(tmp_path):
-    """Times of cycles and all numbers; a run without live settings has none; a file keeps them."""
-    run = fp.simulate(brief(), by_torque(), seed=0, compiled=False, changes=CHANGED)
-    gain, scale = CHANGED[0.2]
-    first = {gain: by_torque().deformation.gain, scale: by_torque().deformation.scale}
-    expected = [(0.0, first), (0.1, first | CHANGED[0.1]), (0.2, CHANGED[0.2])]
-    assert [(time, dict(numbers)) for time, numbers in run.in_force] == expected
+def test_a_run_keeps_the_numbers_that_it_was_given(tmp_path):
+    """All live numbers are in the run and its file; a run without live settings has none."""
+    ready, given = fp.simulator(brief(), by_torque(), compiled=False, live=FOUR[1:3]), {"deformation.gain": -0.9}
+    run = ready.run(seed=0, settings=given)
+    assert run.settings["live"] == {"deformation.scale": by_torque().deformation.scale} | given
     run.save(tmp_path / "run.npz")
-    assert fp.load_run(tmp_path / "run.npz").in_force == run.in_force
-    controllers = tasks.two_mass.controllers
-    assert fp.simulate(brief(), controllers["CTC"], seed=0, compiled=False).in_force == ()
+    assert fp.load_run(tmp_path / "run.npz").settings["live"] == run.settings["live"]
+    assert "live" not in fp.simulate(brief(), tasks.two_mass.controllers["CTC"], seed=0, compiled=False).settings

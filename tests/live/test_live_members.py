@@ -92,9 +92,7 @@ def test_what_python_computes_from_a_number_is_refused_by_path_and_place():
     ):
         fp.simulator(two_masses(), computed, live=["cost.states.a", "limits.inputs.Fa.1"], compiled=False)
     fp.simulator(two_masses(), computed, live=["limits.inputs.Fa.1"], compiled=False)
-    with pytest.raises(
-        NotSupported, match=r"'optimiser\.map\.gain' cannot be live here: the code of the optimiser is computed"
-    ):
+    with pytest.raises(NotSupported, match=r"'optimiser\.map\.gain' cannot be live here: .* needs its number while"):
         fp.simulator(two_masses(), computed, live=["optimiser.map.gain"], compiled=False)
     with pytest.raises(
         NotSupported, match=r"'estimator\.drift\.a' cannot be live here: .* needs its number while the loop"
@@ -136,6 +134,4 @@ def test_a_symbol_turned_into_a_number_is_refused():
             return request + ca.DM([0.5 * self.gain]) * (response - desired) + 0 * self.gain * response, {}
 
     with pytest.raises(FpirhcError, match=r"deformation\.gain"):
-        fp.simulate(
-            two_masses(), fp.ComputedTorque(TRACKING, Lossy(gain=-0.5)), seed=0, settings={"deformation.gain": -0.4}
-        )
+        fp.simulator(two_masses(), fp.ComputedTorque(TRACKING, Lossy(gain=-0.5)), live=["deformation.gain"])

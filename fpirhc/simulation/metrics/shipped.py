@@ -8,8 +8,9 @@ factor by which the iteration shrinks an error per cycle: from the symbols along
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -82,8 +83,7 @@ def at_limit(problem: Problem, run: Run) -> float:
 
 def at_limits(problem: Problem, run: Run) -> np.ndarray:
     """Return whether every command, or its change, stands at a limit in every measured cycle, shape (cycles, inputs)."""
-    measured = measured_cycles(problem, run)
-    lower, upper = (end[measured] for end in _limits(problem, run))
+    lower, upper = _limits(problem, run)
     span = upper - lower
     near, commands = _AT * np.where(np.isfinite(span), span, 1.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
@@ -105,16 +105,12 @@ def _mean(values: np.ndarray) -> np.ndarray:
 
 
 def _limits(problem: Problem, run: Run) -> np.ndarray:
-    """The limits of the inputs that were in force, shape (2, cycles, inputs)."""
-    inputs = problem.plant.input.elements
-    limits = np.array(problem.limits.input_bounds(problem.plant))
-    limits = np.repeat(limits[:, None, :], run.cycles, axis=1)
-    live = {f"limits.inputs.{name}.{end}": (end, k) for k, name in enumerate(inputs) for end in (0, 1)}
-    for time, numbers in run.in_force:
-        for path in live.keys() & numbers.keys():
-            end, k = live[path]
-            limits[end, round(time / problem.period) :, k] = numbers[path]
-    return limits
+    """The limits of the inputs, shape (2, inputs); those that a run was given are its own."""
+    given = cast(Mapping[str, float], run.settings.get("live", {}))
+    names, bounds = problem.plant.inputs, problem.limits.input_bounds(problem.plant)
+    return np.array(
+        [[given.get(f"limits.inputs.{n}.{end}", b) for n, b in zip(names, bounds[end], strict=True)] for end in (0, 1)]
+    )
 
 
 def cycles(problem: Problem, run: Run) -> int:  # noqa: ARG001 -- every metric is given the problem
