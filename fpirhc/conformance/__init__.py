@@ -1,13 +1,12 @@
 """Laws that every member of a family keeps; one line tries them on a user's class, `check_deformation(MyMap(gain=-0.5), seed=1)`.
 
-Each function raises one AssertionError for the first law that is broken, with the numbers, and returns nothing (`check_live`: what
-became of every number); FpirhcError: the member refuses what it is tried on. `seed` is that of every draw. A law is a
-function in the module of its family that yields what breaks it.
+Each function raises one AssertionError for the first law that is broken, with the numbers, and returns nothing; FpirhcError: the
+member refuses what it is tried on. `seed` is that of every draw. A law is a function in the module of its family that yields what
+breaks it.
 `examples(family)` are the members that they are tried on, of other distributions too.
 """
 
 from fpirhc.conformance.controller import check_controller as check_controller
-from fpirhc.conformance.controller import check_live as check_live
 from fpirhc.conformance.deformation import check_deformation as check_deformation
 from fpirhc.conformance.laws import FAMILIES as FAMILIES
 from fpirhc.conformance.laws import Example as Example

@@ -7,11 +7,9 @@ the motion of a recorded run: with another deformation, other exact parameters, 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -33,16 +31,15 @@ from fpirhc.controllers.contract import tracking_law, with_field
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Deformation, Identity, automatic, with_inner
 from fpirhc.describe import describe
-from fpirhc.errors import FpirhcError, NotSupported
+from fpirhc.errors import FpirhcError
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Simulator, simulate, simulator
+from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status
-from fpirhc.symbolic.dotted import entry, names_in
 from fpirhc.task.exogenous import really_known
 from fpirhc.task.problem import Problem
 
@@ -328,96 +325,3 @@ def _measured_once(trial: _Trial, bad: float, entry: int | None, what: str) -> B
             yield f"{what}: the status of that cycle is OK"
     if status == Status.NON_FINITE:
         yield f"{what}: {_STEPS} good measurements later the status is still NON_FINITE"
-
-
-_FACTORS = (1.07, 0.93, 1.01, 0.5, 2.0)  # the first one that the setting accepts
-_SHARE, _CLOSE = 0.5, 1e-6
-
-
-Became: TypeAlias = dict[str, float | str | None]
-
-
-def check_live(
-    problem: Problem, controller: Controller, *, paths: Sequence[str] | None = None, cycles: int = 40
-) -> Became:
-    """Try each number of a controller, and of the problem's cost and limits, as a live setting; return what became of it, by path.
-
-    Every number either is refused by name, or a loop with another number in it runs as the loop that is built with that number,
-    bit by bit, and the number of the build as the loop without live settings. Plans keep the step length and the first plan of
-    the build: behind them the command is nearer to that of the loop built with the number than to that of the first one, which
-    holds for plans that are solved. What became of it: why it is refused, the factor by which it was changed, or None: no change
-    is accepted.
-
-    Args:
-        problem: on which the loops are tried.
-        controller: whose numbers are asked.
-        paths: of the numbers; None: all of them.
-        cycles: length of the runs.
-    """
-    short = replace(problem, duration=cycles * problem.period, measure_from=0.0)
-    asked = list(_own_paths(problem, controller)) if paths is None else list(paths)
-    opened, became, ready = list(asked), Became(), None
-    while opened and ready is None:
-        try:
-            ready = simulator(short, controller, compiled=False, live=opened)
-        except FpirhcError as error:
-            named = [path for path in opened if f"'{path}'" in str(error)]
-            _hold(bool(named), f"one of the settings {opened} is refused without its name: {error}")
-            if len(named) > 1:  # together: those that open alone are not the ones
-                named = [path for path in named if not _opens(short, controller, path)] or named
-            became |= dict.fromkeys(named, str(error))
-            opened = [path for path in opened if path not in named]
-    if ready is not None:
-        plain = simulator(short, controller, compiled=False).run(seed=0)
-        same = np.array_equal(ready.run(seed=0).log, plain.log, equal_nan=True)
-        _hold(same, f"with live settings {opened} the loop runs differently although their numbers are the same")
-        for path in opened:
-            became[path] = next((factor for factor in _FACTORS if _runs_as_rebuilt(ready, path, factor)), None)
-    return became
-
-
-def _opens(problem: Problem, controller: Controller, path: str) -> bool:
-    try:
-        return bool(simulator(problem, controller, compiled=False, live=[path]).live.paths)
-    except FpirhcError:
-        return False
-
-
-def _own_paths(problem: Problem, controller: Controller) -> Iterator[str]:
-    """Yield the path of every number of a controller, and of the problem's cost and limits where these are its own."""
-    yield from _paths(controller, "")
-    for name in ("cost", "limits"):
-        if getattr(problem, name) is not None and getattr(controller, name, None) is None:
-            yield from _paths(getattr(problem, name), f"{name}.")
-
-
-def _paths(value: Any, start: str) -> Iterator[str]:
-    for name in names_in(value):
-        content = entry(value, name)
-        if isinstance(content, int | float) and not isinstance(content, bool):
-            yield f"{start}{name}"
-        yield from _paths(content, f"{start}{name}.")
-
-
-def _runs_as_rebuilt(ready: Simulator, path: str, factor: float) -> bool:
-    """Whether another number is accepted; then the changed and the rebuilt loop must run alike."""
-    number = {path: ready.live.start[path] * factor}
-    try:
-        problem, controller, _ = ready.live.changed(number)
-    except FpirhcError as error:
-        _hold(not isinstance(error, NotSupported) or path in str(error), f"setting {number}: {error}")
-        return False
-    expected = simulator(problem, controller, compiled=False).run(seed=0)
-    plain, changed = ready.run(seed=0), ready.run(seed=0, settings=number)
-    if controller.planner is None:
-        same = np.array_equal(changed.log, expected.log, equal_nan=True)
-    else:  # scale, step length and first plan stay those of the build
-        apart, effect = (np.nanmax(np.abs(one["command"] - expected["command"])) for one in (changed, plain))
-        same = apart <= _SHARE * effect + _CLOSE * np.nanmax(np.abs(expected["command"]))
-    _hold(same, f"with {number} the loop runs differently from one that is built with it")
-    return True
-
-
-def _hold(law: bool, sentence: str) -> None:
-    if not law:
-        raise AssertionError(sentence)

@@ -330,7 +330,7 @@ def _stage(ocp: OptimalControl, damping: float) -> ca.Function:
     a, b, by_state, by_input = sym("A", ns, ns), sym("B", ns, nu), sym("ls", ns), sym("lu", nu)
     q, s, r = sym("Q", ns, ns), sym("S", nu, ns), sym("R", nu, nu)
     u, lower, upper = sym("u", nu), sym("lower", nu), sym("upper", nu)
-    added = ca.DM(np.diag(damping / ocp.scale))
+    added = ca.DM(np.diag(ca.DM(damping / ocp.scale).full().ravel()))  # of an open number CasADi makes no DM
     value_a = ca.mtimes(value, a)
     damped = r + ca.mtimes(b.T, ca.mtimes(value, b)) + added
     coupled = s + ca.mtimes(b.T, value_a)

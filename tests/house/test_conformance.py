@@ -1,13 +1,13 @@
 """Every shipped member of a family keeps the public laws, and every law catches a class that breaks it."""
 
 import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import pytest
 from helpers.kinds import shipped
-from helpers.on_problem import named
+from helpers.on_problem import named, on_problem
 
 import fpirhc as fp
 from fpirhc.conformance import (
@@ -19,9 +19,8 @@ from fpirhc.conformance import (
     check_tracking,
     examples,
     member_classes,
-    two_masses,
 )
-from fpirhc.contracts import Block, Controller, Tracking
+from fpirhc.contracts import Block, Tracking
 from fpirhc.errors import InvalidProblem, InvalidValue
 
 FINE = 1e-6  # tolerance of the optimisers, N
@@ -158,18 +157,8 @@ CONTROLLERS = (
 )
 
 
-def on_problem(example: Any) -> tuple[Controller, fp.Problem | None]:
-    """A controller and the problem that it is tried on, None for that of the laws."""
-    one = example if isinstance(example, Example) else Example(example)
-    if not one.problem:
-        return one.value, replace(two_masses(), **one.changes) if one.changes else None
-    task = fp.load_problem(one.problem)
-    return one.value or task.controllers[one.controller], replace(task.problem, **one.changes)
-
-
 def name_of(example: Any) -> str:
-    one = example if isinstance(example, Example) else Example(example)
-    return one.controller or type(one.value).__name__
+    return getattr(example, "controller", "") or type(getattr(example, "value", example)).__name__
 
 
 QUICK = "ADRC", "Cascade", "ComputedTorque", "ExactModel", "PID", "Predicted", "RecedingHorizon", "slots", "L1 adaptive"

@@ -25,17 +25,9 @@ def rebuilt(ready, numbers, *, compiled):
 
 def random_numbers(rng):
     """Numbers for the settings of `FOUR` and `FIVE`."""
-    four = dict(
-        zip(FOUR, (rng.uniform(3, 9), -rng.uniform(0.1, 1.2), rng.uniform(0.8, 3), rng.uniform(0.05, 0.6)), strict=True)
-    )
-    five = (
-        -rng.uniform(0.1, 1.2),
-        rng.uniform(200, 2e3),
-        rng.uniform(0.3, 3),
-        rng.uniform(5e-4, 3e-3),
-        rng.uniform(2, 40),
-    )
-    return four, dict(zip(FIVE, five, strict=True))
+    four = rng.uniform((3, -1.2, 0.8, 0.05), (9, -0.1, 3, 0.6))
+    five = rng.uniform((-1.2, 200, 0.3, 5e-4, 2), (-0.1, 2e3, 3, 3e-3, 40))
+    return dict(zip(FOUR, four.tolist(), strict=True)), dict(zip(FIVE, five.tolist(), strict=True))
 
 
 @pytest.mark.parametrize("compiled", [True, False], ids=["C", "VM"])
@@ -48,10 +40,8 @@ def test_a_changed_loop_is_the_rebuilt_one_bit_by_bit(compiled):
         four, five = random_numbers(rng)
         assert np.array_equal(torque.run(seed=0, settings=four).log, rebuilt(torque, four, compiled=compiled).log), four
         if k == 0:
-            one, other = (
-                planned.run(seed=0, settings=five)["command"],
-                rebuilt(planned, five, compiled=compiled)["command"],
-            )
+            runs = planned.run(seed=0, settings=five), rebuilt(planned, five, compiled=compiled)
+            one, other = (run["command"] for run in runs)
             assert np.abs(one - other).max() <= 1e-4 * np.abs(other).max()
 
 
