@@ -13,9 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.gate import HELD
-from fpirhc.controllers.live_settings import LiveSettings, Numbers
-from fpirhc.errors import FpirhcError, InvalidName, InvalidShape, InvalidValue, nearest
-from fpirhc.fields.checked import ByName
+from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
 from fpirhc.fields.kinds import described, named_entries, real_number
 from fpirhc.fields.user_code import called
 from fpirhc.simulation.machine import SKIPPED
@@ -26,7 +24,6 @@ from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.checks import check_values
-from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps, in_force, pairs
 
@@ -185,96 +182,6 @@ class StepArguments:
 
 def _view(array: np.ndarray) -> View:
     return cast(View, memoryview(array.data))
-
-
-class NumbersNow:
-    """Live settings and set-points in force, written into the arguments of a step.
-
-    What is refused changes nothing: the old numbers stay, `refused` counts, and `why_refused` states the last reason.
-    """
-
-    refused: int  # number of changes that were refused
-    why_refused: str  # reason of the last change that was refused
-
-    def _begin(self, live: LiveSettings, composite: Composite, arguments: StepArguments) -> None:
-        """Put the numbers of the build in force."""
-        self._live, self._composite, self._arguments = live, composite, arguments
-        self.refused, self.why_refused = 0, ""
-        self._numbers: dict[str, float] = live.start
-        self._write(self._numbers)
-
-    def start(self) -> np.ndarray:
-        """Return the memory of the controller before its first cycle."""
-        return self._composite.memory.start()
-
-    def change(self, settings: Numbers) -> bool:
-        """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
-
-        Raises:
-            InvalidName: a setting that is not live.
-        """
-        if not named_entries("settings", settings):
-            return True
-        try:
-            _, _, numbers = self._live.changed({**self._numbers, **self._live.flat(settings)})
-            self._write(numbers)
-        except InvalidName:
-            raise
-        except FpirhcError as error:
-            return self._refuse(error)
-        self._numbers = numbers
-        return True
-
-    def set_reference(self, setpoints: SetpointsNow) -> bool:
-        """Put set-points in force from the next step on, by coordinate or output, and return whether they were accepted.
-
-        A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
-        old ones stay, `refused` counts, and `why_refused` states the reason.
-
-        Raises:
-            InvalidName: a coordinate without set-point.
-        """
-        if not named_entries("setpoints", setpoints):
-            return True
-        try:
-            row = set_points_now(self._live.problem, setpoints, self._arguments.setpoints)
-        except InvalidValue as error:
-            return self._refuse(error)
-        self._arguments.setpoints[:] = row
-        return True
-
-    @property
-    def settings(self) -> Layout:
-        """The vector of the live settings among `reads`, 'settings'; an element is a path."""
-        return Layout(tuple(s for s in self._composite.reads.signals if s.name == SETTINGS))
-
-    def bounds(self) -> dict[str, Interval]:
-        """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
-
-        It is the interval around the number of the build in which the setting is accepted while the others stay, found by trials of
-        Python's own check, to a millionth of the number. A limit of an input ends at that of the build; infinite ends refuse
-        nothing.
-        """
-        return ByName({path: self._live.bounds(path) for path in self._live.paths}, "Stepper.bounds()")
-
-    @property
-    def numbers(self) -> dict[str, float]:
-        """The live settings in force, by path."""
-        return ByName(self._numbers, "Stepper.numbers")
-
-    @property
-    def setpoints(self) -> dict[str, float]:
-        """The set-points in force, by coordinate or output."""
-        values = zip(self._live.problem.plant.chains, self._arguments.setpoints.tolist(), strict=False)
-        return ByName(dict(values), "Stepper.setpoints")
-
-    def _write(self, numbers: Mapping[str, float]) -> None:
-        if numbers:
-            self._arguments.settings[:] = list(numbers.values())
-
-    def _refuse(self, error: FpirhcError) -> bool:
-        self.refused, self.why_refused = self.refused + 1, str(error)
-        return False
 
 
 def raw_measurements(run: Run) -> np.ndarray:

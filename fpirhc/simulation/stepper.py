@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
 from typing import NoReturn, Self
@@ -15,24 +15,27 @@ from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
-from fpirhc.errors import ConcurrentUse
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue
 from fpirhc.fields.checked import ByName, Checked
+from fpirhc.fields.kinds import named_entries
 from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, refuse_unbounded
 from fpirhc.simulation.replay import CLOCK_MEMORY, Bound, Replay, missed_cycles
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
     NOTHING,
-    NumbersNow,
     SetpointsNow,
     StepArguments,
     numbers_of,
     one_number,
+    set_points_now,
 )
 from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
+from fpirhc.symbolic.open import SETTINGS
+from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _TRUTHS = (bool, np.bool_)
@@ -78,7 +81,7 @@ class ComposedStep:
         return cls(problem, controller, settings, ready, composite, memory, replay)
 
 
-class Stepper(NumbersNow, Checked):
+class Stepper(Checked):
     """One controller, ready to be called once per control cycle.
 
         stepper = Stepper(problem, controller)
@@ -168,7 +171,11 @@ class Stepper(NumbersNow, Checked):
         model = step.ready.plant_model(problem)
         parameters = model.parameters(model.plant)
         arguments = StepArguments(function, composite, problem, parameters)
-        self._begin(step.settings, composite, arguments)
+        self._live, self._composite, self._arguments = step.settings, composite, arguments
+        self.refused = 0  # number of changes that were refused
+        self.why_refused = ""  # reason of the last change that was refused
+        self._numbers = step.settings.start
+        self._write(self._numbers)
         self.reads: Layout = composite.reads.starting_at(np.concatenate(arguments.evaluator.arguments[1:]))
         self.estimates, self.beside = arguments.estimates, arguments.beside
         self._tokens = [True]
@@ -193,6 +200,10 @@ class Stepper(NumbersNow, Checked):
     def __repr__(self) -> str:
         backend = "compiled C" if self.compiled else "virtual machine"
         return f"Stepper({self._title}, {backend})"
+
+    def start(self) -> np.ndarray:
+        """Return the memory of the controller before its first cycle."""
+        return self._composite.memory.start()
 
     def step(
         self,
@@ -303,6 +314,75 @@ class Stepper(NumbersNow, Checked):
             return ByName({name: value.copy() for name, value in trace.items()}, "Stepper.trace()")
         finally:
             self._tokens.append(token)
+
+    def change(self, settings: Numbers) -> bool:
+        """Put numbers of live settings in force from the next step on, by path, and return whether they were accepted.
+
+        Raises:
+            InvalidName: a setting that is not live.
+        """
+        if not named_entries("settings", settings):
+            return True
+        try:
+            _, _, numbers = self._live.changed({**self._numbers, **self._live.flat(settings)})
+            self._write(numbers)
+        except InvalidName:
+            raise
+        except FpirhcError as error:
+            return self._refuse(error)
+        self._numbers = numbers
+        return True
+
+    def set_reference(self, setpoints: SetpointsNow) -> bool:
+        """Put set-points in force from the next step on, by coordinate or output, and return whether they were accepted.
+
+        A set-point that is not finite, or outside the range or the limits of its state, is refused with all others of the call: the
+        old ones stay, `refused` counts, and `why_refused` states the reason.
+
+        Raises:
+            InvalidName: a coordinate without set-point.
+        """
+        if not named_entries("setpoints", setpoints):
+            return True
+        try:
+            row = set_points_now(self._live.problem, setpoints, self._arguments.setpoints)
+        except InvalidValue as error:
+            return self._refuse(error)
+        self._arguments.setpoints[:] = row
+        return True
+
+    @property
+    def settings(self) -> Layout:
+        """The vector of the live settings among `reads`, 'settings'; an element is a path."""
+        return Layout(tuple(s for s in self._composite.reads.signals if s.name == SETTINGS))
+
+    def bounds(self) -> dict[str, Interval]:
+        """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
+
+        It is the interval around the number of the build in which the setting is accepted while the others stay, found by trials of
+        Python's own check, to a millionth of the number. A limit of an input ends at that of the build; infinite ends refuse
+        nothing.
+        """
+        return ByName({path: self._live.bounds(path) for path in self._live.paths}, "Stepper.bounds()")
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """The live settings in force, by path."""
+        return ByName(self._numbers, "Stepper.numbers")
+
+    @property
+    def setpoints(self) -> dict[str, float]:
+        """The set-points in force, by coordinate or output."""
+        values = zip(self._live.problem.plant.chains, self._arguments.setpoints.tolist(), strict=False)
+        return ByName(dict(values), "Stepper.setpoints")
+
+    def _write(self, numbers: Mapping[str, float]) -> None:
+        if numbers:
+            self._arguments.settings[:] = list(numbers.values())
+
+    def _refuse(self, error: FpirhcError) -> bool:
+        self.refused, self.why_refused = self.refused + 1, str(error)
+        return False
 
     def _take(self, time: object, settings: Numbers | None, setpoints: SetpointsNow | None) -> None:
         """Put numbers in force, and refuse a truth value as time."""
