@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, Mistakes, NotSupported
-from fpirhc.fields.kinds import Deviation, Positive
+from fpirhc.fields.kinds import Deviation
 from fpirhc.learning.estimators import Correct, ParameterEstimator, Seen
 from fpirhc.plant.chain import disturbance_name, disturbed, quantities, response_names
 from fpirhc.plant.integrators import USUAL
@@ -26,21 +26,6 @@ from fpirhc.task.problem import Problem
 
 _GAINS: Latest[np.ndarray] = Latest(8)
 _SLOWEST = 1e-9  # decay per cycle below which a mode of the filter counts as undamped
-
-
-@dataclass(frozen=True, eq=False)
-class Modes:
-    """The parts of one disturbance and how they move by themselves in a control cycle."""
-
-    names: tuple[str, ...]  # what is added to the disturbance's name, one per part
-    moves: np.ndarray  # matrix of the parts from one cycle to the next, shape (parts, parts)
-    adds: np.ndarray  # what the parts add up to, shape (1, parts)
-
-    def of(self, count: int) -> tuple[ca.DM, ca.DM]:
-        """Return both matrices for that many disturbances, without their zeros."""
-        blocks = (np.kron(np.eye(count), one) for one in (self.moves, self.adds))
-        moves, adds = (ca.sparsify(ca.DM(one)) for one in blocks)
-        return moves, adds
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +46,14 @@ class DisturbanceKalman(ParameterEstimator):
             evaluates the model at the measured one, and moves the disturbance by the gain L times the innovation, as a
             model-referenced deformation of gain L does.
         noise: coordinate -> deviation of the white noise of its response in every cycle; zero where not named.
-        frequencies: of sines in every disturbance, rad per unit of time; each drifts as the constant does.
 
     Raises:
-        InvalidValue: no disturbance or no measured state; a frequency that is not positive.
+        InvalidValue: no disturbance or no measured state.
     """
 
     drift: Mapping[str, Deviation]
     measured: Mapping[str, Deviation]
     noise: Mapping[str, Deviation] = field(default_factory=dict)
-    frequencies: Sequence[Positive] = ()
 
     def __post_init__(self) -> None:
         require_named("DisturbanceKalman", drift=self.drift, measured=self.measured)
@@ -80,25 +63,6 @@ class DisturbanceKalman(ParameterEstimator):
 
     def learned(self) -> tuple[str, ...]:
         return tuple(disturbance_name(c) for c in self.drift)
-
-    def modes(self, problem: Problem) -> Modes:
-        """How every disturbance moves by itself: a constant, and a turning pair for every sine.
-
-        Raises:
-            InvalidProblem: a sine that the control cycle samples less than twice per turn.
-        """
-        angles = problem.period * np.array(self.frequencies)
-        if angles.size and angles.max() >= np.pi:
-            raise InvalidProblem(
-                f"DisturbanceKalman(frequencies={self.frequencies!r}): cycles of {problem.period:g} {problem.time_unit} sample the "
-                f"fastest sine less than twice per turn; stay below {np.pi / problem.period:.4g} rad/{problem.time_unit}"
-            )
-        moves = np.eye(1 + 2 * len(angles))
-        for k, angle in enumerate(angles):
-            turned = slice(1 + 2 * k, 3 + 2 * k)
-            moves[turned, turned] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        names = ("", *(f"_{part}{k}" for k in range(1, len(angles) + 1) for part in ("cos", "sin")))
-        return Modes(names, moves, np.array([[1.0, *[1.0, 0.0] * len(angles)]]))
 
     def reads_outputs(self, plant: Plant) -> bool:
         return any(n in plant.output.elements and n not in plant.state.elements for n in self.measured)
@@ -116,8 +80,6 @@ class DisturbanceKalman(ParameterEstimator):
         mistakes = Mistakes("DisturbanceKalman")
         mistakes.unknown("measured: state, output or response", self.measured, quantities(problem.plant))
         mistakes.unknown("noise: coordinate", self.noise, problem.plant.coordinates)
-        for one in sorted({f for f in self.frequencies if list(self.frequencies).count(f) > 1}):
-            mistakes.add(f"frequencies: {one:g} is given twice; a sine has one frequency, so give it once")
         mistakes.raise_if_any()
         self._check_rank(problem)
         self.gain(problem)
@@ -134,14 +96,13 @@ class DisturbanceKalman(ParameterEstimator):
         import scipy.linalg
 
         a, noise_input, c = self._matrices(problem)
-        model, modes = problem.plant, self.modes(problem)
-        size = len(self.drift) * len(modes.names)
+        model = problem.plant
         used = self._corrected(problem, a, c)
         noise = np.array([self.noise.get(n, 0.0) for n in model.names])
-        walk = problem.period * np.repeat(list(self.drift.values()), len(modes.names)) ** 2
+        walk = problem.period * np.array(list(self.drift.values())) ** 2
         q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))
         deviation = np.array(list(self.measured.values()))
-        gain = np.zeros((model.state.size + size, len(self.measured)))
+        gain = np.zeros((model.state.size + len(self.drift), len(self.measured)))
         a, c, q = a[np.ix_(used, used)], c[:, used], q[np.ix_(used, used)]
         # In units of their deviations: variances 1e17 apart leave the Riccati solver without a digit.
         scaled, one = c / deviation[:, None], np.eye(len(deviation))
@@ -165,12 +126,12 @@ class DisturbanceKalman(ParameterEstimator):
         return np.asarray(gain)
 
     def memory(self, problem: Problem) -> Layout:
-        model, modes = problem.plant, self.modes(problem).names
-        units = [model.parameters[n].unit for n in self.learned() for _ in modes]
+        model = problem.plant
+        units = tuple(model.parameters[n].unit for n in self.learned())
         return Layout(
             (
                 Signal("observed_state", model.state.elements, model.state.units),
-                Signal("observed_disturbance", tuple(n + m for n in self.learned() for m in modes), tuple(units)),
+                Signal("observed_disturbance", self.learned(), units),
             )
         )
 
@@ -182,31 +143,26 @@ class DisturbanceKalman(ParameterEstimator):
         # A map's response is to the command that acts after the state, so the next state is remembered.
         foresees = bool(self._responses(model)) and model.response_age > 0
         places = [model.parameter.elements.index(n) for n in self.learned()]
-        moves, adds = self.modes(problem).of(len(places))
 
         def disturbed_by(disturbance: Expression, seen: Seen) -> Expression:
             parameters = seen.parameters + 0
-            parameters[places] += adds @ disturbance
+            parameters[places] += disturbance
             return parameters
 
         def correct(seen: Seen, memory: Mapping[str, Expression]) -> tuple[Expression, dict[str, Expression]]:
             before, observed = memory["observed_disturbance"], memory["observed_state"]
-            predicted, moved = seen.state if not follows else observed, before
-            if not foresees:
-                moved = moves @ before
-                predicted = (
-                    advance(observed, seen.command, disturbed_by(before, seen), no_forcing) if follows else predicted
-                )
-            innovation = self._measured(model, seen) - shown(predicted, seen.command, disturbed_by(moved, seen))
+            predicted = seen.state if not follows else observed
+            if follows and not foresees:
+                predicted = advance(observed, seen.command, disturbed_by(before, seen), no_forcing)
+            innovation = self._measured(model, seen) - shown(predicted, seen.command, disturbed_by(before, seen))
             on_state, on_disturbance = gain[: model.state.size, :], gain[model.state.size :, :]
             running = seen.valid > 0.5
             state = ca.if_else(running, predicted + on_state @ innovation, seen.state)
-            disturbance = ca.if_else(running, moved + on_disturbance @ innovation, 0)
-            change = adds @ disturbance
+            disturbance = ca.if_else(running, before + on_disturbance @ innovation, 0)
             if foresees:
                 later = advance(state, seen.command, disturbed_by(disturbance, seen), no_forcing)
-                state, disturbance = ca.if_else(running, later, seen.state), moves @ disturbance
-            return change, {"observed_state": state, "observed_disturbance": disturbance}
+                state = ca.if_else(running, later, seen.state)
+            return disturbance, {"observed_state": state, "observed_disturbance": disturbance}
 
         return correct
 
@@ -236,13 +192,12 @@ class DisturbanceKalman(ParameterEstimator):
         a, b = (np.asarray(m.full()) for m in function(*_operating_point(problem), np.zeros(len(model.names))))
         effects = dict(zip(model.names, b.T, strict=True))  # that of an output is on what is measured alone
         disturbance_input = np.column_stack([effects.get(n, np.zeros(len(a))) for n in self.drift])
-        moves, adds = (np.asarray(m.full()) for m in self.modes(problem).of(len(self.drift)))
-        lower = np.hstack([np.zeros((len(moves), len(a))), moves])
-        augmented = np.vstack([np.hstack([a, disturbance_input @ adds]), lower])
+        augmented = np.eye(len(a) + len(self.drift))  # a disturbance stays
+        augmented[: len(a)] = np.hstack([a, disturbance_input])
         shown = self._shown_function(model)(x, u, p)
         places = [model.parameter.elements.index(n) for n in self.learned()]
         slopes = ca.Function(
-            "fpirhc_seen", [x, u, p], [ca.horzcat(ca.jacobian(shown, x), ca.jacobian(shown, p)[:, places] @ adds)]
+            "fpirhc_seen", [x, u, p], [ca.horzcat(ca.jacobian(shown, x), ca.jacobian(shown, p)[:, places])]
         )
         return augmented, b, np.asarray(slopes(*_operating_point(problem)).full())
 
@@ -337,7 +292,4 @@ def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:
 
 
 _NOISE = dict.fromkeys(("a", "b", "a'", "b'"), 1e-3)
-EXAMPLES = (
-    DisturbanceKalman({"a": 1.0, "b": 1.0}, _NOISE),
-    DisturbanceKalman({"a": 1.0, "b": 1.0}, _NOISE, frequencies=(2.0, 4.0)),
-)
+EXAMPLES = (DisturbanceKalman({"a": 1.0, "b": 1.0}, _NOISE),)

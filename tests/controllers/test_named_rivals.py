@@ -137,20 +137,6 @@ def test_l1_leaves_the_published_share_of_a_load(predictor):
     assert seen[-1] == pytest.approx(-2.0 * np.exp(-predictor * problem.period), rel=1e-6)
 
 
-def test_sine_as_disturbance_model_leaves_nothing_of_a_sine():
-    """The internal model principle; a random walk is late, and more so the slower its filter."""
-    problem = pushed(chain(2), disturbances={"y": fp.Formula(lambda t: 3.0 * ca.sin(5.0 * t))}, duration=30.0)
-    measured, drift = {"y": 1e-3, "y'": 1e-2}, {"y": 1.0}
-    late = {}
-    for name, estimator in {
-        "walk": fp.DisturbanceKalman(drift, measured),
-        "sine": fp.DisturbanceKalman(drift, measured, frequencies=(5.0,)),
-    }.items():
-        errors = run(problem, fp.Estimating(fp.ComputedTorque(TRACK), estimator))["error.y"]
-        late[name] = np.abs(errors[-500:]).max()
-    assert late["sine"] < 0.02 * late["walk"]
-
-
 def test_every_rival_has_its_name_in_one_module():
     """What is a controller of the literature is found there, and by its name at the top."""
     for name in fp.rivals.__all__:

@@ -1,7 +1,6 @@
 """Controllers of the literature by their names, to compare with: `fp.rivals.INDI(tracking)`.
 
-Offset-free predictive control is `Estimating(RecedingHorizon(...), DisturbanceKalman(...), at_once=True)`; with `frequencies` of
-the filter it is the periodic one.
+Offset-free predictive control is `Estimating(RecedingHorizon(...), DisturbanceKalman(...), at_once=True)`.
 """
 
 from fpirhc.controllers.rivals.disturbance_observers import ADRC, L1Adaptive
