@@ -69,7 +69,6 @@ from .sensing.differences import VelocityDifference as VelocityDifference
 from .sensing.kalman_filter import KalmanFilter as KalmanFilter
 from .sensing.sensing import Sensing as Sensing
 from .sensing.sensing import Sensor as Sensor
-from .simulation.machine import RunMonitor as RunMonitor
 from .simulation.metrics import Metric as Metric
 from .simulation.metrics import figures as figures
 from .simulation.metrics import measure as measure

@@ -19,7 +19,6 @@ class Status(IntEnum):
     RESTARTED = 6
     SOLVER_FAILED = 7
     SATURATED = 8
-    NOT_CONTRACTING = 9
     BRIDGED = 10
     SETTLING = 11
     BAD_TIME = 12
@@ -50,7 +49,6 @@ _BEST_TO_WORST = (
     Status.SATURATED,
     Status.INFEASIBLE,
     Status.HELD,
-    Status.NOT_CONTRACTING,
     Status.RESTARTED,
     Status.SOLVER_FAILED,
     Status.NON_FINITE,
@@ -75,8 +73,6 @@ _REMEDIES = {
     "use FixedPoint(), or look at the measurement that the solver was given.",
     Status.SATURATED: "the command has been at a limit for longer than the stated time; integrals go no further into it: check the "
     "actuator, the sign of its gain, and whether the limits allow the task.",
-    Status.NOT_CONTRACTING: "the measured response errors grow from cycle to cycle: the gain is too large or has the wrong sign "
-    "for this plant; lower it.",
     Status.BRIDGED: "cycles without a sample came before this one, lost or not called: the step was run once more for each; "
     "look at the sensor's connection, or at what delays the cycles.",
     Status.SETTLING: "more cycles than are bridged went by without a sample: windows were filled anew, on samples between those "

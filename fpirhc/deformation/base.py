@@ -228,11 +228,6 @@ def smooth_norm(column: Expression, floor: float) -> Expression:
     return ca.sqrt(ca.sumsqr(column) + floor * floor)
 
 
-def of_last_pair(deformation: Deformation) -> bool:
-    """Whether a request follows from the last request and its response alone: no model, pairing or memory of its own."""
-    return not (deformation.form.pairs or deformation.memory(("q",)).size)
-
-
 @dataclass(frozen=True)
 class Wrapper(Deformation, ABC):
     """Contract: a deformation around another one.

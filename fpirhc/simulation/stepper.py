@@ -18,7 +18,7 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue
 from fpirhc.fields.checked import ByName, Checked
 from fpirhc.fields.kinds import named_entries
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, RunMonitor, composed_step, refuse_unbounded
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, composed_step, refuse_unbounded
 from fpirhc.simulation.replay import CLOCK_MEMORY, Bound, Replay, missed_cycles
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
@@ -66,7 +66,7 @@ class ComposedStep:
         problem: Problem,
         controller: Controller,
         *,
-        monitor: RunMonitor | None = None,
+        saturated_after: float = 1.0,
         bounded: bool = True,
         live: Sequence[str] = (),
         bridged: int | None = None,
@@ -76,7 +76,7 @@ class ComposedStep:
         ready = checked(problem, settings.controller)
         if bounded:
             refuse_unbounded(ready)
-        composite, memory = composed_step(settings.composed, problem, ready, monitor or RunMonitor())
+        composite, memory = composed_step(settings.composed, problem, ready, saturated_after)
         replay = Replay.of(settings.problem, composite, bridged)
         return cls(problem, controller, settings, ready, composite, memory, replay)
 
@@ -105,8 +105,8 @@ class Stepper(Checked):
     the command is the one before the run. A sample for which the model has no number skips the cycle too, as NON_FINITE. So
     does a time that cannot follow the last one, as BAD_TIME (`fpirhc.simulation.replay`). A memory that is not finite is
     forgotten, and so is one with which good samples give nothing finite: the controller begins anew, with the status
-    RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. Commands
-    at a limit for long and an iteration that does not contract have the statuses SATURATED and NOT_CONTRACTING.
+    RESTARTED. Where a solver raises, the cycle is skipped with the status SOLVER_FAILED; `why_failed` has its words. A command
+    at a limit for long has the status SATURATED.
 
     One stepper serves one thread. Two threads at the same time are refused; give each a stepper of its own.
 
@@ -118,7 +118,7 @@ class Stepper(Checked):
 
     `function` is the step itself, a CasADi Function (memory, each of `reads`) -> (memory, trace, command), for code generation of
     one's own. `reads`, `memory`, `signals`, `settings` and `parameters` are the layouts of what it takes and gives: names, units,
-    and start values, which are the numbers of the build for parameters, settings and set-points. It has gate and monitor
+    and start values, which are the numbers of the build for parameters, settings and set-points. It has gate and watch
     inside; not inside are missed cycles, a solver that raises, and the check of settings (`bounds`).
 
     A controller that does better without its adaptation is warned of once, `HarmfulAdaptation`, after four runs of 300 cycles on
@@ -131,7 +131,7 @@ class Stepper(Checked):
         controller: Controller,
         *,
         compiled: bool = True,
-        monitor: RunMonitor | None = None,
+        saturated_after: float = 1.0,
         bounded: bool = True,
         live: Sequence[str] = (),
         bridged: int | None = None,
@@ -139,12 +139,14 @@ class Stepper(Checked):
         """Compose the controller's Function, and compile it where `compiled` is set and there is a compiler.
 
         Args:
-            monitor: when SATURATED and NOT_CONTRACTING are reported; None: after 1 s, and over 50 cycles.
+            saturated_after: time at a limit from which the status is SATURATED, s; in the plant's unit where that has no seconds.
             bounded: whether an optimiser whose call may take any time is refused.
             bridged: number of missing cycles up to which each of them is run afterwards; None: 5, or 20 behind differences of
                 positions.
         """
-        step = ComposedStep.of(problem, controller, monitor=monitor, bounded=bounded, live=live, bridged=bridged)
+        step = ComposedStep.of(
+            problem, controller, saturated_after=saturated_after, bounded=bounded, live=live, bridged=bridged
+        )
         self._bind(step, compiled=compiled)
         warn_of_harm(problem, controller)
 

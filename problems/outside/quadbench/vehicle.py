@@ -143,7 +143,7 @@ def rate_controller(gain):
     )
     form = fp.ModelReferenced(fp.Affine(gain=-gain)) if gain else fp.Identity()
     law = fp.ComputedTorque(fp.Exponential(rate=DERIVATIVE, integral=False), form)
-    return fp.Stepper(problem, law, compiled=False, monitor=fp.RunMonitor(saturated_after=1e6))
+    return fp.Stepper(problem, law, compiled=False, saturated_after=1e6)
 
 
 class Vehicle:
