@@ -22,31 +22,21 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.spectrum import predicted_factor
 from fpirhc.errors import FpirhcError, OutputError
-from fpirhc.simulation.drawing import (
-    BANDS,
-    PALETTE,
-    caption_axes,
-    draw_legend,
-    literal,
-    new_figure,
-    responses_of,
-    shown_motion,
-)
+from fpirhc.simulation.drawing import BANDS, PALETTE, draw_legend, literal, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import player
+from fpirhc.studies import finite_alone
 from fpirhc.studies.verdict import IN_FULL, Outcome
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from fpirhc.simulation.picture import Drawing
     from fpirhc.studies import View
-    from fpirhc.studies.compare import Comparison, Contraction
+    from fpirhc.studies.compare import Comparison, Contraction, Entry
     from fpirhc.studies.open_loop import Solved
     from fpirhc.task.problem import Problem
 
@@ -89,10 +79,7 @@ def render(comparison: Comparison) -> str:
         real=any("real" in chart for chart in series["charts"]),
         own=own,
         motions=motions,
-        contraction=[
-            Image(one.address, f"{one.axes[0].get_title()}: {one.axes[0].get_ylabel()}")
-            for one in contraction_figures(comparison)
-        ],
+        contraction=any("across" in chart for chart in series["charts"]),
     )
 
 
@@ -218,6 +205,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
         if n not in real[0].run.layout["state"].elements:  # the model does not have it
             lines = [(e.name, e.run[f"reality_state.{n}"]) for e in real]
             charts.append({**_chart(n, real[0].run.unit(f"reality_state.{n}"), lines, edges), "real": True})
+    charts += contraction_charts(comparison)
     middles = 0.5 * np.diff(edges) * longest.period
     return {
         "controllers": [
@@ -304,77 +292,52 @@ def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
 
 
 def colours_of(comparison: Comparison) -> dict[str, str]:
-    """Return the colour of every controller that ran, by name: the same one in all pictures of a report, the pair's first."""
-    names = sorted(
-        (e.name for e in comparison.entries if e.run.cycles > 1),
-        key=lambda name: name not in (comparison.findings[0].pair or ()),
-    )
-    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(names)))
+    """Return the colour of every controller that ran, by name: that of its place in the problem file, whichever others ran."""
+    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(comparison.places)))
     extra = (f"#{''.join(f'{round(255 * one):02x}' for one in colour)}" for colour in more)
-    return dict(zip(names, (*PALETTE, *extra), strict=False))
+    of_file = dict(zip(comparison.places, (*PALETTE, *extra), strict=False))
+    return {e.name: of_file[e.name] for e in comparison.entries if e.run.cycles > 1}
 
 
-def contraction_figures(comparison: Comparison) -> list[Drawing]:
-    """Return a picture for every gain by its own name and scale, and one of the response errors; none where nothing contracts."""
-    from fpirhc.simulation.picture import Drawing
-
+def contraction_charts(comparison: Comparison) -> list[dict[str, Any]]:
+    """Return a chart for every gain by its own name and scale, and one of the response errors; none where nothing contracts."""
     entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
-    colours, groups = colours_of(comparison), dict[tuple[str, float], list[Any]]()
+    groups: dict[tuple[str, float], list[tuple[str, Contraction]]] = {}
     for entry in entries:
         if entry.contraction is not None:
             name, scale = entry.contraction.report.own  # where no gain converges: of the effective gain
             own = (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
             groups.setdefault(own, []).append((entry.name, entry.contraction))
-    figures = [Drawing(figsize=(5.5, 3.8)) for _ in range(len(groups) + 1) if entries]
-    for figure in figures:  # places that are fixed: to fit them takes two thirds of a picture's time
-        figure.subplots_adjust(left=0.13, right=0.98, bottom=0.14, top=0.92)
-    axes = [figure.subplots() for figure in figures]
-    for axis, ((name, scale), same) in zip(axes, groups.items(), strict=False):
-        _draw_factor(axis, name, scale, same, colours)
-    units, cycles = {e.run.unit(f"desired.{n}") for e in entries for n in e.run.layout["desired"].elements}, 0
+    charts = [_chart_of_factor(name, scale, same) for (name, scale), same in groups.items()]
+    return [*charts, _chart_of_errors(entries)] if entries else []
+
+
+def _chart_of_factor(gain: str, scale: float, entries: Sequence[tuple[str, Contraction]]) -> dict[str, Any]:
+    own, spectrum = [one.report.effective_gain for _, one in entries], entries[0][1].spectrum
+    limit = max((end for _, one in entries for end in one.report.linear_limit), key=abs) or 1.0
+    gains = np.unique(scale * np.append(np.linspace(0, _BEYOND * limit, INTERVALS), own))
+    bound = np.abs(1 - gains[:, None] / scale * spectrum.eigenvalues.ravel()).max(axis=1)
+    lines = [("bound", bound), ("limit", np.ones(gains.size))]
+    lines += [(n, np.where(gains == scale * one.report.effective_gain, one.measured, np.nan)) for n, one in entries]
+    return _across("contraction factor of the iteration alone", "1", gain, gains, lines)
+
+
+def _chart_of_errors(entries: Sequence[Entry]) -> dict[str, Any]:
+    units = {e.run.unit(f"desired.{n}") for e in entries for n in e.run.layout["desired"].elements}
+    lines, cycles = list[tuple[str, np.ndarray]](), min(_CYCLES, max(e.run.cycles for e in entries) - 1)
     for entry in entries:
-        apart = (entry.run[responses_of(entry.run.layout)["realised"]][1:] - entry.run["desired"][:-1])[:_CYCLES]
-        cycles = max(cycles, len(apart))
+        apart = (entry.run[responses_of(entry.run.layout)["realised"]][1:] - entry.run["desired"][:-1])[:cycles]
         if len(units) > 1:  # of different units: shares of their own ranges
             apart = apart / np.maximum(np.ptp(entry.run["desired"], axis=0), 1e-300)
         size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
-        shown = np.where((size > 0) & np.isfinite(size), size, np.nan)
-        axes[-1].semilogy(range(1, size.size + 1), shown, color=colours[entry.name], label=literal(entry.name), lw=1)
-    for axis in axes[-1:]:
-        unit = f"[{units.pop()}]" if len(units) == 1 else "of the ranges of desired"
-        caption_axes(axis, "control cycle", literal(f"|realised - desired| {unit}"))
-        span = f"{cycles} cycles, {cycles * entries[0].run.period:.3g} {comparison.time_unit}"
-        axis.set_title(literal(f"The response error in the first {span}"), fontsize=10, y=1.0)
-        draw_legend(axis)
-    return figures
+        lines.append((entry.name, np.append(np.where(size > 0, size, np.nan), np.full(cycles - len(size), np.nan))))
+    unit = units.pop() if len(units) == 1 else "of the ranges of desired"
+    return {**_across("|realised - desired|", unit, "control cycle", np.arange(1, cycles + 1), lines), "log": True}
 
 
-def _draw_factor(
-    axis: Axes, gain: str, scale: float, entries: Sequence[tuple[str, Contraction]], colours: dict[str, str]
-) -> None:
-    first = entries[0][1]
-    limit = max((end for _, one in entries for end in one.report.linear_limit), key=abs) or 1.0
-    gains = np.linspace(0, _BEYOND * limit, 300)
-    factors = np.abs(1 - gains[:, None] * first.spectrum.eigenvalues.ravel()).max(axis=1)
-    axis.plot(scale * gains, factors, color="#444444", lw=1.2)
-    axis.axhline(1.0, color="#aa0000", lw=0.8)
-    if predicted_factor(first.spectrum.eigenvalues, limit) > 0.999:
-        axis.axvline(scale * limit, color="#aa0000", lw=0.8, ls="--", label="linear limit: small errors")
-    ends: dict[tuple[float, str], str] = {}
-    for name, one in entries:
-        own, colour = scale * one.report.effective_gain, colours[name]
-        axis.plot(own, one.report.predicted, "o", ms=9, mfc="none", mew=1.5, color=colour, label=literal(name))
-        axis.plot(own, one.measured, "x", ms=7, mew=1.5, color=colour, zorder=5)
-        linear, sector = (max(ends_of, key=abs) for ends_of in (one.report.linear_limit, one.report.sector_limit))
-        if linear and predicted_factor(one.spectrum.eigenvalues, linear) < 0.999:
-            ends.setdefault((round(linear, 3), "limit with the response's delay"), colour)
-        if sector and abs(sector) < 0.999 * abs(linear):
-            ends.setdefault((round(sector, 3), "sector limit: errors of any size"), colour)
-    for (end, what), colour in ends.items():
-        axis.axvline(scale * end, color=colour, lw=1.6, ls=":", label=what)
-    axis.set_ylim(0, 1.6)
-    axis.locator_params(axis="x", nbins=7)
-    axis.ticklabel_format(axis="x", scilimits=(-3, 4))
-    caption_axes(axis, literal(gain), "contraction factor")
-    axis.set_title("Contraction of the iteration alone: o predicted, x measured", fontsize=10, y=1.0)
-    draw_legend(axis)
+def _across(
+    title: str, unit: str, label: str, values: np.ndarray, lines: Sequence[tuple[str, np.ndarray]]
+) -> dict[str, Any]:
+    """A chart over another axis than time."""
+    series = [{"name": name, "values": finite_alone(_round(line))} for name, line in lines]
+    return {"title": title, "unit": unit, "series": series, "across": {"label": label, "values": _round(values)}}

@@ -49,7 +49,8 @@ STYLES = {
     Outcome.LIMIT_LEFT: "bold red",
     None: "",  # a remark
 }
-_IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\d{3}\b)"), "\ue000"  # thousands, and what no line breaks at in their place
+# before thousands or a unit, where no line breaks, and what stands there until lines are broken
+_IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\S{1,12}(?:\s|$))"), "\ue000"
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
 _DRAWN = 0.1  # s from one picture of a bar to the next
@@ -58,11 +59,13 @@ _EDGES = 2  # columns left and right of a table
 
 
 def say(text: str, style: str = "", more: str = "", *, wrap: bool = True) -> None:
-    """Print text in which nothing is markup, and more of it without the style; without `wrap` it stays on one line."""
+    """Print text in which nothing is markup, and more without the style; `wrap`: lines go on below the text of a list."""
     console, whole = Console(), Text.assemble((printable(text), style), printable(more))
     whole.plain = _IN_NUMBER.sub(_HELD, whole.plain)
-    for line in whole.wrap(console, console.width) if wrap else [whole]:
-        line.plain = line.plain.replace(_HELD, " ")
+    below = len(re.sub(r"^(- |  \w* *(-> )?)?.*", r"\1", text, flags=re.DOTALL))
+    for k, line in enumerate(whole.wrap(console, console.width - below) if wrap else [whole]):
+        line.plain = line.plain.replace(_HELD, " ").rstrip()
+        line.pad_left(below * (k > 0))
         console.print(line, highlight=False, soft_wrap=True)
 
 

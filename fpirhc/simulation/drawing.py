@@ -113,7 +113,9 @@ def draw_responses(axis: Axes, run: Run, names: Sequence[str], _: str) -> None:
     """Draw the nominal, desired, deformed and realised response of the first coordinate; a spike does not hide the rest."""
     columns = {what: f"{signal}.{names[0]}" for what, signal in responses_of(run.layout).items()}
     for what, column in columns.items():
-        draw_line(axis, run, column, f"{names[0]} {what}", _RESPONSES[what], ":" if what == "realised" else "-")
+        draw_line(
+            axis, run, column, f"{names[0]} {what}", _RESPONSES[what], {"deformed": "--", "nominal": ":"}.get(what, "-")
+        )
     values = np.abs(np.concatenate([run[column] for column in columns.values()])) if run.cycles else np.zeros(1)
     usual = float(np.quantile(values, 0.99))
     if usual > 0 and values.max() > _TALL * usual:
@@ -151,9 +153,9 @@ def shown_motion(layout: Layout) -> str:
 
 
 def responses_of(layout: Layout) -> dict[str, str]:
-    """Return the columns of responses by what they are: time slots find their realised ones from what is measured."""
+    """Return the columns of responses by what they are, the lowest first: those of time slots are found from what is measured."""
     own = "realised_of_slots" in layout
-    return {n: n for n in ("nominal", "desired", "deformed")} | {"realised": "realised_of_slots" if own else "realised"}
+    return {"realised": "realised_of_slots" if own else "realised"} | {n: n for n in ("deformed", "desired", "nominal")}
 
 
 def run_figure(run: Run) -> Figure:

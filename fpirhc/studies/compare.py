@@ -33,7 +33,7 @@ from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, experiment, harm_in, shortened, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
-from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, objective
+from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, follows, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compile_all
@@ -101,7 +101,7 @@ class Entry:
     exact: bool  # whether its model is exact where the others' is not
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
-    cycle: float | None = None  # mean time of a cycle, us
+    cycle: tuple[float, ...] | None = None  # mean time of a cycle, that of 99 %, and the longest, us
     left: tuple[Followed, ...] = ()  # hard limits that it leaves, the worst first
     noise: Finding | None = None  # what noise of its response costs, where that has none
     notes: tuple[str, ...] = ()
@@ -118,6 +118,8 @@ class Comparison(Study):
 
     seed: int
     measure_from: float
+    places: tuple[str, ...]  # all controllers of the file, in its order
+    rivals: frozenset[str]  # names of the rows of which the best numbers are marked: they follow, with a wrong model
     entries: tuple[Entry, ...]
     skipped: Mapping[str, str]
     findings: tuple[Finding, ...]
@@ -144,22 +146,24 @@ class Comparison(Study):
     @property
     def view(self) -> View:
         shown = columns([e.metrics for e in self.entries], in_report)
-        done = [e.metrics for e in self.entries if e.run.stop is None and not e.exact]
+        done = [e.metrics for e in self.entries if e.name in self.rivals]
         best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.main}
         best = {c: number for c, number in best.items() if number is not None}
         heads = [Column(c.heading, c.short if c.metric.main else None) for c in shown]
-        heads = [Column("controller"), *heads, Column("cycle [us]"), Column("status", left=True)]
+        heads = [Column("controller"), *heads, Column("cycle / 99 % / longest [us]"), Column("status", left=True)]
         table = Table(self.title, heads)
         for e in self.entries:
-            marked = [k for k, c in enumerate(shown, 1) if not e.exact and c in best and c.number(e.metrics) == best[c]]
-            texts = [c.text(c.number(e.metrics), missing="", none="none") for c in shown]
+            numbers = [(c, c.number(e.metrics)) for c in shown]
+            marked = [k for k, (c, v) in enumerate(numbers, 1) if e.name in self.rivals and v == best.get(c, np.nan)]
+            texts = [c.text(v, missing="", none="none") for c, v in numbers]
             why = "" if str(e.run.stop) in self.findings[0].text else f": {e.run.stop}"  # which stands above the table
             status = f"ended early{why}" if e.run.stop else status_shares(e.metrics.statuses)
             status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
-            cycle = f"{round(e.cycle, 1):g}" if e.cycle else ""
+            cycle = " / ".join(f"{float(f'{one:.3g}'):g}" for one in e.cycle or ())
             table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
         about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
-        notes = [f"{e.name}: {note}" for e in self.entries for note in e.notes]
+        notes = [CLOCK] * any(e.cycle for e in self.entries)
+        notes += [f"{e.name}: {note}" for e in self.entries for note in e.notes]
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
         null = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
         lists = {"Notes": notes, f"Null tests: {NULL}": null}
@@ -218,13 +222,16 @@ def compare(
             done = {*skipped, *(e.name for e in entries)}
             skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
             break
+    yard = Yardstick.of(problem, seed)
     return Comparison(
         **circumstances(task, selected, command, begin),
         seed=seed,
         measure_from=problem.measure_from,
+        places=tuple(task.controllers),
+        rivals=frozenset(e.name for e in entries if not e.exact and (aim.metric or follows(e, yard))),
         entries=tuple(entries),
         skipped=skipped,
-        findings=findings(entries, task.headline, Yardstick.of(problem, seed), skipped, aim),
+        findings=findings(entries, task.headline, yard, skipped, aim),
         pictures=task.pictures,
         time_unit=problem.time_unit,
         steps=problem.real_plant.step is not None,
@@ -323,13 +330,14 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
+CLOCK = "A cycle is a call of the controller, from measurement to command: the mean, what 99 % take at most, and the longest."
 
 
-def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> float | None:
-    """Mean wall time of a call of the controller, from measurement to command, us: few calls may hold all plans."""
+def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float, ...]:
+    """Mean, 99 % and longest wall time of a call of the controller, us: few calls may hold all plans."""
     stepper, count = Stepper.of(composed, compiled=compiled), min(run.cycles, REPLAYED)
     if not count:
-        return None
+        return ()
     step: Callable[..., Any] = stepper.step_measured if stepper.estimates else stepper.step
     samples: tuple[np.ndarray, ...] = (run.time, run["state"], run["realised"])
     if stepper.estimates:
@@ -342,7 +350,7 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> float | Non
         begin = time.perf_counter_ns()
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
-    return float(taken.mean()) / 1e3
+    return float(taken.mean()) / 1e3, *(np.percentile(taken, (99, 100)) / 1e3).tolist()
 
 
 def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:

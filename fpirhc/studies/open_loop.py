@@ -25,7 +25,6 @@ from fpirhc.members import member_modules
 from fpirhc.optimisers import Optimiser
 from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.summary import line, number
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
 
@@ -62,26 +61,6 @@ class Certificate:
     active: int = 0
     complementarity: float = 0.0
     broken: tuple[str, ...] = ()
-
-    def __repr__(self) -> str:
-        return line(self, *(f"{name} {value}" for name, value in self._facts()))
-
-    def _facts(self) -> list[tuple[str, str]]:
-        limits = [
-            ("active limits of states", str(self.active)),
-            ("complementarity", number(self.complementarity)),
-            *(("violated limit", text) for text in self.broken),
-        ]
-        return [
-            ("contraction factor", number(self.factor)),
-            ("error of any input at most", number(self.input_error)),
-            ("cost above the optimum at most", number(self.suboptimality)),
-            ("stationarity", number(self.stationarity)),
-            ("feasibility", number(self.feasibility)),
-            ("free directions" if self.active else "free inputs", str(self.free)),
-            ("least relative curvature", number(self.curvature)),
-            *(limits if self.active or self.broken else []),
-        ]
 
 
 @checked_call

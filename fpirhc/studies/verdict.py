@@ -382,6 +382,13 @@ def findings(
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 
 
+def follows(entry: Entry, yard: Yardstick) -> bool:
+    """Whether a run ends, with no error larger than the motion, and not all of them as large as those of the plant left alone."""
+    names = entry.weighed or entry.errors
+    idle = [entry.errors[n] >= yard.alone[n] for n in names if yard.alone.get(n)]
+    return entry.run.stop is None and not any(yard.beyond(entry, n) for n in names) and not (idle and all(idle))
+
+
 def relative_error(entry: Entry, yard: Yardstick, names: Collection[str]) -> float:
     """Return the error over the ranges, root mean square over these coordinates; infinite for a run that ended early."""
     if entry.run.stop is not None:
@@ -396,7 +403,8 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
-        among, above = " with the wrong model" * any(e.exact for e in entries), "No controller follows. " * (least > 1)
+        above = "" if any(follows(e, yard) for e in entries) else "No controller follows. "
+        among = " with the wrong model" * any(e.exact for e in entries)
         yield f"{above}Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]

@@ -2,7 +2,16 @@
 // Linked charts: one cursor, one zoom, one set of shown controllers. DATA is written by the page.
 const HEIGHT = 220; // of a chart, px
 const labelled = { size: 30, labelSize: 18, labelGap: 0, labelFont: "12px system-ui,sans-serif" };
-const RESPONSES = { nominal: "#009e73", desired: "#0072b2", deformed: "#e69f00", realised: "#d55e00" };
+// Color, width and dashes of lines that are no controller's; those drawn later lie above.
+const LINES = {
+  realised: ["#d55e0099", 3],
+  deformed: ["#e69f00", 1.2, [6, 3]],
+  desired: ["#0072b2", 1.2],
+  nominal: ["#009e73", 1.6, [2, 4]],
+  reference: [null, 1.2, [5, 4]],
+  "set-point": [null, 1.2, [1, 3]],
+  limit: ["#d55e00", 1.2, [5, 4]],
+};
 const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
 // The palette's black is the page's ink, which is light where the page is dark.
 const tone = (color) => (color === "#111111" ? ink : color);
@@ -17,7 +26,7 @@ function zoomAll(source, key) {
   if (key !== "x" || zooming) return;
   zooming = true;
   const { min, max } = source.scales.x;
-  for (const plot of plots) if (plot.chart !== source) plot.chart.setScale("x", { min, max });
+  for (const plot of plots) if (plot.chart !== source && !plot.spec.across) plot.chart.setScale("x", { min, max });
   zooming = false;
 }
 
@@ -47,7 +56,7 @@ function follow(chart) {
   if (chart.cursor.left >= 0) for (const one of players) one.follow(chart.posToVal(chart.cursor.left, "x"));
 }
 function point(time) {
-  for (const { chart, box } of plots) if (!box.hidden) chart.setCursor({ left: chart.valToPos(time, "x"), top: -10 }, false);
+  for (const { chart, box, spec } of plots) if (!box.hidden && !spec.across) chart.setCursor({ left: chart.valToPos(time, "x"), top: -10 }, false);
 }
 
 // All boxes stand in the grid before a chart is drawn: a box that is alone in it is as wide as the page.
@@ -57,34 +66,39 @@ function place(spec) {
   const title = document.createElement("h3");
   title.textContent = spec.title + " [" + spec.unit + "]";
   box.append(title);
-  document.getElementById(spec.only ? "responses" : spec.real ? "reality" : "charts").append(box);
+  document.getElementById(spec.only ? "responses" : spec.real ? "reality" : spec.across ? "contraction" : "charts").append(box);
   return { box, spec };
 }
 
 function draw({ box, spec }) {
-  const series = [{ label: "t [" + DATA.timeUnit + "]" }].concat(
-    spec.series.map((s) => ({
-      label: s.name,
-      stroke: colors[s.name] || RESPONSES[s.name] || ink,
-      width: 1.2,
-      dash: { reference: [5, 4], "set-point": [1, 3], deformed: [6, 3] }[s.name],
-      // A map has no motion between two cycles: its signals hold from one to the next.
-      ...(DATA.steps ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}),
-      value: (_, v) => (v === null || v === undefined ? "" : v.toPrecision(4)),
-    }))
+  const across = spec.across || { label: "t [" + DATA.timeUnit + "]", values: DATA.time };
+  const series = [{ label: across.label }].concat(
+    spec.series.map((s) => {
+      const [color, width, dash] = LINES[s.name] || [null, 1.2];
+      return {
+        label: s.name,
+        stroke: colors[s.name] || color || ink,
+        width,
+        dash,
+        points: { show: s.values.filter((v) => v !== null).length === 1, size: 9, fill: colors[s.name] }, // a value alone is a dot
+        // A map has no motion between two cycles: its signals hold from one to the next.
+        ...(DATA.steps && !spec.across ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}),
+        value: (_, v) => (v === null || v === undefined ? "" : v.toPrecision(4)),
+      };
+    })
   );
   const axis = { stroke: ink, grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 } };
   const options = {
     width: box.clientWidth,
     height: HEIGHT,
     series,
-    scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec)) } },
-    axes: [{ ...axis, ...labelled, label: "t [" + DATA.timeUnit + "]" }, { ...axis, ...AXIS_OF_VALUES }],
-    cursor: { sync: { key: sync.key } },
+    scales: { x: { time: false }, y: spec.log ? { distr: 3 } : { range: rangeOfValues(() => ended(spec)) } },
+    axes: [{ ...axis, ...labelled, ...(spec.across ? { values: AXIS_OF_VALUES.values } : {}), label: across.label }, { ...axis, ...(spec.log ? AXIS_OF_POWERS : AXIS_OF_VALUES) }],
+    cursor: spec.across ? {} : { sync: { key: sync.key } },
     legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
-    hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
+    hooks: spec.across ? {} : { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
   };
-  const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
+  const chart = new uPlot(options, [across.values, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });
 }
 
@@ -102,6 +116,7 @@ function show() {
       box.hidden = !shown.has(spec.only) || shown.size > 2;
       continue;
     }
+    box.hidden = Boolean(spec.across) && !spec.series.some((s) => shown.has(s.name));
     spec.series.forEach((s, k) => {
       if (s.name in colors) chart.setSeries(k + 1, { show: shown.has(s.name) });
     });

@@ -340,14 +340,14 @@ METRICS = (
     Metric("plans", plans, better="neither", report=False, order=90),
     Metric("cost", cost, by="term", shown=("total",), order=70, always=False),
     Metric(
-        "contraction.predicted",
-        predicted,
+        "contraction.measured",
+        measured,
         short="contr. factor",
         better="neither",  # the smallest factor is not the best gain
         main=True,
         order=85,
         always=False,
     ),
-    Metric("contraction.growing", growing, title="contraction above 1", text=in_percent, order=85, always=False),
-    Metric("contraction.measured", measured, order=85, always=False),
+    Metric("contraction.predicted", predicted, title="contraction bound", better="neither", order=85, always=False),
+    Metric("contraction.growing", growing, title="bound above 1", text=in_percent, order=85, always=False),
 )
