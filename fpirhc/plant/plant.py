@@ -227,9 +227,12 @@ class Plant(Checked):
 
     def response_signal(self, name: str) -> Signal:
         """Return a signal that holds a highest derivative of every controlled quantity; of order 0 it is the quantity."""
+        return Signal(name, self.controlled_names, self._response_units)
+
+    @cached_property
+    def _response_units(self) -> tuple[str, ...]:
         units, time = followed_units(self), self.time_unit
-        own = tuple([derivative_unit(units[n], order, time) for n, order in self.response_orders.items()])
-        return Signal(name, self.controlled_names, own)
+        return tuple(derivative_unit(units[n], order, time) for n, order in self.response_orders.items())
 
     @cached_property
     def controlled_names(self) -> tuple[str, ...]:

@@ -45,13 +45,12 @@ def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
         settled["reality"] = problem.reality and problem.reality.over(problem.period)
     if mistakes:
         return {}
-    if plant.step is not None:
-        if problem.horizon is not None and any(length % 1 for length in problem.horizon.lengths):
-            mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}")
-        if problem.sensing.estimator.measures_all and not plant.at_once:
-            from fpirhc.sensing.differences import StepDifference  # of maps alone
+    if plant.step is not None and problem.horizon is not None and any(length % 1 for length in problem.horizon.lengths):
+        mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}")
+    if problem.sensing.estimator.measures_all and plant.response_age:
+        from fpirhc.sensing.differences import StepDifference  # of maps alone
 
-            settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
+        settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
     return settled
 
 
