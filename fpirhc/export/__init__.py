@@ -28,7 +28,6 @@ from fpirhc.simulation.simulate import simulate
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import command_of, find_compiler
-from fpirhc.symbolic.open import SETTINGS
 from fpirhc.symbolic.program import generate
 from fpirhc.task.problem import Problem
 
@@ -67,7 +66,7 @@ class Device:
     @cached_property
     def settings(self) -> Layout:
         """Live settings, with their units as far as they are known."""
-        own = self._read(lambda name: name == SETTINGS).signals
+        own = self.stepper.settings.signals
         return Layout(tuple(replace(s, units=tuple(unit_of_setting(e, self.problem) for e in s.elements)) for s in own))
 
     @cached_property

@@ -11,7 +11,7 @@ import hashlib
 import html
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -56,10 +56,7 @@ class LabLoop:
 
     def started(self, problem: Problem) -> np.ndarray:
         """Return the first memory with other parameters."""
-        if not self.ready.live.paths:
-            return start_memory(self.ready.loop, problem, self.ready.controller)
-        own, controller, values = self.ready.live.changed({})
-        return start_memory(self.ready.loop, replace(own, plant=problem.plant), controller, values)
+        return start_memory(self.ready.loop, problem, self.ready.controller)
 
     @cached_property
     def shown(self) -> list[str]:

@@ -22,7 +22,6 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.layout import Layout
-from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.checks import check_values
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps, in_force, pairs
@@ -111,7 +110,6 @@ class StepArguments:
 
     Attributes:
         evaluator: of the Function.
-        settings: argument of the live settings; no entries without any.
         setpoints: argument of the set-points; no entries without any.
         time, memory, state, realised, output, command: views; `state` is that of the raw measurements where they are read.
         memory_before, memory_next, trace, command_next: arrays of the memory that is read, and of what is written.
@@ -128,7 +126,6 @@ class StepArguments:
         arguments["parameters"][:] = parameters
         self.sample = arguments
         places = {name: k + 1 for k, name in enumerate(composite.reads.names)}  # after the memory
-        self.settings = arguments.get(SETTINGS, NOTHING)
         self.setpoints = np.zeros(0)
         for signal in problem.given_signals:
             self.setpoints = self.evaluator.arguments[places[signal.name]]

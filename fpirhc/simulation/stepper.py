@@ -30,11 +30,10 @@ from fpirhc.simulation.step_arguments import (
     set_points_now,
 )
 from fpirhc.simulation.trials import warn_of_harm
-from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.block import Composite, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
-from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -356,7 +355,7 @@ class Stepper(Checked):
     @property
     def settings(self) -> Layout:
         """The vector of the live settings among `reads`, 'settings'; an element is a path."""
-        return Layout(tuple(s for s in self._composite.reads.signals if s.name == SETTINGS))
+        return open_settings(self._composite.blocks)
 
     def bounds(self) -> dict[str, Interval]:
         """Return for each live setting the interval of the numbers that a device without Python may accept, by path.
@@ -379,8 +378,8 @@ class Stepper(Checked):
         return ByName(dict(values), "Stepper.setpoints")
 
     def _write(self, numbers: Mapping[str, float]) -> None:
-        if numbers:
-            self._arguments.settings[:] = list(numbers.values())
+        for signal in self.settings.signals:
+            self._arguments.sample[signal.name][:] = list(numbers.values())
 
     def _refuse(self, error: FpirhcError) -> bool:
         self.refused, self.why_refused = self.refused + 1, str(error)
