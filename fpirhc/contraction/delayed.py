@@ -24,7 +24,7 @@ _RANGE = 1e-3, 20.0  # of the gain times the largest eigenvalue that is searched
 _STEPS, _HALVINGS = 60, 25
 _SHARES = 0.15, 0.3, 0.45, 0.6, 0.75, 0.9  # of a gain that converge too
 _SPARE, _SPARE_OF_TWO_POLES = 1.25, 1.5
-_NOTHING = 1e-12  # largest eigenvalue of a Jacobian that has no effect
+_NOTHING = 1e-12  # gain, or largest eigenvalue of a Jacobian, that has no effect
 _JACOBIANS: Latest[Array] = Latest(8)  # a search checks many gains at the same start
 
 
@@ -144,7 +144,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     it likes. With a reality the response is that at the end of a cycle; nothing is judged where the command has not reached it.
     """
     gain = deformation.effective_gain()
-    if gain == 0:
+    if abs(gain) <= _NOTHING:
         return
     what, (name, value) = with_its_gain(deformation), own_gain(deformation)
     pairs = not any(against_wrappers(Paired(deformation, cycles=1.0)))  # whether it may be paired

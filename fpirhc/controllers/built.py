@@ -9,8 +9,6 @@ skipped cycle leaves the estimator's memory as it was, like every other one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,7 +29,6 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
-from fpirhc.symbolic.open import open_numbers
 from fpirhc.task.dead_time import every
 from fpirhc.task.problem import Problem
 
@@ -94,7 +91,7 @@ class Built:
     def inner(self, wrapper: Controller) -> Built:
         """Return what the controller inside a wrapper is built from."""
         assert wrapper.inner is not None
-        return replace(build(wrapper.inner_problem(self.problem), wrapper.inner), follows=self.follows)
+        return replace(made(wrapper.inner_problem(self.problem), wrapper.inner), follows=self.follows)
 
     def path(self, deformation: Deformation) -> Path:
         """Return the way of the commands to the model, as a deformation believes it."""
@@ -106,13 +103,15 @@ _LATEST: Latest[Built] = Latest(8)
 
 def build(problem: Problem, controller: Controller) -> Built:
     """Return the controller built for the problem: the one place where a pair is checked and its automatic numbers are chosen."""
-    ready = (
-        controller if open_numbers(problem, controller) else checked(problem, controller)
-    )  # open ones were checked closed
-    return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _built(problem, ready))
+    return made(problem, checked(problem, controller))
 
 
-def _built(problem: Problem, ready: Controller) -> Built:
+def made(problem: Problem, ready: Controller) -> Built:
+    """Return what `build` returns, of a controller that has been checked: one inside another, or one with open numbers."""
+    return _LATEST.of((problem, ready), (plans_are_compiled(),), lambda: _made(problem, ready))
+
+
+def _made(problem: Problem, ready: Controller) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
     own, before = problem.own_signals, tuple(map(float, problem.inputs_before))
@@ -141,32 +140,26 @@ def _built(problem: Problem, ready: Controller) -> Built:
     )
 
 
-_REFUSES = ContextVar("fpirhc_refuses_gains", default=True)
 _CHECKED: Latest[Controller] = Latest(16)  # a comparison asks for the same controllers again and again
 
 
-@contextmanager
-def any_gain(*, yes: bool = True) -> Iterator[None]:
-    """Within it no gain is refused: a review asks loops that no run would begin; `yes` False: it is again."""
-    token = _REFUSES.set(not yes)
-    try:
-        yield
-    finally:
-        _REFUSES.reset(token)
-
-
-def checked(problem: Problem, controller: Controller, *, numbers_only: bool = False) -> Controller:
+def checked(
+    problem: Problem, controller: Controller, *, numbers_only: bool = False, any_gain: bool = False
+) -> Controller:
     """Return the resolved controller, checked against the problem.
 
     Args:
         numbers_only: whether only numbers have changed since the last check, so that what is slow to build need not be built again.
+        any_gain: whether no gain is refused: a review asks loops that no run would begin.
     """
-    facts = numbers_only, _REFUSES.get()
-    return _CHECKED.of((problem, controller), facts, lambda: _checked(problem, controller, numbers_only))
+    facts = numbers_only, any_gain
+    return _CHECKED.of((problem, controller), facts, lambda: _checked(problem, controller, *facts))
 
 
-def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Controller:
+def _checked(problem: Problem, controller: Controller, numbers_only: bool, any_gain: bool) -> Controller:
     ready = resolved(problem, controller)
+    if ready.inner is not None:
+        checked(ready.inner_problem(problem), ready.inner, numbers_only=numbers_only, any_gain=any_gain)
     if numbers_only and ready.inner is None and ready.planner is not None:
         ready.planner.planned(problem)  # which checks the weights of a cost of its own
     else:
@@ -174,7 +167,7 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool) -> Co
     refuse([*_against_form(problem, ready.deformation), *against_believed(problem, ready)])
     if problem.sensing.observer is not None:
         check_observed(problem)
-    if ready.deforms not in ("target", "turns") and _REFUSES.get():  # their own checks judge gains
+    if ready.deforms not in ("target", "turns") and not any_gain:  # their own checks judge gains
         require_converging(problem, ready.deformation)
     return ready
 

@@ -116,12 +116,8 @@ class Cascade(Controller):
     def with_deformation(self, deformation: Deformation) -> Controller:  # type: ignore[override]
         return replace(self, deformation=deformation) if deformation.adapts else without_deformation(self.controller)
 
-    def with_defaults(self, problem: Problem) -> Cascade:  # noqa: ARG002 -- the reference says nothing of the size of a shift
-        return self
-
     def check(self, problem: Problem) -> None:
-        """Raise if the inner controller, the map or the pairing does not fit the problem."""
-        self.controller.check(self.inner_problem(problem))
+        """Raise if the map or the pairing does not fit the problem."""
         form, name = self.deformation.form, type(self.deformation).__name__
         if automatic(self.deformation):
             raise InvalidValue(

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar, cast
 
 import numpy as np
 
-from fpirhc.controllers.reference_states import request_along_reference, request_of_plans
-from fpirhc.deformation.base import Deformation, Identity, automatic, scaled_for, with_inner
+from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
+from fpirhc.deformation.base import Deformation, Identity, RequestChange, automatic, scaled_for, with_inner
 from fpirhc.errors import require
 from fpirhc.fields.checked import Checked, replaced, unnamed_inner
 from fpirhc.fields.kinds import described
@@ -187,20 +187,23 @@ class Controller(Checked, ABC):
         """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
         own = self.deformation
         deformation = late_deformation(own, problem)
-        if automatic(deformation):
-            plans = self.planner is not None
-            request = request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(self))
-            deformation = scaled_for(deformation, request)
+        if automatic(deformation) and self.deforms != "target":  # the reference says nothing of the size of its shifts
+            deformation = scaled_for(deformation, self._request(problem))
         return self if deformation is own else self.with_deformation(deformation)
+
+    def _request(self, problem: Problem) -> RequestChange:
+        """How much what the deformation acts on changes."""
+        if self.deforms == "command":
+            return request_of_commands(problem)
+        plans = self.planner is not None
+        return request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(self))
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return sentences about the controller on this problem, for a reader of results."""
         return () if self.inner is None else self.inner.notes(self.inner_problem(problem))
 
     def check(self, problem: Problem) -> None:
-        """Raise if the controller cannot serve the problem."""
-        if self.inner is not None:
-            self.inner.check(self.inner_problem(problem))
+        """Raise if the controller cannot serve the problem; what it wraps is checked by itself before."""
 
 
 class Undeformed(Controller, ABC):

@@ -16,7 +16,7 @@ from typing import cast
 
 import numpy as np
 
-from fpirhc.controllers.built import Built, build, checked
+from fpirhc.controllers.built import Built, checked, made
 from fpirhc.controllers.contract import Controller, resolved
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, NotSupported, nearest
 from fpirhc.fields.kinds import described, real_number
@@ -24,7 +24,8 @@ from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.dotted import changed_at, content_at, entry, levels, meant, names_in, paths_to
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
-from fpirhc.symbolic.open import ANEW, Opened, not_live
+from fpirhc.symbolic.layout import Layout
+from fpirhc.symbolic.open import ANEW, SETTINGS, Opened, not_live
 from fpirhc.task.cases import is_whole
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -52,14 +53,14 @@ class LiveSettings:
         """The numbers of the build by path."""
         return {path: float(self._content(path)) for path in self.paths}
 
-    def composed(self, compose: Callable[[Built], Composite]) -> Composite:
+    def composed(self, compose: Callable[[Built], Composite], *, any_gain: bool = False) -> Composite:
         """Return what `compose` makes of the controller that is built with open numbers, if there are any."""
+        ready = checked(self.problem, self.controller, any_gain=any_gain)
         if not self.paths:
-            return compose(build(self.problem, self.controller))
-        checked(self.problem, self.controller)
+            return compose(made(self.problem, ready))
         opened = Opened(self.start)
         try:
-            composite = compose(build(*self._with(opened.symbols, checked=False)))
+            composite = compose(made(*self._with(opened.symbols, checked=False)))
         except _OF_BUILD as error:
             interruption = unwrapped(error)
             if not isinstance(interruption, Exception):
@@ -141,6 +142,10 @@ class LiveSettings:
                 raise InvalidValue(f"setting '{path}': expected a number, got {described(value)}")
             values[path] = number
         return values
+
+    def places(self, memory: Layout) -> np.ndarray:
+        """Return where a memory has the numbers of all live settings."""
+        return np.arange(memory.size)[memory.slice(SETTINGS)] if self.paths else np.zeros(0, dtype=int)
 
     def _with(self, contents: Mapping[str, object], *, checked: bool = True) -> tuple[Problem, Controller]:
         """Problem and controller with other contents, by path."""

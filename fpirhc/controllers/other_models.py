@@ -40,6 +40,9 @@ class ExactModel(ControllerWrapper):
     """
 
     def inner_problem(self, problem: Problem) -> Problem:
+        return _MODELLED.of((problem,), (), lambda: self._modelled(problem))
+
+    def _modelled(self, problem: Problem) -> Problem:
         model = self.plant_model(problem)
         plant = _EXACT.of((model.plant,), (), lambda: _known(model.plant))
         return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
@@ -107,10 +110,9 @@ class Estimating(ControllerWrapper):
         return (*notes, f"{text}from the measurement; name states: {', '.join(problem.plant.coordinates)}")
 
     def check(self, problem: Problem) -> None:
-        """Raise if the estimator or the wrapped controller does not fit the problem."""
+        """Raise if the estimator does not fit the problem."""
         modelled = self.inner_problem(problem)
         self.estimator.check(modelled)
-        self.controller.check(modelled)
         if self.dead_time is not None:
             self.dead_time.check(problem.plant, problem.period)
         lost = problem.sensing.believed_response(problem.plant)

@@ -75,8 +75,7 @@ class Predicted(ControllerWrapper):
         return (*notes, f"Predicted follows set-points {late} late; give one that is known ahead so much earlier")
 
     def check(self, problem: Problem) -> None:
-        """Raise if the wrapped controller, the prediction or the dead time does not fit the problem."""
-        self.controller.check(problem)
+        """Raise if the prediction or the dead time does not fit the problem."""
         plant, cycles = problem.plant, self._cycles(problem.period)
         free = (e for e in plant.output.elements if e.rstrip("'") not in plant.controlled_names)
         unmoved = [*plant.equations.hidden, *free]

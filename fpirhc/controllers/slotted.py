@@ -17,7 +17,7 @@ import casadi as ca
 
 from fpirhc.controllers.base import Controller, judge_block, reference_block, warm_up_block
 from fpirhc.controllers.believed import measured
-from fpirhc.controllers.built import Built, build, checked, with_aim
+from fpirhc.controllers.built import Built, checked, made, with_aim
 from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
@@ -139,7 +139,7 @@ class Slotted(Controller):
         return Block("schedule", Layout((built.plant.time,)), Layout((scalar("slot"),)), step)
 
     def _turn(self, built: Built, number: int, name: str) -> Turn:
-        one = build(slot_problem(built.problem, name), self.slots[name])
+        one = made(slot_problem(built.problem, name), self.slots[name])
         same = built.plant.response_orders.get(name) == one.plant.response_orders[name]
         place = built.plant.controlled_names.index(name) if same else None
         return Turn(number, name, self.slots[name], replace(one, warm_up=built.warm_up + (place is None)), place)

@@ -7,7 +7,7 @@ on by one period with that command held. The way from the command to what moves 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -28,13 +28,12 @@ from fpirhc.simulation.tables import disturbance_signal
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
-from fpirhc.symbolic.open import SETTINGS
 from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
 from fpirhc.task.problem import Problem
 
 
-def close_loop(problem: Problem, controller: Controller) -> Composite:
-    """Return the closed loop as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
+def closed_loop(built: Built) -> Composite:
+    """Return the closed loop of what is built as one step: (memory, [disturbance], [sensing], [setpoints]) -> (memory, trace).
 
     With an `ExternalPlant` the step also reads its measurements, and returns the inputs that it is sent.
 
@@ -42,11 +41,6 @@ def close_loop(problem: Problem, controller: Controller) -> Composite:
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
     `setpoints` only where the reference is given some.
     """
-    return closed_loop(build(problem, controller))
-
-
-def closed_loop(built: Built) -> Composite:
-    """Return the closed loop of a controller that is built."""
     problem = built.problem
     mover, inner = moving(problem), built.step
     lost, ranges = lost_blocks(mover), sensor_ranges(problem)
@@ -64,14 +58,11 @@ def closed_loop(built: Built) -> Composite:
     return compose("loop", reads, around, delays, outputs=mover.sent)
 
 
-def start_memory(
-    loop: Composite, problem: Problem, controller: Controller, numbers: Mapping[str, float] | None = None
-) -> np.ndarray:
-    """Return the first memory of a loop, shape (loop.memory.size,).
+def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
+    """Return the first memory of a loop, shape (loop.memory.size,), with the live settings of the build.
 
     Args:
         problem: the problem of the loop, or one that differs from it in the exact parameters only.
-        numbers: all open ones, by path; None: those of the build.
     """
     mover, whole = moving(problem), loop.memory.start()
     blocks = (*sensing_blocks(mover, predicts=False), *seeing_blocks(problem)[0])
@@ -83,8 +74,6 @@ def start_memory(
     places = {column.removeprefix(f"{INNER}."): k for k, column in enumerate(loop.memory.columns)}
     for signal in signals:
         whole[[places[column] for column in signal.columns]] = signal.start_vector()
-    if numbers and SETTINGS in loop.memory:
-        whole[loop.memory.slice(SETTINGS)] = list(numbers.values())
     return whole
 
 

@@ -120,7 +120,8 @@ class Simulator:
         controller, numbers = own.controller, live.start
         if settings:
             problem, controller, numbers = live.changed(settings)
-        start = start_memory(own.loop, problem, controller, numbers)
+        start = start_memory(own.loop, problem, controller)
+        start[live.places(own.loop.memory)] = list(numbers.values())
         rows, talk = _padded(problem, ()), moving(problem).exchange(seed)
         tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints)
         logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress)
@@ -179,10 +180,10 @@ class ComposedLoop:
     loop: Composite
 
     @classmethod
-    def of(cls, problem: Problem, controller: Controller, live: Sequence[str] = ()) -> Self:
+    def of(cls, problem: Problem, controller: Controller, live: Sequence[str] = (), *, any_gain: bool = False) -> Self:
         """Return the loop of problem and controller; arguments and errors as in `simulator`."""
         settings = live_settings(problem, controller, live)
-        return cls(problem, settings, settings.composed(closed_loop))
+        return cls(problem, settings, settings.composed(closed_loop, any_gain=any_gain))
 
     @property
     def controller(self) -> Controller:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -11,8 +11,7 @@ from scipy.linalg import companion, solve_continuous_lyapunov
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block, tracked_blocks
 from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import OfDerivatives
-from fpirhc.controllers.reference_states import request_of_commands
-from fpirhc.deformation.base import Deformation, automatic, scaled_for
+from fpirhc.deformation.base import Deformation
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
@@ -81,11 +80,6 @@ class ForceMRAC(Controller):
 
     tracking: Tracking
     deformation: Deformation
-
-    def with_defaults(self, problem: Problem) -> ForceMRAC:
-        if not automatic(self.deformation):
-            return self
-        return replace(self, deformation=scaled_for(self.deformation, request_of_commands(problem)))
 
     deforms = "command"
 
