@@ -44,8 +44,8 @@ class Predicted(ControllerWrapper):
 
     Args:
         controller: any controller.
-        inputs: dead time of all inputs, one number, s; the sum of both dead times is rounded to control cycles.
-        measurement: dead time of the measurement, s.
+        inputs: a time, the dead time of all inputs, s; the sum of both dead times is rounded to control cycles.
+        measurement: a time too, the dead time of the measurement, s.
         by: what is integrated over the dead time: the "model" under the commands that are on their way, or the "desired" responses.
         residual_time: time constant of the low-pass on the residual of the model's responses that is added, s; None: no residual.
             The loop of the residual has a limit of its own: it is stable at moderate rate x dead time (0.4) and unstable at long
