@@ -17,7 +17,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.reference_states import reference_states
 from fpirhc.deformation.affine import Affine
-from fpirhc.deformation.base import Deformation, default_pole
+from fpirhc.deformation.base import Deformation, default_pole, own_gain
 from fpirhc.deformation.delayed import Paired
 from fpirhc.deformation.filters import Filtered
 from fpirhc.deformation.model_referenced import ModelReferenced
@@ -91,12 +91,12 @@ class Choice:
         return {name: one for k, (name, one) in enumerate(found.items()) if one not in list(found.values())[:k]}
 
     def _shortlist(self) -> dict[str, Deformation]:
-        """What makes the error on the plant as estimated clearly less, by name of its form, the best first."""
+        """What makes the error on the plant as estimated clearly less, by name of its form and gain, the best first."""
         found = dict[str, tuple[float, Deformation]]()
         with compiled_plans():
             for done, name in enumerate(names := self._forms(1.0, 0.0), 1):
                 if one := self._best(name):
-                    found[name] = one
+                    found[f"{name}, gain {own_gain(one[1])[1]:.4g}"] = one
                 self._progress("gains on the plant as estimated", done, len(names))
         return {name: found[name][1] for name in sorted(found, key=lambda name: found[name][0])}
 
@@ -149,7 +149,7 @@ class Choice:
         """The error with another gain; infinity where it does not pass, or is not below `least`, so that it does not count."""
         one = _times(self.candidates[form], _STEP**place) if place else self.candidates[form]
         outcome = self._real.of(one, seed)
-        name = f"{form}, {_STEP**place:.3g} times its gain" if place else form
+        name = f"{form.partition(', gain ')[0]}, gain {own_gain(one)[1]:.4g}" if place else form
         if counts := outcome.error < least:
             self._places[name], self.candidates[name], self.results[name] = (form, place), one, outcome
         return outcome.error if counts and outcome.passes else math.inf

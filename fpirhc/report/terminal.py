@@ -24,7 +24,6 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table as Grid
 from rich.text import Text
 
-from fpirhc.deformation.base import own_gain
 from fpirhc.simulation.metrics import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
@@ -289,11 +288,10 @@ def show_probe(title: str, answer: Probe) -> None:
     for estimate, value in answer.facts:
         estimates.add([estimate, value])
     show_table(estimates)
-    tried = map(Column, ("gain", "error, of that without", "worst", "passes"))
+    tried = map(Column, ("error, of that without", "worst", "passes"))
     trials = Table("trials", [Column("candidate", left=True), *tried])
     for candidate, one in answer.trials.items():
-        gain = number(own_gain(answer.candidates[candidate])[1])
-        trials.add([candidate, gain, written_out(one.error), written_out(one.worst), "yes" if one.passes else "no"])
+        trials.add([candidate, written_out(one.error), written_out(one.worst), "yes" if one.passes else "no"])
     if trials.rows:
         show_table(trials)
     for note in answer.notes:
