@@ -108,7 +108,7 @@ def test_an_excited_run_finds_what_suits_the_plant():
     adaptive, left = replace(RHC, deformation=fp.ModelReferenced(fp.Affine(gain=-0.2))), dict[str, int]()
     found = fp.probe(stated, adaptive, cycles=150, progress=lambda what, n, of: left.update({what: of - n}))
     assert (set(left.values()), "ModelReferenced, as it is" in found.trials) == ({0}, True)
-    assert all(n.endswith((f"gain {one.effective_gain() / -0.5:.4g}", "as it is")) for n, one in found.candidates.items())
+    assert all(n.endswith((f"gain {c.effective_gain() / -0.5:.4g}", "as it is")) for n, c in found.candidates.items())
     assert found.dead_time["u"].value == dead
     assert found.gain["q"]["q"].low <= gain <= found.gain["q"]["q"].high
     assert found.lag["u"].low <= lag <= found.lag["u"].high
