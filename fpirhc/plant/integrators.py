@@ -24,23 +24,37 @@ from fpirhc.symbolic.layout import Expression
 _NAMES = ["x", "u", "p", "w"], ["x_next"]
 
 
+@dataclass(frozen=True)
 class Integrator(Checked, ABC):
-    """Contract: how x' = f(x, u, p, w) moves in a time. A map has steps of its own, and no use for it."""
+    """Contract: how x' = f(x, u, p, w) moves in a time, in equal sub-steps. A map has steps of its own, and no use for it."""
 
-    def finer(self, times: int) -> Integrator | None:  # noqa: ARG002
-        """The same method with about `times` times the work; None where it has no such setting."""
-        return None
+    substeps: Few = 1
 
-    def growth(self, modes: np.ndarray) -> np.ndarray | None:  # noqa: ARG002
-        """Return |R(z)|, by which a cycle multiplies a mode whose pole times period is z, per mode.
+    @abstractmethod
+    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
+        """Function (x, u, p, w) -> x after one sub-step of length h, of one with the same arguments -> dx/dt."""
+
+    def finer(self, times: int) -> Integrator | None:
+        """The same method with so many times the sub-steps; None where these were too many."""
+        more = self.substeps * times
+        return replace(self, substeps=more) if more <= FEW else None
+
+    def growth(self, modes: np.ndarray) -> np.ndarray | None:
+        """Return |R(z)|, by which a cycle multiplies a mode whose pole times period is z, per mode, by sub-steps of x' = z x.
 
         None: no decaying mode ever grows, as in implicit methods.
         """
-        return None
+        once: Any = self.method(cast(ca.Function, lambda x: modes * x), 1 / self.substeps)
+        return np.asarray(np.abs(once(1.0)) ** self.substeps)
 
-    @abstractmethod
+    @final
     def integrate(self, rate: ca.Function, period: float) -> ca.Function:
         """Function (state, input, parameters, forcing) -> state after `period`, of one with the same arguments -> dx/dt."""
+        x, u, p, w = _symbols(rate)
+        once, after = self.method(rate, period / self.substeps), x
+        for _ in range(self.substeps):
+            after = once(after, u, p, w)
+        return ca.Function("fpirhc_moved", [x, u, p, w], [after], *_NAMES)
 
     @final
     def step(self, plant: Plant, period: float) -> ca.Function:
@@ -71,34 +85,7 @@ class Integrator(Checked, ABC):
         return ca.Function("fpirhc_stretched", [x, u, p, length], [after])
 
 
-@dataclass(frozen=True)
-class _Substepped(Integrator):
-    """Equal sub-steps of one method; `finer` has more of them, as many as there may be."""
-
-    substeps: Few = 1
-
-    def finer(self, times: int) -> Integrator | None:
-        more = self.substeps * times
-        return replace(self, substeps=more) if more <= FEW else None
-
-    @abstractmethod
-    def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
-        """Function (x, u, p, w) -> x after one sub-step of length h."""
-
-    def growth(self, modes: np.ndarray) -> np.ndarray | None:
-        """The method's own sub-steps of x' = z x from x = 1."""
-        once: Any = self.method(cast(ca.Function, lambda x: modes * x), 1 / self.substeps)
-        return np.asarray(np.abs(once(1.0)) ** self.substeps)
-
-    def integrate(self, rate: ca.Function, period: float) -> ca.Function:
-        x, u, p, w = _symbols(rate)
-        once, after = self.method(rate, period / self.substeps), x
-        for _ in range(self.substeps):
-            after = once(after, u, p, w)
-        return ca.Function("fpirhc_moved", [x, u, p, w], [after], *_NAMES)
-
-
-class RungeKutta4(_Substepped):
+class RungeKutta4(Integrator):
     """Classical fourth-order Runge-Kutta with so many equal sub-steps per cycle: local error O(h^5), global O(h^4)."""
 
     def method(self, rate: ca.Function, h: float) -> Callable[..., Expression]:
@@ -113,7 +100,7 @@ class RungeKutta4(_Substepped):
 
 
 @dataclass(frozen=True)
-class Collocation(_Substepped):
+class Collocation(Integrator):
     """Collocation at Radau points, of order 2 d - 1: for plants with modes much faster than the step. None of them ever grows.
 
         x_j = x + h sum_k a_jk f(x_k, u, p),   j = 1 ... d,   x+ = x_d
@@ -159,15 +146,13 @@ class Collocation(_Substepped):
 
 def own_steps(plant: Plant, integrator: Integrator, period: float) -> int:
     """Return how many steps of its own a plant makes in a cycle: those of a map, sub-steps, and else one."""
-    return round(period / plant.step) if plant.step is not None else getattr(integrator, "substeps", 1)
+    return round(period / plant.step) if plant.step is not None else integrator.substeps
 
 
 def own_step(plant: Plant, integrator: Integrator, period: float) -> ca.Function:
     """Return the Function of one of these steps, as `Integrator.step`."""
     count = own_steps(plant, integrator, period)
-    if plant.step is None and count > 1:
-        integrator = replace(cast(_Substepped, integrator), substeps=1)
-    return integrator.step(by_single_steps(plant), period / count)
+    return replace(integrator, substeps=1).step(by_single_steps(plant), period / count)
 
 
 USUAL = RungeKutta4()
