@@ -16,7 +16,7 @@ from typing import Annotated
 
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked, checked_call
-from fpirhc.fields.kinds import JudgedByOwner, Range, finite_number, real_number
+from fpirhc.fields.kinds import JudgedByOwner, Positive, Range, finite_number
 from fpirhc.symbolic.dotted import copied
 
 
@@ -158,42 +158,29 @@ class Spread(Checked, ABC):
         """Return the least and the largest value."""
         return self.quantile(exact, share, 0.0), self.quantile(exact, share, 1.0)
 
-    def mistake(self, exact: float) -> str:
+    def mistake(self, exact: float) -> str:  # noqa: ARG002
         """Return why the spread cannot belong to a parameter with this exact value; empty where it can."""
-        lowest, highest = self.interval(exact, 1.0)
-        return "" if lowest < highest else f"has the value {exact:g}, of which a share is nothing; give absolute=..."
+        return ""
 
 
 @dataclass(frozen=True)
-class _Wide(Spread, ABC):
-    """A spread whose width is one of the parameter's unit, or a share of its value."""
+class Uniform(Spread):
+    """Uniform in exact -+ `absolute`, in the parameter's unit."""
 
-    absolute: float | None = None
-    relative: float | None = None
-
-    def __post_init__(self) -> None:
-        values = [v for v in (self.absolute, self.relative) if v is not None]
-        if len(values) != 1 or real_number(values[0]) is None or not 0 < values[0] < math.inf:
-            raise InvalidValue(
-                f"{self!r}: expected one positive number, absolute=... in the parameter's unit or relative=... as a share"
-            )
-
-    def _width(self, exact: float) -> float:
-        return self.absolute if self.absolute is not None else (self.relative or 0.0) * abs(exact)
-
-
-class Uniform(_Wide):
-    """Uniform in exact -+ width, which is absolute, in the parameter's unit, or relative, a share of |exact|."""
+    absolute: Positive
 
     def quantile(self, exact: float, share: float, probability: float) -> float:
-        return exact + share * self._width(exact) * (2 * probability - 1)
+        return exact + share * self.absolute * (2 * probability - 1)
 
 
-class Normal(_Wide):
-    """Normal around exact, cut off at two standard deviations, which are absolute or relative as the width of `Uniform` is."""
+@dataclass(frozen=True)
+class Normal(Spread):
+    """Normal around exact with the deviation `absolute`, in the parameter's unit, cut off at two of them."""
+
+    absolute: Positive
 
     def quantile(self, exact: float, share: float, probability: float) -> float:
-        return exact + share * self._width(exact) * _standard(probability)
+        return exact + share * self.absolute * _standard(probability)
 
 
 _FACTOR = Range("a number above 1, such as 1.3 for 30 %", lambda v: 1 < v < math.inf)
@@ -224,12 +211,3 @@ def _standard(probability: float) -> float:
     if probability in (0.0, 1.0):
         return TAILS * (2 * probability - 1)
     return _NORMAL.inv_cdf(_LEAST + (1 - 2 * _LEAST) * probability)
-
-
-EXAMPLES = (
-    Uniform(absolute=0.5),
-    Uniform(relative=0.3),
-    Normal(absolute=0.2),
-    Normal(relative=0.1),
-    LogNormal(factor=1.3),
-)

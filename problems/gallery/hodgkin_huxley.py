@@ -67,7 +67,7 @@ plant = fp.Plant(
     response=response,
     time_unit="ms",
     parameters={
-        "C": fp.Parameter(approximate=1.2, exact=1.0, unit="uF/cm^2", spread=fp.Uniform(relative=0.1)),
+        "C": fp.Parameter(approximate=1.2, exact=1.0, unit="uF/cm^2", spread=fp.Uniform(absolute=0.1)),
         "gNa": fp.Parameter(approximate=0.0, exact=120.0, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
         "gK": fp.Parameter(approximate=0.0, exact=36.0, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
         "gL": fp.Parameter(approximate=0.5, exact=0.3, unit="mS/cm^2", spread=fp.LogNormal(factor=1.2)),
