@@ -6,12 +6,11 @@ is entered once per chunk: for disturbances and noise, to check that all signals
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self, TypeAlias
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
@@ -37,7 +36,6 @@ from fpirhc.task.problem import Problem
 _DESCRIBED: Latest[object] = Latest(16)
 _CHAIN = 5  # cycles of the inner chain of the virtual machine
 Progress = Callable[[int, int], None]
-Compiled: TypeAlias = tuple[Evaluator, bool, str]  # whether it is compiled, and why not
 Patch: TypeAlias = tuple[int, np.ndarray, np.ndarray]  # cycle, places in the memory, their values
 SWITCHED_OFF = "compiled=False was given"  # a reason why a loop is not compiled
 _TOO_SHORT = "the run is short, and a compiler would take longer"
@@ -52,30 +50,65 @@ class Simulator:
 
     Args:
         problem: the task.
-        controller: with its automatic settings chosen.
-        loop: the closed loop as one step.
-        evaluator: of the loop over `CHUNK` cycles, or fewer that divide it.
-        compiled: whether the loop is compiled C.
-        why_not_compiled: reason where it is not; empty where it is.
         live: the settings that a run may change.
+        loop: the closed loop as one step.
+        compiles: whether the loop is compiled; None: unless the run is short.
     """
 
     problem: Problem
-    controller: Controller
-    loop: Composite
-    evaluator: Evaluator
-    compiled: bool
-    why_not_compiled: str
     live: LiveSettings
+    loop: Composite
+    compiles: bool | None
 
-    def built_for(self, problem: Problem) -> Simulator:
-        """Return the loop of another form of the problem; it is not compiled again where its code is the same."""
-        live = live_settings(problem, self.live.unresolved, self.live.paths)
-        loop = live.composed(closed_loop)
-        if loop.function.serialize() == self.loop.function.serialize():
-            return replace(self, problem=problem, controller=live.controller, loop=loop, live=live)
-        anew = ComposedLoop.of(problem, self.live.unresolved, self.live.paths)
-        return anew.simulator(self.compiled)
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        controller: Controller,
+        compiled: bool | None,
+        live: Sequence[str] = (),
+        *,
+        any_gain: bool = False,
+    ) -> Self:
+        """Return the loop of problem and controller, compiled when it first runs; arguments and errors as in `simulator`."""
+        settings = live_settings(problem, controller, live)
+        return cls(problem, settings, settings.composed(closed_loop, any_gain=any_gain), compiled)
+
+    @property
+    def controller(self) -> Controller:
+        """The controller with its automatic settings chosen."""
+        return self.live.controller
+
+    @property
+    def calls(self) -> int:
+        """Cycles of a call of the compiled loop; 0 where no compiler is asked."""
+        horizon, plans = self.problem.horizon, innermost(self.controller).planner is not None
+        long = self.problem.cycles * (horizon.stages if plans and horizon is not None else 1) > _SHORT_RUN
+        return cycles_per_call(self.problem, compiled=True) * bool(self.compiles or (self.compiles is None and long))
+
+    @cached_property
+    def backend(self) -> Native:
+        """What runs the loop's cycles, and the reason where it is not compiled C."""
+        function = self.loop.function
+        if self.calls:
+            return native(function, required=bool(self.live.paths), calls=self.calls)
+        return Native(function, False, SWITCHED_OFF if self.compiles is False else _TOO_SHORT)
+
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """The loop over so many cycles as a call runs."""
+        interpreted, function = cycles_per_call(self.problem, compiled=False), self.backend.function
+        return Evaluator(function if self.compiled else chained(function, interpreted, _CHAIN))
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the loop is compiled C."""
+        return self.backend.compiled
+
+    @property
+    def why_not_compiled(self) -> str:
+        """Reason where it is not; empty where it is."""
+        return self.backend.reason
 
     def outdated_by(self, problem: Problem) -> bool:
         """Whether a variant needs a loop of its own: plans that know the exact parameters begin their line search with a step that
@@ -115,7 +148,9 @@ class Simulator:
             NotContractive: a gain with which the deformation cannot converge.
         """
         problem = variant or self.problem
-        own = self.built_for(problem) if self.outdated_by(problem) else self
+        own: Simulator = self
+        if self.outdated_by(problem):
+            own = simulator(problem, self.live.unresolved, compiled=self.compiles, live=self.live.paths)
         live = replace(own.live, problem=problem)
         controller, numbers = own.controller, live.start
         if settings:
@@ -168,67 +203,9 @@ def simulator(
         NotSupported: a setting that decides what the loop is made of, or that this loop needs as a number.
         CompileError: the compiler fails on a loop with live settings.
     """
-    return ComposedLoop.of(problem, controller, live).simulator(compiled)
-
-
-@dataclass(frozen=True, eq=False)
-class ComposedLoop:
-    """A closed loop that is composed, and not compiled."""
-
-    problem: Problem
-    live: LiveSettings
-    loop: Composite
-
-    @classmethod
-    def of(cls, problem: Problem, controller: Controller, live: Sequence[str] = (), *, any_gain: bool = False) -> Self:
-        """Return the loop of problem and controller; arguments and errors as in `simulator`."""
-        settings = live_settings(problem, controller, live)
-        return cls(problem, settings, settings.composed(closed_loop, any_gain=any_gain))
-
-    @property
-    def controller(self) -> Controller:
-        """The controller with its automatic settings chosen."""
-        return self.live.controller
-
-    @property
-    def function(self) -> ca.Function:
-        """One cycle of the loop."""
-        return self.loop.function
-
-    def worth_compiling(self, compiled: bool | None) -> bool:
-        """Return whether a compiler is asked; `compiled` as in `simulator`."""
-        horizon, plans = self.problem.horizon, innermost(self.controller).planner is not None
-        long = self.problem.cycles * (horizon.stages if plans and horizon is not None else 1) > _SHORT_RUN
-        return bool(compiled or (compiled is None and long))
-
-    @property
-    def calls(self) -> int:
-        """Cycles of a call of the compiled loop."""
-        return cycles_per_call(self.problem, compiled=True)
-
-    def simulator(self, compiled: bool | None, known: dict[object, Compiled] | None = None) -> Simulator:
-        """Return the loop ready to run.
-
-        A loop whose code is `known` is not compiled again, and `known` gets that of every other one: loops of one code differ in
-        their first memory alone, as those of most starts do.
-        """
-        ready, worth = self.controller, self.worth_compiling(compiled)
-        if known is None:
-            return Simulator(self.problem, ready, self.loop, *self._code(compiled), self.live)
-        key = worth, hashlib.sha256(self.function.serialize().encode()).digest()
-        code = known.get(key) or self._code(compiled)
-        result = Simulator(self.problem, ready, self.loop, *code, self.live)
-        known[key] = code
-        return result
-
-    def _code(self, compiled: bool | None) -> Compiled:
-        function = self.function
-        backend = Native(function, False, SWITCHED_OFF if compiled is False else _TOO_SHORT)
-        if self.worth_compiling(compiled):
-            backend = native(function, required=bool(self.live.paths), calls=self.calls)
-        interpreted = cycles_per_call(self.problem, compiled=False)
-        called = backend.function if backend.compiled else chained(function, interpreted, _CHAIN)
-        return Evaluator(called), backend.compiled, backend.reason
+    ready = Simulator.of(problem, controller, compiled, live)
+    ready.backend  # noqa: B018 -- what cannot be compiled is an error here
+    return ready
 
 
 @checked_call

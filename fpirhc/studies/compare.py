@@ -28,7 +28,7 @@ from fpirhc.simulation.metrics.shipped import sampled_spectrum
 from fpirhc.simulation.pictures import Picture
 from fpirhc.simulation.ranges import Followed, limits_left
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import ComposedLoop, Simulator
+from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, experiment, harm_in, shortened, weighed
@@ -243,8 +243,7 @@ class _Rows:
 
     def __init__(self, task: Task, controllers: Mapping[str, Controller], seed: int, compiled: bool | None) -> None:
         self._task, self._controllers, self._seed, self._compiled = task, controllers, seed, compiled
-        self.composed: dict[str, tuple[ComposedLoop, ComposedStep | None]] = {}
-        self._loops: dict[str, Simulator] = {}
+        self.composed: dict[str, tuple[Simulator, ComposedStep | None]] = {}
         self.wanted: list[tuple[Any, int]] = []  # Functions to be compiled, and so many calls of each
         self._model = ModelAsPlant(task.problem, seed=seed)
         adaptive = [n for n, one in controllers.items() if one.deformation.adapts and pair_of(controllers, n)]
@@ -253,28 +252,22 @@ class _Rows:
     def compose(self, name: str) -> None:
         """Compose a loop, and its step by hand."""
         problem = self._task.problem
-        loop = ComposedLoop.of(problem, resolved(problem, self._controllers[name]))
+        loop = Simulator.of(problem, resolved(problem, self._controllers[name]), self._compiled)
         facts: dict[str, Any] = {"bounded": False, "broken": []}
         step = attempted("the time of a cycle", ComposedStep.of, problem, loop.controller, **facts)
         self.composed[name] = loop, step
-        if loop.worth_compiling(self._compiled):
-            self.wanted += [(loop.function, loop.calls), *([(step.function, 0)] if step is not None else [])]
-
-    def _loop(self, name: str) -> Simulator:
-        ready = self._loops.get(name)
-        if ready is None:
-            ready = self._loops[name] = self.composed[name][0].simulator(self._compiled)
-        return ready
+        if loop.calls:
+            self.wanted += [(loop.loop.function, loop.calls), *([(step.function, 0)] if step is not None else [])]
 
     def entry(self, name: str, progress: Callable[[int, int], None] | None) -> Entry:
         """Run a controller; a part that breaks is told, and loses no run."""
         problem, broken = self._task.problem, list[str]()
-        part, loop = partial(attempted, broken=broken), self._loop(name)
+        part, (loop, step) = partial(attempted, broken=broken), self.composed[name]
         run = loop.run(seed=self._seed, name=name, progress=progress)
         ready, metrics = loop.controller, measure(problem, run, self._task.metrics)
         pair = pair_of(self._controllers, name) if ready.deformation.adapts else None
         pair = pair if pair in self.composed else None
-        step, judged = self.composed[name][1], weighed(problem, ready)
+        judged = weighed(problem, ready)
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
         cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
@@ -286,7 +279,7 @@ class _Rows:
         return Entry(name, run, metrics, adapts, pair, judged, exact, contraction, null, cycle, left, noise, notes)
 
     def _null(self, pair: str, name: str, judged: frozenset[str] | None) -> ErrorPair:
-        return errors_of(*self._model.pair((self._loop(pair), self._loop(name))), judged)
+        return errors_of(*self._model.pair((self.composed[pair][0], self.composed[name][0])), judged)
 
 
 def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Metrics) -> Contraction | None:

@@ -26,7 +26,7 @@ from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
 from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.run import Run
-from fpirhc.simulation.simulate import Compiled, ComposedLoop, Simulator
+from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies import Progress, versions
 from fpirhc.studies.compare import select
 from fpirhc.studies.variants import Variant, Variants
@@ -49,7 +49,6 @@ class Runner:
         self._task, self._name, self._controller = task, name, task.controllers[name]
         self._metrics, self._compiled = metrics, compiled
         self._loops: dict[object, Simulator | FpirhcError] = {}
-        self._codes: dict[object, Compiled] = {}
         self._ranges, self._held = ranges(task.problem)
 
     def rows(self, variants: Iterable[Variant]) -> Iterator[Row]:
@@ -120,9 +119,9 @@ class Runner:
             if not paths:
                 checked(base, controller)
             controller = resolved(one.believed, controller) if one.believed else controller
-            loop = ComposedLoop.of(base, resolved(base, controller), paths)
             # A loop that runs once is worth a compiler where the run is long.
-            return loop.simulator(self._compiled and (None if once and not paths else True), known=self._codes)
+            compiled = self._compiled and (None if once and not paths else True)
+            return simulator(base, resolved(base, controller), compiled=compiled, live=paths)
         except FpirhcError as error:
             return error
 
