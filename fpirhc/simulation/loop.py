@@ -28,7 +28,7 @@ from fpirhc.simulation.tables import disturbance_signal
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
-from fpirhc.task.dead_time import MEASUREMENT, Queue, delay_block
+from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.problem import Problem
 
 
@@ -122,7 +122,7 @@ def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
     """Motion and response as the controller is given them; where these are not the plant's own, also the true ones and error."""
     problem, plant = mover.problem, mover.problem.plant
     response = plant.response_signal("realised")
-    at_once = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    at_once = problem.sensing.ideal and not problem.dead_time.measurement
     if at_once and not problem.truth.seen:
         sense = [mover.sense(plant.motion, response)]
         return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
@@ -146,7 +146,7 @@ def _true_blocks(mover: Mover, response: Signal) -> tuple[list[Block], Shown]:
     blocks = [sense, _truth_block(problem, true[0][-1])]
     if not problem.truth.seen:
         return blocks, true
-    direct = problem.sensing.ideal and MEASUREMENT not in problem.dead_time.queued
+    direct = problem.sensing.ideal and not problem.dead_time.measurement
     shown = (motion, response) if direct else hidden
     return [*blocks, _seen_block(problem, shown)], shown
 

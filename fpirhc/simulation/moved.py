@@ -40,11 +40,9 @@ _RAW, HELD = "_foreign", "_foreign_held"
 def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
     problem, plant, late = mover.problem, mover.problem.plant, mover.problem.dead_time
-    known = not problem.foreign  # a body outside has the dead time of its inputs itself
-    queued = [name for name in plant.inputs if name in late.queued and known]
-    if not queued:
+    if problem.foreign or not any(late.inputs.values()):  # a body outside has the dead time of its inputs itself
         return [mover.advance(disturbed, plant.input)]
-    waits = [late.wait(name, problem.period) if name in queued else Queue(0.0) for name in plant.inputs]
+    waits = [Queue(late.inputs.get(name, 0.0) / problem.period) for name in plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
     return [delay_block("send_command", plant.input, arriving, waits), mover.advance(disturbed, arriving)]
 

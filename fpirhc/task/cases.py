@@ -7,9 +7,9 @@ and any other one a field of the problem or a number inside it, 'limits.inputs.Q
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -184,16 +184,11 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
 def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
     """Raise where one change does not fit."""
     word, _, name = path.partition(".")
-    if word == START:
-        _check_name(f"'{START}.NAME' has a state", name, problem.plant.state.elements)
-        _check_number(changes[path], problem.plant.ranges.get(name))
-    elif word in PARAMETERS:
-        # A case with a reality of its own means the parameters of that one.
-        moves = changed_at(problem, "reality", changes["reality"]).moves if "reality" in changes else problem.moves
-        stated = (moves if word == _EXACT else problem.plant).parameters
-        settable = {n: one for n, one in stated.items() if not one.outside}
-        _check_name(f"'{word}.NAME' has a parameter of {PARAMETERS[word]}", name, settable)
-        _check_number(changes[path], settable[name].bounds, settable[name].unit)
+    if word in _WORDS:
+        what, settable = _settable(problem, changes, word)
+        if name not in settable:
+            raise InvalidName(f"'{word}.NAME' has a {what}, and there is no '{name}'.{nearest(name, settable)}")
+        _check_number(changes[path], *settable[name])
     else:
         paths = [f.name for f in fields(problem) if f.name not in _OWN]
         if word not in paths:
@@ -201,6 +196,17 @@ def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> 
             raise InvalidName(f"the problem has no '{path}'.{meant}")
         if isinstance(content_at(problem, path, "the problem"), int | float):
             _check_number(changes[path])
+
+
+def _settable(problem: Problem, changes: Mapping[str, object], word: str) -> tuple[str, dict[str, tuple[Any, str]]]:
+    """What stands behind a word, and range and unit of each by name."""
+    if word == START:
+        return "state", {name: (problem.plant.ranges.get(name), "") for name in problem.plant.state.elements}
+    # A case with a reality of its own means the parameters of that one.
+    moves = changed_at(problem, "reality", changes["reality"]).moves if "reality" in changes else problem.moves
+    stated = (moves if word == _EXACT else problem.plant).parameters
+    within = {name: (one.bounds, one.unit) for name, one in stated.items() if not one.outside}
+    return f"parameter of {PARAMETERS[word]}", within
 
 
 def _meant(problem: Problem, path: str) -> str:
@@ -211,12 +217,6 @@ def _meant(problem: Problem, path: str) -> str:
     if path in problem.plant.state.elements:
         return f" It is a state: '{START}.{path}' is its first value."
     return f" It is an input: 'limits.inputs.{path}' are its limits." if path in problem.plant.inputs else ""
-
-
-def _check_name(what: str, name: str, valid: Iterable[str]) -> None:
-    names = list(valid)
-    if name not in names:
-        raise InvalidName(f"{what}, and there is no '{name}'.{nearest(name, names)}")
 
 
 def _check_number(value: object, bounds: tuple[float, float] | None = None, unit: str = "") -> None:

@@ -25,8 +25,9 @@ from fpirhc.plant.motion import followed, followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.task.exogenous import check_signals
+from fpirhc.task.exogenous import Samples, check_signals
 from fpirhc.task.limits import Limits
+from fpirhc.task.reality import Reality
 from fpirhc.task.reference import pairs
 
 if TYPE_CHECKING:
@@ -37,21 +38,20 @@ _INSTANTS = 101  # at which signals from outside are tried before a run
 _SHOWN = 200  # instants at which a reference is compared with the ranges of sensors
 
 
-def settled_maps(problem: Problem, mistakes: Mistakes) -> dict[str, object]:
-    """Return the fields of a problem that follow from its maps, by name, and add to `mistakes` what does not fit their steps."""
-    settled: dict[str, object] = {}
+def settled(problem: Problem) -> dict[str, object]:
+    """Return the fields of a problem that follow from its period and its maps, by name."""
+    mistakes, plant, reality = Mistakes("problem"), problem.plant, problem.reality
     with mistakes.caught():
-        plant = settled["plant"] = over(problem.plant, problem.period)
-        settled["reality"] = problem.reality and problem.reality.over(problem.period)
-    if mistakes:
-        return {}
-    if plant.step is not None and problem.horizon is not None and any(length % 1 for length in problem.horizon.lengths):
-        mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {problem.horizon.lengths}")
+        plant = over(plant, problem.period)
+        if isinstance(reality, Reality) and reality.plant.step is not None:
+            reality = replace(reality, plant=over(reality.plant, problem.period))
+    mistakes.raise_if_any()
+    found: dict[str, object] = {"plant": plant, "reality": reality, "dead_time": problem.dead_time.over(problem.period)}
     if problem.sensing.estimator.measures_all and plant.response_age:
         from fpirhc.sensing.differences import StepDifference  # of maps alone
 
-        settled["sensing"] = replace(problem.sensing, estimator=StepDifference())
-    return settled
+        return found | {"sensing": replace(problem.sensing, estimator=StepDifference())}
+    return found
 
 
 def check_problem(problem: Problem) -> None:
@@ -85,7 +85,7 @@ def check_problem(problem: Problem) -> None:
     mistakes.join(_STAGES.of(parts, (), lambda: _of_stage(*parts)))
     _check_inverse(problem, mistakes)
     courses = {name: problem.signals[name].values for name in differentiated_signals(plant) if name in problem.signals}
-    smooth = [name for name, one in courses.items() if callable(one) and not getattr(one, "held", False)]
+    smooth = [name for name, one in courses.items() if callable(one) and not isinstance(one, Samples)]
     if smooth:
         mistakes.add(
             f"signals: the derivatives of outputs depend on {', '.join(smooth)}, whose own derivatives are not stated; state "
@@ -106,9 +106,11 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
         mistakes.add(f"duration {problem.duration} {unit} is shorter than one period of {problem.period} {unit}")
     if not 0 <= problem.measure_from < problem.duration:
         mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
-    if problem.horizon is not None:
+    if (horizon := problem.horizon) is not None:
+        if problem.plant.step is not None and any(length % 1 for length in horizon.lengths):
+            mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {horizon.lengths}")
         with mistakes.caught():
-            cycles_per_plan(problem.horizon, problem.period, unit)
+            cycles_per_plan(horizon, problem.period, unit)
 
 
 def cycles_per_stage(horizon: Horizon, period: float, unit: str = "s") -> int:

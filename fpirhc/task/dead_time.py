@@ -19,8 +19,6 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
 from fpirhc.symbolic.layout import Expression, Layout, Signal
 
-MEASUREMENT = "measurement"  # the name beside those of the inputs
-
 
 @dataclass(frozen=True, eq=False)
 class DeadTime(Checked):
@@ -49,26 +47,15 @@ class DeadTime(Checked):
         same = (len(inputs), measurement) == (len(self.inputs), self.measurement)
         return self if same else DeadTime(inputs, measurement)
 
-    @property
-    def queued(self) -> tuple[str, ...]:
-        """Names of the inputs that wait in a queue, and "measurement" where measurements do."""
-        late = {**self.inputs, MEASUREMENT: self.measurement}
-        return tuple(n for n in late if late[n])
-
-    def wait(self, name: str, period: float) -> Queue:
-        """Return the queue in which commands of an input, or measurements, wait."""
-        late = self.measurement if name == MEASUREMENT else self.inputs.get(name, 0.0)
-        return Queue(late / period)
-
     def measurement_wait(self, period: float) -> Queue | None:
-        """Return how long measurements wait; None where there is no queue."""
-        return self.wait(MEASUREMENT, period) if MEASUREMENT in self.queued else None
+        """Return how long measurements wait; None where they do not."""
+        return Queue(self.measurement / period) if self.measurement else None
 
     def check(self, plant: Plant, period: float) -> None:
         """Raise if a name is unknown, or a dead time is too long."""
         mistakes, unit = Mistakes("dead_time"), plant.time_unit
         mistakes.unknown("input", self.inputs, plant.inputs)
-        for name, value in {**self.inputs, MEASUREMENT: self.measurement}.items():
+        for name, value in {**self.inputs, "measurement": self.measurement}.items():
             if value > MOST * period:
                 mistakes.add(
                     f"'{name}' is {value:g} {unit}, more than {MOST} control cycles of {period:g} {unit}; "

@@ -23,7 +23,6 @@ from fpirhc.symbolic.expression import expression, graph, kind
 from fpirhc.symbolic.layout import Expression
 
 _FILLED: Latest[ca.Function] = Latest(16)  # every run asks for those of the plant and of the model
-_REAL: Latest[Mapping[str, Exogenous]] = Latest(8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +67,7 @@ def signals_of(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exog
 
 def really_known(signals: Mapping[str, Exogenous]) -> Mapping[str, Exogenous]:
     """Return the same signals, told to the model as they are: what an exact model knows."""
-    values = {name: one.values for name, one in signals.items()}
-    return _REAL.of(tuple(values.values()), tuple(values), lambda: {name: Known(one) for name, one in values.items()})
+    return {name: Known(one.values) for name, one in signals.items()}
 
 
 def rows_of(function: ca.Function | None, times: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -105,7 +103,7 @@ def check_signals(
 
 
 def _check_course(what: str, course: Course, times: np.ndarray, mistakes: Mistakes) -> None:
-    first = getattr(course, "first", -math.inf)
+    first = float(course.times[0]) if isinstance(course, Samples) else -math.inf
     if first > times[0]:
         mistakes.add(f"{what} are stated from {first:g} on, and the run begins at {times[0]:g}; add a sample")
         return
@@ -148,14 +146,6 @@ class Samples(Checked):
         if not (np.isfinite(times).all() and np.isfinite(values).all()) or np.any(np.diff(times) <= 0):
             raise InvalidValue("Samples: times and values must be finite, and the times must increase")
 
-    opaque = True
-    held = True
-
-    @property
-    def first(self) -> float:
-        """First time with a stated value; the last sample goes on for ever."""
-        return float(self.times[0])
-
     def __call__(self, t: Expression) -> Expression:
         """Return the value at a time."""
         times, values = (np.asarray(v, dtype=float) for v in (self.times, self.values))
@@ -168,8 +158,8 @@ Course: TypeAlias = Samples | Callable[[Expression], Expression] | float
 
 
 def _opaque(courses: Iterable[Course]) -> bool:
-    """Whether some course needs operations that scalar expressions cannot."""
-    return any(getattr(course, "opaque", False) for course in courses)
+    """Whether some course needs operations that scalar expressions cannot hold."""
+    return any(isinstance(course, Samples) for course in courses)
 
 
 def _course_function(courses: Sequence[Course]) -> ca.Function:

@@ -101,10 +101,6 @@ class ExternalPlant(Checked):
             return "; ExternalPlant(holds=1) bridges a bad answer with the last good one"
         return f", after {self.holds} in a row that were held; ExternalPlant(holds={self.holds + 1}) bridges one more"
 
-    @property
-    def foreign(self) -> ExternalPlant:
-        return self
-
     def with_exact(self, exact: np.ndarray) -> ExternalPlant:
         """Return it with other exact parameters, shape (number of parameters,)."""
         require(
@@ -116,9 +112,6 @@ class ExternalPlant(Checked):
 
     def as_model(self, model: Plant) -> NoReturn:  # noqa: ARG002
         raise NotSupported("an ExternalPlant has no equations that could be the exact model; leave ExactModel out")
-
-    def over(self, cycle: float) -> ExternalPlant:  # noqa: ARG002
-        return self  # it is called once in every cycle, whatever that is
 
     def shows(self, name: str) -> bool:
         return name in self.measures

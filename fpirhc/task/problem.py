@@ -10,7 +10,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.cost import Cost, Horizon
@@ -23,7 +22,7 @@ from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.layout import Signal
 from fpirhc.symbolic.open import nominal
-from fpirhc.task.checks import check_problem, settled_maps
+from fpirhc.task.checks import check_problem, settled
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
 from fpirhc.task.exogenous import Exogenous, real_values, rows_of, signals_of
@@ -88,11 +87,8 @@ class Problem(Checked):
     name: str = field(default="", kw_only=True)
 
     def __post_init__(self) -> None:
-        mistakes = Mistakes("problem")
-        for name, value in settled_maps(self, mistakes).items():
+        for name, value in settled(self).items():
             object.__setattr__(self, name, value)
-        mistakes.raise_if_any()
-        object.__setattr__(self, "dead_time", self.dead_time.over(self.period))
         check_problem(nominal(self))
 
     def __repr__(self) -> str:
@@ -121,7 +117,7 @@ class Problem(Checked):
     @property
     def foreign(self) -> ExternalPlant | None:
         """The reality where it is an object outside, which has no equations and cannot be run again to answer a question."""
-        return self.reality.foreign if self.reality is not None else None
+        return self.reality if isinstance(self.reality, ExternalPlant) else None
 
     @property
     def moves(self) -> Reality | ExternalPlant:

@@ -20,7 +20,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, output_order
 from fpirhc.plant.integrators import Integrator, spurious_growth
-from fpirhc.plant.maps import over, unlike
+from fpirhc.plant.maps import unlike
 from fpirhc.plant.motion import followed_units, with_exact_parameters
 from fpirhc.plant.parameter import Parameter
 from fpirhc.plant.plant import Plant
@@ -48,7 +48,6 @@ class Reality(Checked):
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
 
-    foreign: ClassVar[None] = None  # no object outside
     lag: ClassVar[Mapping[str, float]] = {}  # of its inputs: none beside what its equations have
 
     @property
@@ -59,11 +58,6 @@ class Reality(Checked):
     def with_exact(self, exact: np.ndarray) -> Reality:
         """Return the reality with other exact parameters, shape (np,)."""
         return replace(self, plant=with_exact_parameters(self.plant, exact))
-
-    def over(self, cycle: float) -> Reality:
-        """Return it as a controller with this cycle sees it; see `fpirhc.plant.maps.over`."""
-        plant = over(self.plant, cycle)
-        return self if plant is self.plant else replace(self, plant=plant)
 
     def check(self, model: Plant, needed: Collection[str], measured: Collection[str]) -> None:  # noqa: ARG002
         """Raise if the reality cannot stand for what the model describes."""
@@ -79,18 +73,14 @@ class Reality(Checked):
         mistakes.unknown("start: state", self.start, plant.state.elements)
         if plant.time_unit != model.time_unit:
             mistakes.add(f"its time is in {plant.time_unit}, the model's in {model.time_unit}; write both in one unit")
-        for name in quantities:
-            self._check_quantity(model, name, mistakes, needed=name in needed)
+        for name, unit in quantities.items():
+            self._check_quantity(model, name, unit, mistakes, needed=name in needed)
         mistakes.raise_if_any()
 
-    def _check_quantity(self, model: Plant, name: str, mistakes: Mistakes, *, needed: bool) -> None:
+    def _check_quantity(self, model: Plant, name: str, unit: str, mistakes: Mistakes, *, needed: bool) -> None:
         """Add what is wrong with what is measured or judged in the place of a coordinate or an output of the model."""
         plant, units, seen = self.plant, self._units, self.seen.get(name, name)
-        what, unit = (
-            ("output", followed_units(model)[name])
-            if name in model.outputs
-            else ("coordinate", model.coordinates[name])
-        )
+        what = "output" if name in model.outputs else "coordinate"
         there = [one for one in dict.fromkeys((seen, name)) if one in units]
         if needed and not there:
             mistakes.add(
@@ -98,7 +88,7 @@ class Reality(Checked):
                 f"Reality(seen={{'{name}': ...}}), or estimate it, Sensing(measured=..., observer=KalmanFilter(...)). "
                 f"It has {', '.join(units)}"
             )
-        for one in there if needed else [name] * (name in units):
+        for one in there:
             if units[one] != unit:
                 mistakes.add(f"its '{one}' is in {units[one]}, the model's '{name}' in {unit}; write both in one unit")
         if not needed or seen not in units:
@@ -170,22 +160,19 @@ class Reality(Checked):
         plant = self.plant
         if plant is model:
             return plant
-        names = plant.names, model.names
-        differences = [f"the coordinate {c}, which the controller is not given" for c in names[0] if c not in names[1]]
-        differences += [f"no coordinate {c}, which the model has" for c in names[1] if c not in names[0]]
         facts = {
-            "its coordinates in another order": names[0] == names[1],
-            "other orders": plant.orders == model.orders,
-            "other outputs": plant.output.elements == model.output.elements,
-            unlike(plant, model): not unlike(plant, model),
-            "another coordinate measured": not self.seen,
-            f"other controlled coordinates (write controlled={model.controlled_names!r} in its plant too)": (
-                tuple(plant.controlled or plant.chains) == model.controlled_names
-            ),
+            "coordinates": (plant.names, model.names),
+            "orders": (plant.orders, model.orders),
+            "outputs": (plant.output.elements, model.output.elements),
+            "controlled": (tuple(plant.controlled or plant.chains), model.controlled_names),
+            "measured": (tuple(self.seen.values()), tuple(self.seen)),
         }
-        differences = differences or [what for what, same in facts.items() if not same]
+        differences = [
+            f"{what} {own}, and the controller's are {its}" for what, (own, its) in facts.items() if own != its
+        ]
+        differences += filter(None, [unlike(plant, model)])
         require(
             not differences,
-            f"the reality has {'; '.join(differences)}: it cannot be the exact model of this controller; leave ExactModel out",
+            f"the reality has {'; '.join(differences[:1])}: it cannot be the exact model of this controller; leave ExactModel out",
         )
         return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)

@@ -199,7 +199,9 @@ class Setpoint(Reference):
     def motion_now(self, plant: Plant, ahead: float = 0.0) -> ca.Function:
         own = ca.SX.sym("own", self.own(plant)[0].size)
         z, points = ca.vertsplit(own, [0, len(self._elements(plant)), own.numel()])
-        motion = self._motion(plant, self._later(plant, z, points, ahead) if ahead else z, points)
+        orders, z = self._orders(plant), self._later(plant, z, points, ahead) if ahead else z
+        parts = ca.vertsplit(z, [0, *np.cumsum(list(orders.values())).tolist()])
+        motion = _arranged(plant, {c: self._chain(plant, parts[k], points[k]) for k, c in enumerate(orders)})
         arguments, names = [ca.SX.sym("t"), own], ["t", "own"]
         return ca.Function("fpirhc_reference_now", arguments, list(motion), names, ["state", "response"])
 
@@ -209,12 +211,6 @@ class Setpoint(Reference):
         aims = ca.diagcat(*(ca.DM(np.eye(order)[:, 0]) for order in orders.values())) @ points
         phi = ca.diagcat(*(_transition(self.rate, time, order) for order in orders.values()))
         return aims + phi @ (z - aims)
-
-    def _motion(self, plant: Plant, z: Expression, points: Expression) -> tuple[Expression, Expression]:
-        """State and response of the plant's reference, of the state of all filters."""
-        orders = self._orders(plant)
-        parts = ca.vertsplit(z, [0, *np.cumsum(list(orders.values())).tolist()])
-        return _arranged(plant, {c: self._chain(plant, parts[k], points[k]) for k, c in enumerate(orders)})
 
     def _chain(self, plant: Plant, z: Expression, held: Expression) -> list[Expression]:
         """(y, y', ..., y^(m)) of a filter in the state z, for w = `held`; of a map y and its divided forward differences."""

@@ -65,7 +65,7 @@ class AdaptiveInverseDynamics(Controller):
     def check(self, problem: Problem) -> None:
         """Raise if plant, bounds or rule do not fit, as `Learning.check` does, or an error of the past would have to be known."""
         require(
-            self.rule.reads_response or not problem.dead_time.queued,
+            self.rule.reads_response or not problem.dead_time.longest,
             "AdaptiveInverseDynamics learns by this rule from the error of the instant, which dead time makes late; "
             "use rule=Projection(...)",
         )
@@ -88,7 +88,7 @@ class AdaptiveInverseDynamics(Controller):
         weights = self.lyapunov_row()
 
         target, integral = like(plant.output, "_target"), integral_signal(plant, "_integral_used")
-        paired = bool(built.pairs.dead_time.queued)
+        paired = bool(built.pairs.dead_time.longest)
 
         def gradient(s: Signals, then: Expression, estimate: Expression) -> Pair:
             state = then if paired else s.state
