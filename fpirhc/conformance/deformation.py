@@ -15,7 +15,7 @@ import numpy as np
 
 from fpirhc.conformance.laws import Array, Broken, Draw, keep
 from fpirhc.contraction.delayed import delayed, radius
-from fpirhc.deformation.base import Deformation, RequestChange, automatic, scaled_for, with_inner
+from fpirhc.deformation.base import Deformation, RequestChange, automatic, scaled_for
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
 
@@ -69,19 +69,6 @@ class _Map:
 
     def vector(self, draw: Draw) -> Array:
         return draw.normal(size=self.size)
-
-    @cached_property
-    def wait(self) -> int:
-        """Cycles after which every pair is one of this run, and a memory is at rest."""
-        return _WARM + 3 * math.ceil(self.map.form.late)
-
-    def after(self, errors: Array) -> Array:
-        """Requests after every cycle with these response errors, from rest."""
-        request, memory, requests = np.zeros(self.size), self.layout.start(), []
-        for error in errors:
-            request, memory = (v.full() for v in self.function(request, error, 0.0, memory))
-            requests.append(request)
-        return np.array(requests)
 
 
 def derivatives_are_finite(trial: _Map, draw: Draw) -> Broken:
@@ -163,13 +150,6 @@ def nan_shows(trial: _Map, draw: Draw) -> Broken:
             yield "a response of NaN is hidden: the request is finite, and not the desired response"
 
 
-def facts_hold(trial: _Map, draw: Draw) -> Broken:
-    """Around its own inner map a wrapper stays the same."""
-    same = with_inner(trial.map, trial.map.inner) if trial.map.inner is not None else trial.map
-    if describe(same) != describe(trial.map):
-        yield f"around its own inner map it is {same}"
-
-
 def automatic_settings_are_chosen(trial: _Map, draw: Draw) -> Broken:
     """`scaled_for` leaves no automatic setting open, and one step then covers the change; it leaves given settings alone."""
     for sudden in (False, True):
@@ -210,7 +190,7 @@ def compares_as_it_says(trial: _Map, draw: Draw) -> Broken:
             if missed > 1e-9:
                 yield f"given the model's response as the plant's, the request misses the desired one by {missed:.3g}"
     elif trial.map.adapts:
-        for _ in range(trial.wait):
+        for _ in range(_WARM + 3 * math.ceil(form.late)):  # until every pair is one of this run
             memory = trial.function(0.0, 0.0, 0.0, memory)[1]
         passes = form.compares == "increment"
         request = trial.function(0.0, 0.0 if passes else jump, jump, memory)[0].full()[:, 0]

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import build, compose_controller
+from fpirhc.deformation.base import with_inner
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
 from fpirhc.horizon.cost import Horizon, Quadratic
@@ -76,7 +77,7 @@ def within(value: Any, bound: float) -> bool:
 
 
 def frozen_value(trial: Any, draw: Draw) -> Broken:
-    """A member is a frozen dataclass that can be hashed, compared, copied, and described as plain data."""
+    """A member is a frozen dataclass that can be hashed, copied, built around its own inner one, and described as plain data."""
     subject = _member(trial)
     if not (is_dataclass(subject) and getattr(subject, "__dataclass_params__").frozen):  # noqa: B009
         yield "its settings can be changed after a loop was built from them; write @dataclass(frozen=True)"
@@ -87,6 +88,9 @@ def frozen_value(trial: Any, draw: Draw) -> Broken:
     described = describe(subject)
     if describe(deepcopy(subject)) != described:
         yield "a copy of it has another description"
+    inner = getattr(subject, "inner", None)
+    if inner is not None and describe(with_inner(subject, inner)) != described:
+        yield "around its own inner one it has another description"
     try:
         json.dumps(described)
     except (TypeError, ValueError) as error:

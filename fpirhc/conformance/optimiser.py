@@ -93,31 +93,26 @@ class _Plan(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Horizon:
-    """The plant y'' = u - y / 2 - y' / 10 - nonlinearity sin(2 y) / 2 on a horizon, and an optimiser's functions for it."""
+    """A horizon with an optimiser's functions for it."""
 
     optimiser: Optimiser
-    nonlinearity: float
-    limits: Limits
+    ocp: OptimalControl
+    data: Array
 
-    @cached_property
-    def _posed(self) -> Posed:
+    @classmethod
+    def of(cls, optimiser: Optimiser, nonlinearity: float, limits: Limits) -> _Horizon:
+        """That of the plant y'' = u - y / 2 - y' / 10 - nonlinearity sin(2 y) / 2."""
         plant = Plant(
             coordinates={"y": "m"},
             inputs={"u": "N"},
-            parameters={"n": Parameter(self.nonlinearity, self.nonlinearity, "m/s^2")},
+            parameters={"n": Parameter(nonlinearity, nonlinearity, "m/s^2")},
             response=lambda q, v, u, p: {"y": u.u - 0.5 * q.y - 0.1 * v.y - 0.5 * p.n * ca.sin(2 * q.y)},
         )
         horizon, rest = Horizon(_STAGES, _STEP), Trajectory(lambda t: {"y": 0 * t})
         cost = Quadratic(states={"y": 2.0, "y'": 0.5}, effort={"u": 1.0}, terminal=LQRTerminal())
-        return posed(Problem(plant, rest, {"y": 0.0}, _STEP, _STEP, limits=self.limits, horizon=horizon, cost=cost))
-
-    @property
-    def ocp(self) -> OptimalControl:
-        return self._posed[0]
-
-    @property
-    def data(self) -> Array:
-        return self._posed[2]
+        problem = Problem(plant, rest, {"y": 0.0}, _STEP, _STEP, limits=limits, horizon=horizon, cost=cost)
+        ocp, _, data = posed(problem)
+        return cls(optimiser, ocp, data)
 
     @cached_property
     def served(self) -> bool:
@@ -199,12 +194,12 @@ class _Trial:
     @cached_property
     def linear(self) -> _Horizon:
         """A linear model without limits."""
-        return _Horizon(self.optimiser, 0.0, Limits())
+        return _Horizon.of(self.optimiser, 0.0, Limits())
 
     @cached_property
     def bounded(self) -> _Horizon:
         """The linear model with limits of the input that bind."""
-        return _Horizon(self.optimiser, 0.0, Limits(inputs={"u": (-_BOUND, _BOUND)}))
+        return _Horizon.of(self.optimiser, 0.0, Limits(inputs={"u": (-_BOUND, _BOUND)}))
 
 
 def remembers_a_plan(trial: _Trial, draw: Draw) -> Broken:
@@ -234,7 +229,7 @@ def work_is_bounded_as_told(trial: _Trial, draw: Draw) -> Broken:
 
 def numbers_are_true(trial: _Trial, draw: Draw) -> Broken:
     """Cost and stationarity are those of a simulation, and OK only where it is stationary: far away, nonlinear, at bounds."""
-    nonlinear = _Horizon(trial.optimiser, 1.0, Limits())
+    nonlinear = _Horizon.of(trial.optimiser, 1.0, Limits())
     yield from _judged(trial, trial.linear, trial.linear.called(_FAR * draw.normal(size=2)))
     for horizon, sizes in ((trial.linear, (1.0,)), (nonlinear, (1.0, 1.0, 1.0)), (trial.bounded, (1.0, 3.0, 10.0))):
         for size in sizes if horizon.served else ():
@@ -299,7 +294,7 @@ def bounds_of_a_call_count(trial: _Trial, draw: Draw) -> Broken:
 def infeasible_is_told(trial: _Trial, draw: Draw) -> Broken:
     """A limit of a state that cannot be kept is never called OK; or limits of states are refused."""
     limits = Limits(inputs={"u": (-_BOUND, _BOUND)}, states={"y": (-_CORRIDOR, _CORRIDOR)})
-    horizon = _Horizon(trial.optimiser, 0.0, limits)
+    horizon = _Horizon.of(trial.optimiser, 0.0, limits)
     if not horizon.served:
         return
     plan = horizon.solved(np.array([2.0, float(draw.uniform(1.0, 2.0))]), most=_FEW)

@@ -56,7 +56,7 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
     "check": "what it takes it controls",
     "deformation": "deformation acts",
     "deforms": "deformation acts",
-    "inner": "facts hold",
+    "inner": "frozen value",
     "inner_problem": "same command everywhere",
     "learns": "learning remembers",
     "notes": "facts hold",
@@ -68,7 +68,7 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
 MAP_MEMBERS = {
     "adapts": "gain and pairs are told",
     "effective_gain": "gain and pairs are told",
-    "inner": "facts hold",
+    "inner": "frozen value",
     "form": "compares as it says",
     "memory": "gain and pairs are told",
     "secant_gain": "step is bounded",
