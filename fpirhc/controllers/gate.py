@@ -14,7 +14,7 @@ from fpirhc.controllers.base import clip
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.driver import every_finite, finite, kept_if_finite
-from fpirhc.symbolic.expression import FINITE, Signals, expression
+from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -43,11 +43,8 @@ def outcome(
     `ran`: whether the results are to be kept where they are fine. `opaque`: whether the step is a graph of calls.
     """
     said = trace[layout.slice("status")] != int(Status.NON_FINITE)
-    if not opaque:
-        fine = ca.logic_and(every_finite(ca.vertcat(memory_next, command)), said)
-        return ca.if_else(ca.logic_and(ran, fine), memory_next, memory), fine
-    good = ca.logic_and(ca.mmin(ca.fabs(command) <= FINITE), said)
-    kept, finite = kept_if_finite(memory_next, memory, ca.logic_and(ran, good))
+    good = ca.logic_and(every_finite(command), said)
+    kept, finite = kept_if_finite(memory_next, memory, ca.logic_and(ran, good), opaque=opaque)
     return kept, ca.logic_and(finite, good)
 
 
@@ -72,7 +69,7 @@ HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 REPLAYS = Signal("replays")  # in the memory of a loop: whether its sample is that of `replayed_...`
 LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a machine is one that is not finite
 _SAMPLE = ("state", "output", "realised", "measured", "arrived", LOST.name)
-INNER = "controller_memory"  # in the memory: that of a graph as one signal
+INNER = "controller_memory"  # in the memory: that of the controller as one signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,14 +142,12 @@ class Gate:
 
     @cached_property
     def controller_memory(self) -> Layout:
-        """The controller's memory; of a graph as one signal, because a graph copies every signal of a long memory one by one."""
+        """The controller's memory as one signal, because a graph copies every signal of a long memory one by one."""
         memory = self.inner.memory
-        if not self.inner.opaque:
-            return memory
         return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start()))),))
 
     def named(self, memory: Layout) -> Layout:
-        """Return a layout with the controller's memory under the names of its signals, where it is one signal there."""
+        """Return a layout with the controller's memory under the names of its signals."""
         whole = {INNER: self.inner.memory.signals}
         return Layout(tuple(s for signal in memory.signals for s in whole.get(signal.name, (signal,))))
 

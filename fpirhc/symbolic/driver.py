@@ -197,7 +197,7 @@ int ENTRY{SIGNATURE} {{
 
 def finite(column: Expression, *, opaque: bool) -> Expression:
     """Return 1 where every entry of the column is finite, else 0; `opaque` is that of the block."""
-    return kept_if_finite(column, column, expression(1.0))[1] if opaque else every_finite(column)
+    return kept_if_finite(column, column, expression(1.0), opaque=opaque)[1]
 
 
 def every_finite(column: Expression) -> Expression:
@@ -209,10 +209,15 @@ def every_finite(column: Expression) -> Expression:
     return ca.fabs(parts[0]) <= FINITE
 
 
-def kept_if_finite(new: Expression, old: Expression, good: Expression) -> tuple[Expression, Expression]:
-    """Return (new where it is good and finite, else old; whether new is finite) of columns of a graph; C passes over them once."""
-    kept, fine = _kept(graph(new).numel())(new, old, good)
-    return kept, fine
+def kept_if_finite(
+    new: Expression, old: Expression, good: Expression, *, opaque: bool
+) -> tuple[Expression, Expression]:
+    """Return (new where it is good and finite, else old; whether new is finite); C passes over columns of a graph once."""
+    if opaque:
+        kept, fine = _kept(graph(new).numel())(new, old, good)
+        return kept, fine
+    fine = every_finite(new)
+    return ca.if_else(ca.logic_and(good, fine), new, old), fine
 
 
 @cache
