@@ -146,9 +146,6 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     gain = deformation.effective_gain()
     if abs(gain) <= _NOTHING:
         return
-    what, (name, value) = with_its_gain(deformation), own_gain(deformation)
-    pairs = not any(against_wrappers(Paired(deformation, cycles=1.0)))  # whether it may be paired
-    remembers = deformation.memory(problem.plant.controlled_names).size > 0
     jacobian = _JACOBIANS.of((problem,), (), lambda: _jacobian_at_start(problem.of_equations))
     weighted = deformation.form.weighted(jacobian)
     if not np.isfinite(jacobian).all() or np.abs(np.linalg.eigvals(weighted)).max() <= _NOTHING:
@@ -160,6 +157,9 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
         not steady or (seen is None and abs(gain) < abs(limit)) or converges(deformation, jacobian, weights)
     ):
         return
+    what, (name, value) = with_its_gain(deformation), own_gain(deformation)
+    pairs = not any(against_wrappers(Paired(deformation, cycles=1.0)))  # whether it may be paired
+    remembers = deformation.memory(problem.plant.controlled_names).size > 0
     right = deformation.with_effective_gain(-gain) if wrong else deformation
     judged = steady and (seen is not None or (remembers and not wrong))
     largest = largest_gain(right, jacobian, weights) if judged else abs(limit)
