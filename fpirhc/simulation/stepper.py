@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
@@ -46,10 +45,7 @@ _NOT_SOLVED = "the compiled solver failed"
 class ComposedStep:
     """The step of a controller that is composed, and not compiled."""
 
-    problem: Problem
-    controller: Controller
     settings: LiveSettings
-    ready: Controller
     composite: Composite
     memory: Layout
     replay: Replay
@@ -72,12 +68,10 @@ class ComposedStep:
     ) -> Self:
         """Return the step of a controller; arguments as of `Stepper`."""
         settings = live_settings(problem, controller, live)
-        ready = checked(problem, settings.controller)
         if bounded:
-            refuse_unbounded(ready)
-        composite, memory = composed_step(settings.composed, problem, ready, saturated_after)
-        replay = Replay.of(settings.problem, composite, bridged)
-        return cls(problem, controller, settings, ready, composite, memory, replay)
+            refuse_unbounded(settings.controller)
+        composite, memory = composed_step(settings.composed, problem, settings.controller, saturated_after)
+        return cls(settings, composite, memory, Replay.of(problem, composite, bridged))
 
 
 class Stepper(Checked):
@@ -158,7 +152,7 @@ class Stepper(Checked):
 
     def _bind(self, step: ComposedStep, *, compiled: bool) -> None:
         """Compile the step, and bind its arguments."""
-        problem, controller, composite = step.problem, step.controller, step.composite
+        problem, composite = step.settings.problem, step.composite
         self.memory = step.memory
         self.function: ca.Function = composite.function
         backend = native(self.function, required=bool(step.settings.paths)) if compiled else None
@@ -166,10 +160,10 @@ class Stepper(Checked):
         self.signals: Layout = composite.trace
         self.measures = problem.sampled  # names of the raw measurements
         self.why_failed = ""
-        self._title = f"{problem.name or 'problem'}, {name_in_task(controller)}"
+        self._title = f"{problem.name or 'problem'}, {name_in_task(step.settings.unresolved)}"
         self._may_fail = composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self.function
-        model = step.ready.plant_model(problem)
+        model = step.settings.controller.plant_model(problem)
         parameters = model.parameters(model.plant)
         arguments = StepArguments(function, composite, problem, parameters)
         self._live, self._composite, self._arguments = step.settings, composite, arguments

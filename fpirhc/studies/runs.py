@@ -18,7 +18,6 @@ from typing import Any
 import joblib
 import pandas as pd
 
-from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
 from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
@@ -116,8 +115,6 @@ class Runner:
         once = one.alone or not live
         try:
             controller = controller if live else with_settings(controller, own)
-            if not paths:
-                checked(base, controller)
             controller = resolved(one.believed, controller) if one.believed else controller
             # A loop that runs once is worth a compiler where the run is long.
             compiled = self._compiled and (None if once and not paths else True)
