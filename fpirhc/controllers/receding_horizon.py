@@ -30,7 +30,7 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
-from fpirhc.symbolic.open import expressed, numbers
+from fpirhc.symbolic.open import numbers
 from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
@@ -175,7 +175,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     def step(s: Signals) -> dict[str, Value]:
         own = [getattr(s, one.name) for one in problem.own_signals]
         motion = () if preview is None else preview(s.time, *own)
-        rows = [expression(ca.vertcat(*(expressed(one, s.parameters) for one in ocp.settings)))] if ocp.settings else []
+        rows = [numbers(ocp.settings, s.parameters)] if ocp.settings else []
         data = data_of(s.time, *motion, s.parameters, *rows)
         for seen in plant.beside if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=corrected)

@@ -10,10 +10,10 @@ with a symbol: where a build does, it is refused by its path and the place.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from types import FunctionType
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,6 @@ from fpirhc.symbolic.layout import Expression, Signal
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 SETTINGS = "settings"  # the signal of all open numbers of a loop
-T = TypeVar("T")
 Value = TypeVar("Value", ca.SX, ca.MX)
 _LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
 _OPEN: dict[int, Opened] = {}  # of every symbol of both kinds
@@ -79,13 +78,6 @@ def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
     return NotSupported(f"setting{'s' if len(names) > 1 else ''} {', '.join(names)} cannot be live{where}: {why}")
 
 
-def open_numbers(*values: object) -> list[str]:
-    """Return the paths of the open numbers in some values."""
-    found = list[ca.SX]()
-    _mapped(values, found.append)
-    return list(dict.fromkeys(s.name() for number in found for s in ca.symvar(number)))
-
-
 def number_of(value: ca.SX) -> float:
     """Return the number of the build of an open number."""
     symbols = ca.symvar(value)
@@ -93,9 +85,27 @@ def number_of(value: ca.SX) -> float:
     return float(ca.Function("fpirhc_number", symbols, [value])(*numbers))
 
 
-def nominal(value: T) -> T:
+def nominal(value: Any) -> Any:
     """Return a value with the numbers of the build in place of all open ones in it; the value itself where it has none."""
-    return cast(T, _mapped(value, number_of))
+    if not _OPEN or type(value) in _LEAVES:
+        return value
+    if isinstance(value, ca.SX):
+        return number_of(value) if is_open(value) else value
+    parts: dict[Any, Any]
+    if isinstance(value, Mapping):
+        parts = dict(value)
+    elif isinstance(value, tuple | list):
+        parts = dict(enumerate(value))
+    elif is_dataclass(value) and not isinstance(value, type):
+        parts = {f.name: getattr(value, f.name) for f in fields(value)}
+    else:
+        return value
+    changed = {key: nominal(part) for key, part in parts.items()}
+    if all(changed[key] is part for key, part in parts.items()):
+        return value
+    if isinstance(value, Mapping):
+        return changed
+    return type(value)([*changed.values()]) if isinstance(value, tuple | list) else copied(value, changed)
 
 
 def expressed(value: float | ca.SX, beside: Value) -> Value:
@@ -105,33 +115,6 @@ def expressed(value: float | ca.SX, beside: Value) -> Value:
     symbols = ca.symvar(value)
     graph = [_OPEN[_key(s)].graph[s.name()] for s in symbols]
     return graph[0] if value.is_symbolic() else ca.Function("fpirhc_open", symbols, [value])(*graph)
-
-
-def _mapped(value: object, change: Callable[[ca.SX], object]) -> object:
-    """The value with `change` applied to its open numbers; the same object where it has none."""
-    if not _OPEN or type(value) in _LEAVES:
-        return value
-    if isinstance(value, ca.SX):
-        return change(value) if is_open(value) else value
-    parts: dict[object, object]
-    if isinstance(value, Mapping):
-        parts = dict(value)
-    elif isinstance(value, tuple | list):
-        parts = dict(enumerate(value))
-    elif is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: getattr(value, f.name) for f in fields(value)}
-    else:
-        return value
-    changed = {key: _mapped(part, change) for key, part in parts.items()}
-    if all(changed[key] is part for key, part in parts.items()):
-        return value
-    if isinstance(value, Mapping):
-        return changed
-    return (
-        type(value)([*changed.values()])
-        if isinstance(value, tuple | list)
-        else copied(value, cast(dict[str, object], changed))
-    )
 
 
 def numbers(values: Sequence[float | ca.SX], beside: Expression) -> Expression:
