@@ -50,12 +50,12 @@ class Repeats(Variants):
     def of(self, task: Task) -> Sequence[Variant]:
         problem, seed = task.problem, self.seed
         every = [Variant("nominal", problem, "nominal", seed=seed)]
-        if self.seeds > 1 and problem.foreign is None:
+        if self.seeds > 1 and problem.moves.simulated:
             moved = problem.with_exact(problem.real_parameters * (1 + 1e-14))
             every.append(Variant("rounding", moved, "nominal", seed=seed))
             if (finer := problem.integrator.finer(2)) is not None:
                 every.append(Variant("finer steps", replace(problem, integrator=finer), "finer", seed=seed))
-        if problem.disturbances or not problem.sensing.ideal or problem.foreign is not None:
+        if problem.random:
             seeds = range(seed + 1, seed + self.seeds)
             every += [Variant(f"seed {k}", problem, "nominal", seed=k) for k in seeds]
         return every

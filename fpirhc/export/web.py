@@ -125,7 +125,8 @@ def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: P
     """Write the page of some controllers of a task, which `fpirhc.load_problem` finds by `file`."""
     problem = task.problem
     require(
-        not problem.foreign, "a lab runs the plant's equations in the page; a plant outside Python's equations has none"
+        problem.moves.simulated,
+        "a lab runs the plant's equations in the page; a plant outside Python's equations has none",
     )
     require(
         not loses(moving(problem)),

@@ -178,7 +178,7 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates, chosen: De
         if limited > _LIMITED:
             yield f"{u} is at a limit in {100 * limited:.0f} % of the cycles, which tells little: excite less, or widen its limits"
         around, known = problem.dead_time.measurement, problem.dead_time.inputs.get(u, 0.0)
-        if problem.foreign and not hidden and one.dead_time.low - (around + known) / problem.period > 1 - 1e-9:
+        if not (problem.moves.simulated or hidden) and one.dead_time.low - (around + known) / problem.period > 1 - 1e-9:
             time = f"dead_time=fp.DeadTime(inputs={{'{u}': {estimates.counted[row] * problem.period - around:.6g}}})"
             counts = chosen is None or np.any(chosen.form.cycles)
             yield f"state {time} in the problem too: predictions need it, and a review may fail without it" if counts else (

@@ -40,7 +40,9 @@ _RAW, HELD = "_foreign", "_foreign_held"
 def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
     """Blocks of the command's way to the plant, and of the plant over one period."""
     problem, plant, late = mover.problem, mover.problem.plant, mover.problem.dead_time
-    if problem.foreign or not any(late.inputs.values()):  # a body outside has the dead time of its inputs itself
+    if not (
+        problem.moves.simulated and any(late.inputs.values())
+    ):  # what is outside has the dead time of its inputs itself
         return [mover.advance(disturbed, plant.input)]
     waits = [Queue(late.inputs.get(name, 0.0) / problem.period) for name in plant.inputs]
     arriving = Signal("arriving", plant.input.elements, plant.input.units, tuple(map(float, problem.inputs_before)))
@@ -159,7 +161,7 @@ class Mover(ABC):
 
 def moving(problem: Problem) -> Mover:
     """Return what the run of a problem moves."""
-    return Equations(problem) if problem.foreign is None else Body(problem, problem.foreign)
+    return Body(problem, problem.moves) if isinstance(problem.moves, ExternalPlant) else Equations(problem)
 
 
 class Equations(Mover):

@@ -343,7 +343,7 @@ def experiment(problem: Problem, controller: Controller, cycles: int) -> tuple[E
     loops = loop_of(short, without_deformation(controller)), loop_of(short, controller)
     names = weighed(short, loops[1].controller)
     null = errors_of(*ModelAsPlant(short, seed=0).pair(loops), names)
-    if short.foreign:
+    if not short.moves.simulated:
         return None, null
     return errors_of(short, [loop.run(seed=0, variant=short) for loop in loops], names), null
 

@@ -296,7 +296,7 @@ def _has_exact_model(problem: Problem, controller: Controller) -> bool:
     """Whether it is the bound of a controller with a wrong model: parameters known as exact, nothing adapted, nothing learned."""
     model, real = controller.plant_model(problem), problem.real_plant
     wrong = problem.reality is not None or not np.array_equal(model.plant.approximate, model.plant.exact)
-    fixed = not controller.deformation.adapts and not controller.learns and not problem.foreign
+    fixed = not controller.deformation.adapts and not controller.learns and problem.moves.simulated
     return bool(wrong and fixed and model.plant is real and np.array_equal(model.parameters(model.plant), real.exact))
 
 
@@ -307,7 +307,7 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     """Return what white noise of the response costs in as many cycles as a review runs; None where it has some."""
     names, sensing = {*response_names(problem.plant)}, problem.sensing
     right = names <= {*sensing.measures(problem.plant)} - {n for n, sensor in sensing.sensors.items() if sensor.acts}
-    if not right or problem.foreign or controller.deforms in ("target", "turns") or run.stop is not None:
+    if not (right and problem.moves.simulated) or controller.deforms in ("target", "turns") or run.stop is not None:
         return None
     bench = Bench(problem, controller, short=True, seed=run.seed)
     quiet = run.first(bench.cycles)

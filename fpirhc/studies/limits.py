@@ -95,7 +95,7 @@ def _latency(problem: Problem, seed: int) -> Quantity:
 
     def at(value: float) -> list[Variant]:
         inputs = {n: times.inputs.get(n, 0.0) + value for n in problem.plant.inputs}
-        late = {"inputs": inputs} if not problem.foreign else {"measurement": times.measurement + value}
+        late = {"inputs": inputs} if problem.moves.simulated else {"measurement": times.measurement + value}
         later = replace(problem, dead_time=replace(times, **late))
         return _one(later, seed, value, later, problem)
 

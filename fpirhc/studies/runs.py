@@ -165,7 +165,7 @@ def run_variants(
     chosen = replace(task, controllers=select(task, controllers))
     metrics = [one for one in task.metrics if one.always] if metrics is None else metrics
     every = variants.of(chosen)
-    if task.problem.foreign is not None and task.problem.foreign.rest is not None:
+    if task.problem.moves.rest is not None:
         processes = 1  # a machine would have two loops that command it
     with Kept(keep, header_of(chosen, variants.same, metrics)) as kept:
         titles = {one: k for k, one in enumerate(one.name for one in every)}

@@ -124,9 +124,8 @@ class Draws(Variants):
         wide = {n for n, (low, high) in exact_ranges(problem.moves.parameters, self.percent).items() if high > low}
         delay = problem.dead_time
         delayed = delay.measurement or any(delay.inputs.values())
-        late = bool(self.percent and delayed) and problem.foreign is None  # a body outside has its own
-        noisy = bool(problem.disturbances) or not problem.sensing.ideal or problem.foreign is not None
-        if self.count > 1 and not (wide or late or noisy):
+        late = bool(self.percent and delayed) and problem.moves.simulated  # a body outside has its own
+        if self.count > 1 and not (wide or late or problem.random):
             mend = "state parameters of the plant, or a dead time" if self.percent else "give --mismatch P"
             raise InvalidValue(
                 f"all {self.count} plants would be the same: the problem has no disturbances, no noise, and nothing that is drawn; "

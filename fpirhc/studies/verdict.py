@@ -150,7 +150,7 @@ _SAMPLES = 2000
 def left_alone(problem: Problem, seed: int) -> dict[str, float]:
     """Return the rms errors of the plant whose inputs are held; empty where it does not last, or is outside and so not run."""
     try:
-        run = simulator(problem, HeldInput(), compiled=False).run(seed=seed) if not problem.foreign else None
+        run = simulator(problem, HeldInput(), compiled=False).run(seed=seed) if problem.moves.simulated else None
     except FpirhcError:
         return {}
     return {} if run is None or run.stop is not None else rms_error(problem, run)

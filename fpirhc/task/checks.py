@@ -216,7 +216,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
 def _check_disturbances(problem: Problem) -> None:
     """Raise if a disturbance is of nothing or has no values, or one of an output not the derivatives that are needed."""
     mistakes, instants = Mistakes("disturbances"), np.array([0.0, problem.period])
-    others = () if problem.foreign else (*problem.real_plant.coordinates, *problem.plant.outputs)  # none of a body
+    others = (*problem.real_plant.coordinates, *problem.plant.outputs) if problem.moves.simulated else ()
     mistakes.unknown("input, coordinate or output", problem.disturbances, (*problem.plant.inputs, *others))
     for name, one in problem.disturbances.items():
         with mistakes.caught(f"'{name}': "):

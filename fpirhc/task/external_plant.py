@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import NoReturn, Protocol
+from typing import ClassVar, NoReturn, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -73,6 +73,8 @@ class ExternalPlant(Checked):
     make: Make | None = None
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     period: Positive | None = None
+
+    simulated: ClassVar[bool] = False  # no equations, no run again to answer a question, and a dead time of its own
 
     def __post_init__(self) -> None:
         if (self.body is None) == (self.make is None):

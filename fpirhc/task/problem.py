@@ -115,11 +115,6 @@ class Problem(Checked):
         return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self.moves.shows(n)))
 
     @property
-    def foreign(self) -> ExternalPlant | None:
-        """The reality where it is an object outside, which has no equations and cannot be run again to answer a question."""
-        return self.reality if isinstance(self.reality, ExternalPlant) else None
-
-    @property
     def moves(self) -> Reality | ExternalPlant:
         """What a run moves: the reality, or the model itself with its exact parameters."""
         return self.reality or self.truth
@@ -128,6 +123,11 @@ class Problem(Checked):
     def truth(self) -> Reality:
         """What a run moves, where its equations are known; else the model itself."""
         return self.reality if isinstance(self.reality, Reality) else Reality(self.plant)
+
+    @property
+    def random(self) -> bool:
+        """Whether runs of other seeds differ."""
+        return bool(self.disturbances) or not self.sensing.ideal or not self.moves.simulated
 
     @property
     def real_plant(self) -> Plant:
@@ -165,7 +165,7 @@ class Problem(Checked):
     @cached_property
     def of_equations(self) -> Problem:
         """The problem as far as equations tell it: where an object outside moves, the model moves in its place."""
-        return self if self.foreign is None else replace(self, reality=None)
+        return self if self.moves.simulated else replace(self, reality=None)
 
     @property
     def real_integrator(self) -> Integrator:
@@ -183,7 +183,7 @@ class Problem(Checked):
 
         A plant that moves as its model does has the signals of the middle of the cycle, as the model has them.
         """
-        if self.reality is None or self.foreign is not None or real_values(self.real_plant, self.signals) is None:
+        if self.reality is None or not self.moves.simulated or real_values(self.real_plant, self.signals) is None:
             return 1
         return own_steps(self.real_plant, self.real_integrator, self.period)
 

@@ -48,6 +48,8 @@ class Reality(Checked):
     integrator: Integrator | None = None
     seen: Mapping[str, str] = field(default_factory=dict)
 
+    simulated: ClassVar[bool] = True  # its equations are known: it can run again to answer a question
+    rest: ClassVar[None] = None  # nothing is left to itself when a run ends
     lag: ClassVar[Mapping[str, float]] = {}  # of its inputs: none beside what its equations have
 
     @property

@@ -171,10 +171,10 @@ def measured(problem: Problem, run: Run) -> float | None:
 
     None for a plant outside whose response is late, or that nothing excites.
     """
-    if not _adapts(run) or (problem.foreign and problem.response_delay):
+    if not _adapts(run) or (problem.response_delay and not problem.moves.simulated):
         return None
     factor = identified_factor(run["deformed"], run["plant_realised"], _gain(run), _weights(run))
-    return factor if not problem.foreign or np.isfinite(factor) else None
+    return factor if problem.moves.simulated or np.isfinite(factor) else None
 
 
 def _gain(run: Run) -> float:
@@ -210,7 +210,7 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
 
 def _eigenvalues(problem: Problem, run: Run) -> np.ndarray | None:
     """Those of sampled cycles; None where its factors do not follow from equations."""
-    eigenvalues = sampled_spectrum(problem, run).eigenvalues if _adapts(run) and not problem.foreign else None
+    eigenvalues = sampled_spectrum(problem, run).eigenvalues if _adapts(run) and problem.moves.simulated else None
     return eigenvalues if eigenvalues is not None and len(eigenvalues) else None
 
 
