@@ -73,7 +73,6 @@ class ExternalPlant(Checked):
     make: Make | None = None
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     period: Positive | None = None
-
     simulated: ClassVar[bool] = False  # no equations, no run again to answer a question, and a dead time of its own
 
     def __post_init__(self) -> None:
