@@ -336,7 +336,7 @@ class Pairs:
     def cycles(self) -> float:
         """Number of the first cycle whose pair belongs to this run: before it, samples show the start."""
         late = self.dead_time.measurement / self.problem.period
-        return max(self.problem.sensing.warm_up_cycles(self.problem.plant, late), math.ceil(late - 1e-9) + 1)
+        return max(self.problem.sensing.warm_up_cycles(self.problem.plant, late), Queue(late).length)
 
     @property
     def memory(self) -> tuple[Signal, ...]:

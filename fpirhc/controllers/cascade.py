@@ -134,7 +134,7 @@ class Cascade(Controller):
                 f"Cascade: an effective gain of {gain:.3g} moves the target away from the reference; use the other sign"
             )
         count, cycles = len(problem.plant.controlled_names), self._cycles(problem)
-        if len(every(self.lag or 0.0)) not in (1, count):
+        if isinstance(self.lag, tuple) and len(self.lag) != count:
             raise InvalidValue(
                 f"Cascade(lag={self.lag!r}): there are {count} controlled coordinates; give one lag for each, or one for all"
             )

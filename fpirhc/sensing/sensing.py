@@ -7,7 +7,6 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -174,7 +173,7 @@ class Sensing(Checked):
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1
-        return math.ceil(late) + max(self.estimator.fills(plant.chains[name]) for name in plant.controlled_names)
+        return Queue(late).length - 1 + max(self.estimator.fills(plant.chains[name]) for name in plant.controlled_names)
 
     @property
     def drawn(self) -> tuple[Signal, ...]:

@@ -106,7 +106,7 @@ class INDI(Undeformed):
         pairs = [like(signal, name + late) for name, signal in both for late in ("", "_before")]
         memory = Layout((*pairs, scalar("filter_begun"))) if self.frequency is not None else Layout()
 
-        def filtered(s: Signals) -> tuple[dict[str, Expression], dict[str, Expression]]:
+        def filtered(s: Signals, running: Expression) -> tuple[dict[str, Expression], dict[str, Expression]]:
             """Command and response behind the filter, which begins settled, and what it remembers."""
             now = {"filtered_command": s._command_before, "filtered_response": s.realised}
             if self.frequency is None:
@@ -115,7 +115,7 @@ class INDI(Undeformed):
             for name, x in now.items():
                 last, before = getattr(s, name), getattr(s, f"{name}_before")
                 values[name] = ca.if_else(begun, (1 - first - second) * x + first * last + second * before, x)
-            usable = ca.logic_and(is_finite(ca.vertcat(*values.values())), s.warm_up > warm_up_cycles - 0.5)
+            usable = ca.logic_and(is_finite(ca.vertcat(*values.values())), running)
             after = {f"{name}_next": ca.if_else(usable, value, getattr(s, name)) for name, value in values.items()}
             for name, value in values.items():
                 last, before = getattr(s, name), getattr(s, f"{name}_before")
@@ -123,10 +123,10 @@ class INDI(Undeformed):
             return values, {**after, "filter_begun_next": ca.if_else(usable, 1, s.filter_begun)}
 
         def step(s: Signals) -> dict[str, Expression]:
-            values, after = filtered(s)
+            running = s.warm_up > warm_up_cycles - 0.5
+            values, after = filtered(s, running)
             before, realised = values["filtered_command"], values["filtered_response"]
             moved = before + ca.solve(gain(s.state, before, s.parameters), s.desired - realised)
-            running = s.warm_up > warm_up_cycles - 0.5
             command = ca.if_else(running, moved, inverse(s.state, s.desired, s.parameters))
             request = response(s.state, command, s.parameters)
             return {"command_unclipped": command, "_deformed_unclipped": request, **after}
