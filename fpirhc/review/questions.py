@@ -24,6 +24,7 @@ from fpirhc.status import Status
 from fpirhc.summary import written_out
 from fpirhc.symbolic.dotted import paths_to
 from fpirhc.symbolic.driver import compiled_plans
+from fpirhc.symbolic.expression import TINY
 from fpirhc.task.problem import Problem
 
 MINOR, ROUNDING = 1e-3, 1e-6  # added error as a share of the largest, and of the task
@@ -308,7 +309,7 @@ def recommended_gain(case: Case) -> Fact:
 
 def price(before: float, after: float) -> str:
     """What an advice costs, in words."""
-    times = after / max(before, 1e-300)
+    times = after / max(before, TINY)
     return f" The error is then {written_out(times)} times as large." if times > 1.05 else ""
 
 
@@ -324,11 +325,11 @@ def gain_by_run(case: Case) -> Fact:
         raise NotSupported("Every gain has the error of none: the run has nothing that adaptation corrects.")
     if right and best and best not in found.calm:  # it has to be better and calmer than today's
         best *= rungs[best].error <= LITTLE * own.error and (rungs[best].moves <= own.moves).all()
-    worst = int((own.moves / np.maximum(before, 1e-300)).argmax())
+    worst = int((own.moves / np.maximum(before, TINY)).argmax())
     of = list(case.problem.plant.inputs)[worst]
     numbers = {SAID[times]: one.error for times, one in rungs.items() if times in SAID} | {"error_without": found.alone}
     numbers |= {"movement": own.moves[worst], "movement_without": before[worst]}
-    ratio, reserve = (rungs[best].error / max(own.error, 1e-300), best in found.spare) if best else (math.inf, False)
+    ratio, reserve = (rungs[best].error / max(own.error, TINY), best in found.spare) if best else (math.inf, False)
     poor = not calm or not (spare or (reserve and ratio > WORSE))  # its reserve may cost too much
     verdict = Verdict.CAUTION if poor else Verdict.YES
     if not right:
@@ -354,7 +355,7 @@ def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) 
     added = {n: math.inf if adapted[n] == math.inf else (adapted[n] - without[n]) / s for n, s in sizes.items()}
     slight = slight or MINOR * min(max((e[n] / s for n, s in sizes.items()), default=0.0) for e in (without, adapted))
     counted = [n for n, share in added.items() if share > slight and adapted[n] > ROUNDING * sizes[n]]
-    times = {n: adapted[n] / max(without[n], 1e-300) for n in counted}
+    times = {n: adapted[n] / max(without[n], TINY) for n in counted}
     name = max(added, key=lambda n: (times.get(n, 0.0) > WORSE, added[n]), default=next(iter(adapted)))
     numbers = {"error_without": without[name], "error_with": adapted[name], "added": added.get(name, 0.0)}
     return name, numbers, times.get(name, 0.0)
@@ -382,7 +383,7 @@ def _pays(case: Case) -> Fact:
     plain, own = case.plain.share(case.plain.nominal), case.bench.share(case.bench.nominal)
     require(min(plain, own) <= BAD, "Neither follows: mend that first.")
     name, numbers, harms = _added(case, case.plain.errors(case.plain.nominal), case.bench.errors(case.bench.nominal))
-    numbers["divided_by"] = plain / max(own, 1e-300)
+    numbers["divided_by"] = plain / max(own, TINY)
     verdict = Verdict.YES if own < max(plain, SLIGHT) else Verdict.CAUTION  # a small one is nothing to mend
     verdict = Verdict.NO if harms > WORSE or own > BAD else verdict
     return Fact(verdict, numbers, name)

@@ -36,6 +36,7 @@ from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, follows, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.symbolic.evaluate import attempted
+from fpirhc.symbolic.expression import TINY
 from fpirhc.symbolic.native import compile_all
 from fpirhc.task.problem import Problem
 
@@ -314,8 +315,8 @@ def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding
     noise = np.random.default_rng(run.seed).standard_normal(quiet["realised"].shape) * np.ptp(quiet["realised"], axis=0)
     other = bench.run(bias=NOISE * noise)
     before, after = bench.errors(quiet), bench.errors(other)
-    moves = float((bench.moves(other) / np.maximum(bench.moves(quiet), 1e-300)).max())
-    ratios = {n: after[n] / max(e, 1e-300) for n, e in before.items()}
+    moves = float((bench.moves(other) / np.maximum(bench.moves(quiet), TINY)).max())
+    ratios = {n: after[n] / max(e, TINY) for n, e in before.items()}
     name = max(ratios, key=ratios.__getitem__)
     text = f"{run.controller} measures its response without noise. White noise of {in_percent(NOISE)} of its range (rms) would "
     text += f"multiply the rms error of {name} by {written_out(ratios[name])} and the total variation of the command "

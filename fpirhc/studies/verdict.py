@@ -23,6 +23,7 @@ from fpirhc.simulation.metrics.shipped import rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
 from fpirhc.summary import in_percent, in_words
+from fpirhc.symbolic.expression import TINY
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
@@ -172,8 +173,8 @@ def ranges(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
         found[name] = max(span, abs(float(rows[place, 0] - problem.start_output[place])))
         small = ROUNDING * size
         if found[name] <= small:
-            wide = high - low if math.isfinite(high - low) else 1.0
-            found[name] = weights[name] ** -0.5 if weights.get(name) else wide
+            wide = high - low
+            found[name] = weights[name] ** -0.5 if weights.get(name) else wide if math.isfinite(wide) else 1.0
         resting |= {name: size} if span <= small else {}
     return found, resting
 
@@ -221,9 +222,9 @@ def _growth(pair: Pair) -> float:
     if len(errors) < 40:
         return math.nan
     largest = np.array([part.max(axis=0) for part in np.array_split(errors, 4)])
-    steps = largest[1:] / np.maximum(largest[:-1], 1e-300)
+    steps = largest[1:] / np.maximum(largest[:-1], TINY)
     exponential = (steps[0] > 1) & (steps[1:] >= 1.5).all(axis=0) & (steps[-1] >= 0.6 * steps[0])
-    return max((largest[-1] / np.maximum(largest[0], 1e-300))[exponential], default=math.nan)
+    return max((largest[-1] / np.maximum(largest[0], TINY))[exponential], default=math.nan)
 
 
 def _unsolved(pair: Pair) -> float:

@@ -17,7 +17,6 @@ import numpy as np
 
 from fpirhc.contraction.spectrum import Spectrum, identified_factor, jacobians_along, predicted_factor
 from fpirhc.horizon.nominal import stage_data
-from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.simulation.metrics import Function, Metric, by_name, coordinate_unit, input_unit, measured_cycles
@@ -32,6 +31,7 @@ from fpirhc.task.problem import Problem
 _SMALLEST = 1e-12  # range of a reference
 SETTLED = 0.02  # half width of the band, as a share of the reference's range or of the first error, whichever is larger
 _AT = 1e-9  # of the range between the limits: nearer is at the limit
+_AT_RATE = 1 - 1e-6  # of the limit of a rate: faster is at the limit
 # A run of a simulated plant counts these even where they never occurred; the others are statuses of a machine.
 _ALWAYS = (Status.OK, Status.NOT_CONVERGED, Status.INFEASIBLE, Status.HELD, Status.NON_FINITE)
 
@@ -71,9 +71,8 @@ def effort(problem: Problem, run: Run) -> dict[str, float]:
 
 def total_variation(problem: Problem, run: Run) -> dict[str, float]:
     """Return sum |u_k+1 - u_k| per unit of time, by input."""
-    commands = _measured(problem, run)
-    moves = np.abs(np.diff(commands, axis=0)).sum(axis=0) / (max(len(commands) - 1, 1) * problem.period)
-    return by_name(run.layout["command"].elements, moves if len(commands) else np.nan * moves)
+    moves = _mean(np.abs(np.diff(_measured(problem, run), axis=0))) / problem.period
+    return by_name(run.layout["command"].elements, moves)
 
 
 def at_limit(problem: Problem, run: Run) -> float:
@@ -87,10 +86,9 @@ def at_limits(problem: Problem, run: Run) -> np.ndarray:
     span = upper - lower
     near, commands = _AT * np.where(np.isfinite(span), span, 1.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
-    slowest, fastest = problem.period * np.array(problem.limits.rate_bounds(problem.plant))
-    slack = 1e-6 * np.fmin(fastest, -slowest)
-    moves, slack = np.diff(commands, axis=0, prepend=commands[:1]), np.where(np.isfinite(slack), slack, 0.0)
-    stands |= (moves <= slowest + slack) | (moves >= fastest - slack)
+    slowest, fastest = _AT_RATE * problem.period * np.array(problem.limits.rate_bounds(problem.plant))
+    moves = np.diff(commands, axis=0, prepend=commands[:1])
+    stands |= (moves <= slowest) | (moves >= fastest)
     return np.asarray(stands)
 
 
@@ -219,9 +217,8 @@ def _adapts(run: Run) -> bool:
     return bool(run.settings.get("iterates")) and run.cycles >= _SHORTEST
 
 
-_CHUNK = 500  # cycles whose costs are evaluated in one call
 # Every controller of a comparison is judged by the same cost.
-_COSTS: Latest[tuple[OptimalControl, Evaluator]] = Latest(2)
+_COSTS: Latest[tuple[tuple[str, ...], ca.Function]] = Latest(2)
 
 
 def cost(problem: Problem, run: Run) -> dict[str, float]:
@@ -244,28 +241,24 @@ def _costs(problem: Problem, run: Run) -> tuple[tuple[str, ...], np.ndarray]:
     Effort relative to a feedforward is relative to the feedforward of the plant.
     """
     shifted, own = LOGGED in run.layout.names, bool(problem.own_signals)
-    ocp, evaluator = _COSTS.of((problem,), (shifted,), lambda: _cost_evaluator(problem, shifted=shifted))
+    terms, one = _COSTS.of((problem,), (shifted,), lambda: _cost_function(problem, shifted=shifted))
     states, commands = run["plant_state"], run["command"]
     before = np.vstack([commands[:1], commands[:-1]])
     # Along the reference that the run had, where it is no function of the time alone.
     motion = [run[name] for name in ("reference", "reference_response")] if own else []
     # A disturbed output is h + d; its error is that of h to the reference less d.
     shift = [run[LOGGED]] if shifted else []
-    sources = run["time"], *motion, *shift, states, commands, before
-    costs = np.empty((run.cycles, len(ocp.terms)))
-    evaluator.arguments[-1][:] = problem.plant.exact
-    for at in range(0, run.cycles, _CHUNK):
-        part = slice(at, at + _CHUNK)
-        size = len(costs[part])
-        for argument, source in zip(evaluator.arguments, sources, strict=False):
-            argument.reshape(_CHUNK, -1)[:size] = source[part]
-        evaluator.evaluate()
-        costs[part] = evaluator.results[0].reshape(_CHUNK, -1)[:size]
-    return tuple(ocp.terms), costs
+    exact = np.tile(problem.plant.exact, (run.cycles, 1))
+    sources = run["time"], *motion, *shift, states, commands, before, exact
+    [costs] = Evaluator(one.map(run.cycles))(*sources)
+    return terms, costs.reshape(run.cycles, -1)
 
 
-def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl, Evaluator]:
-    """A horizon of one cycle, and its cost terms of many cycles."""
+def _cost_function(problem: Problem, *, shifted: bool) -> tuple[tuple[str, ...], ca.Function]:
+    """The terms, and their Function (time, [states and responses of the reference], [shift], state, input, the one before, p).
+
+    It is that of the first stage of a horizon of one cycle. The shift is subtracted from the reference.
+    """
     assert problem.horizon is not None
     assert problem.cost is not None
     plant, own = problem.plant, bool(problem.own_signals)
@@ -273,14 +266,6 @@ def _cost_evaluator(problem: Problem, *, shifted: bool) -> tuple[OptimalControl,
     ocp = transcribe(plant, problem.reference, one_cycle, problem.cost, problem.limits, start=problem.start_state)
     outside = real_values(plant, problem.signals)
     data_of = stage_data(plant, problem.reference, one_cycle, problem.cost, signals=outside, previewed=own)
-    return ocp, Evaluator(_cost_function(ocp, data_of, _CHUNK, shifted=shifted))
-
-
-def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shifted: bool) -> ca.Function:
-    """Function (times, [states and responses of the reference], [shift], states, inputs, inputs before, parameters) -> cost terms.
-
-    They are those of `count` cycles. The shift is subtracted from the reference.
-    """
     t, x, before = ca.MX.sym("t"), *(ca.MX.sym(ocp.start.name_in(k), ocp.start.size1_in(k)) for k in (0, 1))
     u, p = ca.MX.sym("u", ocp.input.size), ca.MX.sym("p", data_of.size1_in(data_of.n_in() - 1))
     motion = [ca.MX.sym(data_of.name_in(k), data_of.size1_in(k)) for k in range(1, data_of.n_in() - 1)]
@@ -294,9 +279,7 @@ def _cost_function(ocp: OptimalControl, data_of: ca.Function, count: int, *, shi
     one = ca.Function("fpirhc_cost", [t, *motion, x, u, before, p], [ca.densify(terms)])
     with contextlib.suppress(RuntimeError):  # a table to look up, or a solver, is no scalar code
         one = one.expand()
-    tables = [ca.MX.sym(one.name_in(k), one.size1_in(k), count) for k in range(one.n_in() - 1)]
-    costs = one.map(count)(*tables, ca.repmat(p, 1, count))
-    return ca.Function("fpirhc_costs", [*tables, p], [costs])
+    return tuple(ocp.terms), one
 
 
 METRICS = (
