@@ -85,6 +85,8 @@ def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(na
         np.testing.assert_allclose(
             runs[0]["reference"], runs[1]["reference"], rtol=0, atol=1e-12, err_msg=repr(controller)
         )
+        costs = [fp.measure(p, run)["cost"] for p, run in zip((ours, theirs), runs, strict=True)]
+        assert costs[0] == pytest.approx(costs[1], rel=1e-6)
 
 
 def test_a_horizon_knows_no_set_point_ahead():
