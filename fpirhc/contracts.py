@@ -10,6 +10,7 @@ from fpirhc.controllers.built import build as build
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import ControllerWrapper as ControllerWrapper
 from fpirhc.controllers.contract import PlantModel as PlantModel
+from fpirhc.controllers.contract import Undeformed as Undeformed
 from fpirhc.deformation.base import Deformation as Deformation
 from fpirhc.deformation.base import Form as Form
 from fpirhc.deformation.base import Wrapper as Wrapper

@@ -140,7 +140,7 @@ class Controller(Checked, ABC):
             yield (
                 f"{name} has no `deformation`, which its contract Controller asks for: the map in use. Add the field "
                 "deformation: Deformation = field(default_factory=Identity); a wrapper has a property that returns "
-                "self.inner.deformation"
+                "self.inner.deformation, and a law without a map derives from fpirhc.contracts.Undeformed"
             )
 
     @abstractmethod

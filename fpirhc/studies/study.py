@@ -15,6 +15,7 @@ import pandas as pd
 
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, pair_of
+from fpirhc.simulation.metrics import known_metrics
 from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import run_variants
@@ -34,8 +35,8 @@ class VariantStudy(Study):
     Args:
         table: a row per controller and variant, see `run_variants`.
         summary: a row per controller: worst, worst_in, failures, median, difference to the first one (the median of the paired
-            ones), its 95 % interval from low to high, in how many variants it is better, and the median total variation per unit
-            of time of every input in runs that finished, 'total_variation.INPUT'.
+            ones), its 95 % interval from low to high, in how many variants it is better, and medians over runs that finished:
+            'total_variation.INPUT' per unit of time, and the main metrics of the file.
         groups: the same of every group of cases.
         figure: the number that is judged.
         variants: of the study.
@@ -71,10 +72,10 @@ class VariantStudy(Study):
 
     def _shown(self, title: str, summary: pd.DataFrame) -> Table:
         noun, first, units = self.figure.column, summary.index[0], self.table.attrs["units"]
-        moves = [name for name in map(str, summary) if name.startswith(_MOVES) and name != noun]
+        medians = [name for name in map(str, summary) if name in self.table and name != noun]
         heads = ["controller", f"worst {noun}", f"worst {self.variants.place}", "failures", f"median {noun}"]
         heads += [f"against {first}", "95 % interval"]
-        heads += [f"variation {n.removeprefix(_MOVES)} [{units.get(n, '1')}]" for n in moves]
+        heads += [f"{n.replace(_MOVES, 'variation ')} [{units.get(n, '1')}]" for n in medians]
         shown = Table(title, [*map(Column, heads), Column("better in", None)])  # the verdict has it
         text, apart = self.figure.text, self.figure.difference
         for row in _rows(summary):
@@ -82,7 +83,7 @@ class VariantStudy(Study):
             difference = "" if math.isnan(row.difference) else apart(row.difference)
             better = f"{row.better} of {row.variants}" if row.controller != first else ""
             numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between]
-            moved = [written_out(float(summary[name][row.controller])) for name in moves]
+            moved = [written_out(float(summary[name][row.controller])) for name in medians]
             shown.add([row.controller, *numbers, *moved, better])
         return shown.filled
 
@@ -120,10 +121,11 @@ def study(
     how: dict[str, Any] = {"processes": processes, "compiled": compiled, "progress": progress}
     own, keep = aim.needed(task.metrics), folder and folder / "runs.jsonl"
     table = run_variants(task, variants, controllers=list(chosen), metrics=own, keep=keep, **how)
-    named = table.loc[table.group != ""]
-    groups = {str(g): summarised(some, aim) for g, some in named.groupby("group", sort=False)}
+    named, known = table.loc[table.group != ""], known_metrics()
+    also = tuple(one.name for one in task.metrics if one.main and one not in known)
+    groups = {str(g): summarised(some, aim, also) for g, some in named.groupby("group", sort=False)}
     facts = {**circumstances(task, chosen, command, begin), "chatter": _chatter(table, task)}
-    summary = summarised(table, aim)
+    summary = summarised(table, aim, also)
     return VariantStudy(table=table, summary=summary, groups=groups, figure=aim, variants=variants, **facts)
 
 
@@ -141,7 +143,7 @@ def _chatter(table: pd.DataFrame, task: Task) -> dict[str, dict[str, float]]:
     return found
 
 
-def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
+def summarised(table: pd.DataFrame, aim: Objective, also: Sequence[str] = ()) -> pd.DataFrame:
     """Return a row per controller, see `VariantStudy`. A run that failed is worse than every other one."""
     values = table.assign(
         value=[aim.value(dict(zip(map(str, table), row, strict=True))) for row in table.itertuples(index=False)]
@@ -149,8 +151,8 @@ def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
     wide = values.pivot(index="variant", columns="controller", values="value")
     wide = wide.loc[[*dict.fromkeys(table.variant)], [*dict.fromkeys(table.controller)]]
     failures = (table.outcome != "finished").groupby(table.controller).sum()
-    moves = [column for column in map(str, table) if column.startswith(_MOVES)]
-    moved = table.loc[table.outcome == "finished"].groupby("controller")[moves].median()
+    medians = [column for column in map(str, table) if column.startswith((_MOVES, *also))]
+    middles = table.loc[table.outcome == "finished"].groupby("controller")[medians].median()
     first, rows = wide.iloc[:, 0].to_numpy(), {}
     for name in map(str, wide):
         own, baseline = wide[name].to_numpy(), name == wide.columns[0]
@@ -167,7 +169,7 @@ def summarised(table: pd.DataFrame, aim: Objective) -> pd.DataFrame:
             "high": max(aim.sign * low, aim.sign * high),
             "better": int((own < first).sum()),
             "variants": len(own),
-            **{column: float(moved[column].get(name, math.nan)) for column in moves},
+            **{column: float(middles[column].get(name, math.nan)) for column in medians},
         }
     return pd.DataFrame.from_dict(rows, orient="index").rename_axis("controller")
 

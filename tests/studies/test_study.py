@@ -264,8 +264,12 @@ def test_a_summary_is_that_of_the_rows(task):
     turned = ["CTC+FPI", "CTC"]
     few = fp.study(task, fp.Draws(4, 20.0, 5), compiled=False, controllers=turned)
     assert few.view.sentences[0] == ("CTC against CTC+FPI by error: smaller in 0 of 4.", None)  # it moves less
-    headed = fp.study(replace(task, headline=("CTC+FPI", "CTC")), fp.Draws(1), compiled=False)
+    mine = fp.Metric("largest", lambda problem, run: float(abs(run["command.u"]).max()), unit="N", main=True)
+    own = replace(task, headline=("CTC+FPI", "CTC"), metrics=[*task.metrics, mine])
+    headed = fp.study(own, fp.Draws(1), compiled=False)
     assert [*headed.summary.index][:2] == turned
+    assert headed.view.tables[0].columns[-2].head == "largest [N]"  # a main metric of the file is in the table
+    assert headed.summary.largest.to_dict() == headed.table.set_index("controller").largest.to_dict()
 
 
 def test_chatter_in_some_plants_makes_a_study_doubtful(task):

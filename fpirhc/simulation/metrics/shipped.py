@@ -82,7 +82,12 @@ def at_limit(problem: Problem, run: Run) -> float:
 
 def at_limits(problem: Problem, run: Run) -> np.ndarray:
     """Return whether every command, or its change, stands at a limit in every measured cycle, shape (cycles, inputs)."""
-    lower, upper = _limits(problem, run)
+    given = cast(Mapping[str, float], run.settings.get("live", {}))  # limits that the run was given
+    ends = enumerate(problem.limits.input_bounds(problem.plant))
+    lower, upper = (
+        np.array([given.get(f"limits.inputs.{name}.{k}", b) for name, b in zip(problem.plant.inputs, end, strict=True)])
+        for k, end in ends
+    )
     span = upper - lower
     near, commands = _AT * np.where(np.isfinite(span), span, 1.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
@@ -100,15 +105,6 @@ def _measured(problem: Problem, run: Run) -> np.ndarray:
 def _mean(values: np.ndarray) -> np.ndarray:
     """The mean over cycles; NaN where no cycle is measured."""
     return np.asarray(values.sum(axis=0) / len(values) if len(values) else np.full(values.shape[1:], np.nan))
-
-
-def _limits(problem: Problem, run: Run) -> np.ndarray:
-    """The limits of the inputs, shape (2, inputs); those that a run was given are its own."""
-    given = cast(Mapping[str, float], run.settings.get("live", {}))
-    names, bounds = problem.plant.inputs, problem.limits.input_bounds(problem.plant)
-    return np.array(
-        [[given.get(f"limits.inputs.{n}.{end}", b) for n, b in zip(names, bounds[end], strict=True)] for end in (0, 1)]
-    )
 
 
 def cycles(problem: Problem, run: Run) -> int:  # noqa: ARG001 -- every metric is given the problem
