@@ -38,36 +38,32 @@ def _publish(view: Any, page: str, folder: Path, as_json: bool, verbose: bool) -
 @command(
     "compare two_mass",
     "compare my_arm.py -c RHC RHC+FPI --set deformation.gain=-1.2",
-    "compare cart_pole --optimisers fixed-point ipopt    every planning controller once with each",
-    "compare cart_pole --plans --optimisers all          their first plans to 1e-6, with certificates, and no run",
+    "compare cart_pole --plans    their first plans, with certificates, and no run",
 )
 def compare(
     problem: opt.Problem, controllers: opt.Controllers = None, set_: opt.Set = None,
-    optimisers: Annotated[list[str] | None, given("NAME ...", "run planning controllers with each of these, or all")] = None,
     plans: Annotated[bool, typer.Option("--plans", help="solve and certify the first plans alone; no run")] = False,
     seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Run controllers side by side and write a report. It names the winner, by how much, and at what price.
 
-    Exit code 1: no controller finishes. With -c, --set or --optimisers the report goes to results/PROBLEM/part.
+    Exit code 1: no controller finishes. With -c or --set the report goes to results/PROBLEM/part.
     """
     task = _task(problem, set_, controllers)
     from fpirhc.report.html import render
     from fpirhc.report.terminal import announce_backend, progress_bars
     from fpirhc.studies.compare import compare as run
     from fpirhc.studies.compare import select
-    from fpirhc.studies.open_loop import first_plans, with_optimisers
+    from fpirhc.studies.open_loop import first_plans
 
     named = list(select(task, controllers)) if controllers else None
-    folder = opt.folder_of(out, task.name, *["part"] * bool((controllers or set_ or optimisers) and not plans))
+    folder = opt.folder_of(out, task.name, *["part"] * bool((controllers or set_) and not plans))
     if plans:
         with progress_bars() as progress:
             progress("first plans", 0, 1)
-            solved = first_plans(task, optimisers, named)
+            solved = first_plans(task, named)
         return _show_plans(task, solved, folder)
-    if optimisers:
-        task, named = with_optimisers(task, optimisers, named), None
     with progress_bars() as progress:
         result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
     announce_backend(entry.run for entry in result.entries)

@@ -318,7 +318,6 @@ def _require_rollouts(growth: np.ndarray) -> None:
 
 
 EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))
-CHOICES = {"fixed-point": ("FixedPoint", lambda tolerance: FixedPoint(iterations=1, tolerance=tolerance))}
 
 
 def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Columns, first: Columns) -> Columns:

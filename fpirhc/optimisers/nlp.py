@@ -306,7 +306,3 @@ class Fatrop(MultipleShooting):
 
 
 EXAMPLES = (Ipopt(tolerance=1e-6), Fatrop(tolerance=1e-6))
-CHOICES = {
-    "ipopt": ("IPOPT", lambda tolerance: Ipopt(tolerance=tolerance)),
-    "fatrop": ("fatrop", lambda tolerance: Fatrop(tolerance=tolerance)),
-}

@@ -341,6 +341,3 @@ EXAMPLES = (
     GradientFixedPoint(iterations=100, tolerance=1e-6),
     ReducedGradient(iterations=200, tolerance=1e-6),
 )
-CHOICES = {
-    "reduced-gradient": ("reduced gradient", lambda tolerance: ReducedGradient(iterations=50, tolerance=tolerance))
-}

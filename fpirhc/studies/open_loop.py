@@ -1,4 +1,4 @@
-"""Open-loop solves of a problem's first horizon with the optimisers that the command line names, and a certificate of each plan.
+"""Open-loop solves of a problem's first horizon with the optimisers of its controllers, and a certificate of each plan.
 
 A certificate says what is known beyond the residual: how fast the iteration contracts there, and how far the optimum is. Its
 bounds, and where they hold, stand in docs/theory.md.
@@ -6,32 +6,26 @@ bounds, and where they hold, stand in docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import with_field
 from fpirhc.describe import identity
-from fpirhc.errors import InvalidName, InvalidProblem, nearest
+from fpirhc.errors import InvalidProblem
 from fpirhc.fields.checked import checked_call
 from fpirhc.horizon.hessian_models import GaussNewton, hessian_end, hessian_stage, linear_stage
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient
 from fpirhc.horizon.transcription import transcribe
-from fpirhc.members import member_modules
-from fpirhc.optimisers import Optimiser
 from fpirhc.optimisers.plan import Plan, sensitivity_of, solve
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.task.exogenous import model_values
-from fpirhc.task.problem import Problem
 
 _ROUNDING = 1e-14  # relative to the trace, added to the model before it is factorised
 _REMEMBERED = 4  # horizons whose Functions are kept
 _AT_BOUND = 1e-9  # relative distance within which an input counts as at its bound
-TOLERANCE = 1e-6  # of the plans of named optimisers
 _RANK = 1e-9  # relative singular value below which active limits depend on each other
 
 
@@ -213,18 +207,15 @@ def _largest_return(active: _Active, free: np.ndarray) -> float:
 class Solved:
     """One optimiser's plan."""
 
-    name: str  # label of the optimiser, or name of its controller
+    name: str  # of the controllers whose optimiser it is
     plan: Plan
     certificate: Certificate | None  # certificate of the plan; None where the plan is not inside its bounds
 
 
-def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[str] | None) -> list[Solved]:
-    """Solve the horizon that begins at the start of the problem, with the approximate model.
+def first_plans(task: Task, controllers: Sequence[str] | None) -> list[Solved]:
+    """Solve the horizon that begins at the start of the problem, with the approximate model and the optimiser of each controller.
 
-    Args:
-        names: of optimisers, which solve it to `TOLERANCE`; 'all' among them stands for every one. Where a controller has one of
-            that kind it is that one, with its settings. None: each controller's own.
-        controllers: names of those whose optimisers are meant; None: all that plan.
+    `controllers`: names of those whose optimisers are meant; None: all that plan. Optimisers that are alike solve it once.
     """
     problem = task.problem
     own = {name: task.controllers[name].planner for name in controllers or task.controllers}
@@ -233,84 +224,18 @@ def first_plans(task: Task, names: Sequence[str] | None, controllers: Sequence[s
         raise InvalidProblem(
             f"problem '{task.name}' has no horizon, or none of {', '.join(own)} plans with an optimiser"
         )
-    if names:
-        some = [one.optimiser for one in planners.values()]
-        wanted = {
-            label: (_of_kind(made, TOLERANCE, some), problem.cost) for label, made in chosen_optimisers(names).values()
-        }
-    else:
-        alike: dict[object, list[str]] = {}
-        for name, one in planners.items():
-            alike.setdefault(identity((one.optimiser, one.cost)), []).append(name)
-        wanted = {
-            ", ".join(some): (planners[some[0]].optimiser, planners[some[0]].cost or problem.cost)
-            for some in alike.values()
-        }
+    alike: dict[object, list[str]] = {}
+    for name, one in planners.items():
+        alike.setdefault(identity((one.optimiser, one.cost)), []).append(name)
     plant, limits, start = problem.plant, problem.limits, problem.start_state
     ahead = model_values(plant, problem.signals)
     solved = []
-    for label, (optimiser, cost) in wanted.items():
+    for names in alike.values():
+        optimiser, cost = planners[names[0]].optimiser, planners[names[0]].cost or problem.cost
         if cost is None:
             raise InvalidProblem(f"problem '{task.name}' has no cost; give Problem(cost=...)")
         ocp = transcribe(plant, problem.reference, problem.horizon, cost, limits, ahead, start)
         first = np.asarray(ocp.start(start, problem.inputs_before).full()).ravel()
         plan = solve(ocp, optimiser, first, ocp.nodes[2])
-        solved.append(Solved(label, plan, None if plan.overflow() else certify(plan)))
+        solved.append(Solved(", ".join(names), plan, None if plan.overflow() else certify(plan)))
     return solved
-
-
-Choice = tuple[str, Callable[[float], Optimiser]]  # label, function of the tolerance
-
-
-def optimiser_choices() -> dict[str, Choice]:
-    """Return every optimiser of the command line, which the modules of the optimisers define as `CHOICES`: name -> choice."""
-    choices: dict[str, Choice] = {}
-    for module in member_modules("optimisers"):
-        choices |= getattr(module, "CHOICES", {})
-    return choices
-
-
-def chosen_optimisers(names: Sequence[str]) -> dict[str, Choice]:
-    """Return the choices of these names; 'all' among them stands for every optimiser."""
-    choices = optimiser_choices()
-    unknown = [n for n in names if n != "all" and n not in choices]
-    if unknown:
-        raise InvalidName(f"optimiser '{unknown[0]}' is unknown.{nearest(unknown[0], [*choices, 'all'])}")
-    return choices if "all" in names else {name: choices[name] for name in names}
-
-
-def _of_kind(build: Callable[[float], Optimiser], tolerance: float, own: Sequence[Optimiser]) -> Optimiser:
-    """The first of a file's own optimisers that is of this kind, to this tolerance; a new one where a kind has two names."""
-    fresh = build(tolerance)
-    names = sum(type(other(tolerance)) is type(fresh) for _, other in optimiser_choices().values())
-    alike = [one for one in own if type(one) is type(fresh)] if names == 1 else []
-    return replace(alike[0], tolerance=tolerance) if alike else fresh  # type: ignore[type-var]
-
-
-def with_optimisers(task: Task, names: Sequence[str], controllers: Sequence[str] | None) -> Task:
-    """Return the task with its planning controllers once per optimiser: the headline pair, or those named.
-
-    A controller that is named and does not plan stays as it is.
-    """
-    choices = chosen_optimisers(names).values()
-    sources = {name: task.controllers[name] for name in controllers or task.headline or task.controllers}
-    own = {name: one.planner.optimiser for name, one in task.controllers.items() if one.planner is not None}
-    if not own.keys() & sources:
-        raise InvalidProblem(f"problem '{task.name}': none of {', '.join(sources)} plans with an optimiser")
-    varied: dict[str, Controller] = {}
-    for name, controller in sources.items():
-        if name in own:
-            tolerance, kept = _tolerance_of(own[name], task.problem), [own[name], *own.values()]
-            varied |= {
-                f"{name} ({n})": with_field(controller, "optimiser", _of_kind(b, tolerance, kept)) for n, b in choices
-            }
-        elif controllers:
-            varied[name] = controller
-    return replace(task, controllers=varied, headline=None)
-
-
-def _tolerance_of(optimiser: Optimiser, problem: Problem) -> float:
-    """Its own, in the unit of the inputs; where it takes one by itself, 1e-4 of half the smallest range of an input."""
-    stated = getattr(optimiser, "tolerance", None)
-    low, high = problem.limits.input_bounds(problem.plant)
-    return stated or min((0.5e-4 * size for size in high - low if 0 < size < np.inf), default=1e-3)

@@ -71,7 +71,9 @@ TUNABLE = edited(
     "controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {'
 )
 PLAN = "fp.FixedPoint(iterations=1, tolerance=1e-3)"
-CHOSEN = edited(f"{PLAN}),\n", "fp.FixedPoint()),\n")  # its tolerance follows from the limits of the inputs
+PRECISE = edited(
+    f"{PLAN}),\n", 'fp.FixedPoint(tolerance=1e-6)),\n    "IPOPT": fp.RecedingHorizon(fp.Ipopt(tolerance=1e-6)),\n'
+)
 OF_AN_END = edited(
     'fp.Quadratic(states={"y": 100.0, "y\'": 1.0}, deviation={"u": 1e-2})',
     """fp.CustomCost(
@@ -111,13 +113,9 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     ],
     "plans": [
         (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
-        (receding, "compare line.py --optimisers fixed-point ipopt --no-compile -c RHC", 0, MASS),
-    ],
-    "optimisers by name": [
-        (lambda: (receding(), CHOSEN()), "compare line.py --optimisers ipopt --no-compile -c RHC", 0, MASS),
-        (OF_AN_END, "compare line.py --plans --optimisers fixed-point -c RHC", 2, "fpirhc: FixedPoint needs a cost that"),
-        (BENDS, "compare line.py --plans --optimisers fixed-point -c RHC+FPI", 0, "line, first horizon"),
-        (None, "compare line.py --optimisers fixed-point --no-compile -c RHC+FPI", 0, MASS),
+        (receding, "compare line.py --no-compile -c RHC", 0, MASS),
+        (OF_AN_END, "compare line.py --plans -c RHC", 2, "fpirhc: FixedPoint needs a cost that"),
+        (BENDS, "compare line.py --plans -c RHC+FPI", 0, "line, first horizon"),
     ],
     "run": [
         (None, "run line.py CTC --no-compile --out kept", 0, f"{RUN} CTC: errors from t = 0.5 s on, seed 0.\nrms"),
@@ -226,10 +224,9 @@ def test_plans_are_certified_side_by_side(folder, capsys, monkeypatch):
     """A plan to 1e-6 by either optimiser is the same optimum, and its bound says so; a limit that is broken has its name."""
     monkeypatch.setenv("COLUMNS", "200")
     receding()
-    assert main(["compare", "line.py", "--plans", "--optimisers", "fixed-point", "ipopt"]) == 0
-    rows = [
-        line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] in (["FixedPoint"], ["IPOPT"])
-    ]
+    PRECISE()
+    assert main(["compare", "line.py", "--plans", "-c", "RHC", "IPOPT"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if line.split()[:1] in (["RHC"], ["IPOPT"])]
     assert len({row[1] for row in rows}) == 1
     assert all(float(row[4]) < 1 and float(row[5]) < 1e-3 for row in rows)
     assert (folder / "results/line/plan.png").stat().st_size > 10_000

@@ -287,7 +287,6 @@ run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number o
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
 compare mine.py --set exact.mass=-1 => enlarges the error: mass of the plant and of the model differ in sign; give the model
 run mine.py RHC --case adult => problem 'mine' has no cases; add cases = fpirhc.Cases({...}) to its file
-compare mine.py --plans --optimisers ipot => optimiser 'ipot' is unknown. Did you mean 'ipopt'? Valid: fixed-point, ipopt,
 tune mine.py => no search space ... add to its file, for example, tuning =
 tune two_mass --trials 10000000000 => '--trials'
 tune two_mass --metric settling.qq => metric 'settling.qq' is unknown. Did you mean 'settling.q2'?
