@@ -210,7 +210,7 @@ def _free(name: str, plant: Plant) -> str:
     return name
 
 
-WORSE, MUCH_WORSE, FAR_WORSE = 1.2, 2.0, 10.0  # ratio of the errors
+MUCH_WORSE, FAR_WORSE = 2.0, 10.0  # ratio of the errors
 _ROUNDING = 1e-9  # share of the coordinate's range
 MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing
 SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
@@ -256,17 +256,9 @@ class ErrorPair:
         return f"the rms error of {self.worst} is {before:.3g}{unit} without adaptation, {rest}"
 
     @property
-    def stuck(self) -> str:
-        """Why the pair shows nothing: commands stand at a limit in both runs; empty where it shows something."""
-        if not self.at_limit >= MOSTLY:  # NaN is informative
-            return ""
-        share = f"{100 * self.at_limit:.3g} %"
-        return f"not informative: the command stands at a limit in {share} of the cycles, where no adaptation can act"
-
-    @property
-    def passes(self) -> bool:
-        """Whether adaptation makes no coordinate worse by more than a fifth and by a thousandth of its range."""
-        return not self._beyond(WORSE, SLIGHT)
+    def stuck(self) -> bool:
+        """Whether the pair shows nothing: commands stand at a limit in both runs, where no adaptation can act."""
+        return self.at_limit >= MOSTLY  # NaN is informative
 
     @property
     def fails(self) -> bool:
@@ -322,34 +314,30 @@ def weighed(problem: Problem, controller: Controller) -> frozenset[str] | None:
     return frozenset(n for n in problem.judged_names if n in names) or None
 
 
-def harm_in(real: ErrorPair | None, null: ErrorPair) -> str:
-    """Return what runs on the plant (None: it is outside) and on the model show against adaptation; empty without harm."""
-    if real is not None and not real.passes:
-        return f"with the wrong model {real.sentence}"
-    if not null.passes and (real is None or null.adapted[null.worst] > real.without[null.worst]):
-        return f"with a right model {null.sentence}"
-    return ""
+def harm(problem: Problem, controller: Controller, cycles: int) -> str:
+    """Return what runs of so many cycles, without adaptation and with it, on the plant and on the model, show against adaptation.
 
-
-def experiment(problem: Problem, controller: Controller, cycles: int) -> tuple[ErrorPair | None, ErrorPair]:
-    """Return the errors of runs of so many cycles, without adaptation and with it: on the plant, and on the controller's model.
-
-    They are of the coordinates that its cost weighs. A plant outside is not run: it has None.
-
-    Raises:
-        FpirhcError: every error that the controller raises about the problem.
+    They are judged by the coordinates that its cost weighs. A plant outside is not run. Empty: no harm, or no such run.
     """
+    if not controller.deformation.adapts:
+        return ""
     short = shortened(problem, cycles)
-    loops = loop_of(short, without_deformation(controller)), loop_of(short, controller)
-    names = weighed(short, loops[1].controller)
-    null = errors_of(*ModelAsPlant(short, seed=0).pair(loops), names)
-    if not short.moves.simulated:
-        return None, null
-    return errors_of(short, [loop.run(seed=0, variant=short) for loop in loops], names), null
+    try:
+        loops = loop_of(short, without_deformation(controller)), loop_of(short, controller)
+        names = weighed(short, loops[1].controller)
+        null = errors_of(*ModelAsPlant(short, seed=0).pair(loops), names)
+        runs = [loop.run(seed=0, variant=short) for loop in loops] if short.moves.simulated else []
+    except FpirhcError:  # what the runs cannot do says nothing about the controller
+        return ""
+    real = errors_of(short, runs, names) if runs else None
+    reasons = [f"on the plant {real.sentence}"] if real and real.fails else []
+    if null.fails and (real is None or null.adapted[null.worst] > real.without[null.worst]):
+        reasons.append(f"on its own model, with nothing to adapt {null.sentence}")
+    return "; ".join(reasons)
 
 
 CYCLES = 300  # of a run
-_REASONS: Latest[list[str]] = Latest(8)  # the same values run alike
+_FOUND: Latest[str] = Latest(8)  # the same values run alike
 _REMEDY = (
     "Use ModelReferenced(map), which leaves an exact model alone, or ask fpirhc review. To silence this, and spare the runs: "
     'warnings.simplefilter("ignore", fpirhc.HarmfulAdaptation)'
@@ -358,15 +346,11 @@ _REMEDY = (
 
 def warn_of_harm(problem: Problem, controller: Controller) -> None:
     """Warn once where adaptation does harm; nothing is run where the warning is ignored, or nothing adapts a fixed model."""
-    if not controller.deformation.adapts or controller.learns or _ignored():
+    if controller.learns or _ignored():
         return
-    try:
-        reasons = _REASONS.of((problem, controller), (), lambda: _reasons(problem, controller))
-    except FpirhcError:  # what the runs cannot do says nothing about the controller
-        return
-    if reasons:
+    if found := _FOUND.of((problem, controller), (), lambda: harm(problem, controller, CYCLES)):
         what = ", ".join(part for part in (problem.name, name_in_task(controller)) if part)
-        text = f"{what}: adaptation does harm, by runs of {CYCLES} cycles: {'; '.join(reasons)}. {_REMEDY}"
+        text = f"{what}: adaptation does harm, by runs of {CYCLES} cycles: {found}. {_REMEDY}"
         warnings.warn(text, HarmfulAdaptation, stacklevel=users_level())
 
 
@@ -384,11 +368,3 @@ def _ignored() -> bool:
         if issubclass(HarmfulAdaptation, category) and message is None and module is None:
             return action == "ignore"
     return False
-
-
-def _reasons(problem: Problem, controller: Controller) -> list[str]:
-    real, null = experiment(problem, controller, CYCLES)
-    reasons = [] if real is None or not real.fails else [f"on the plant {real.sentence}"]
-    if null.fails and (real is None or null.adapted[null.worst] > real.without[null.worst]):
-        reasons.append(f"on its own model, with nothing to adapt {null.sentence}")
-    return reasons

@@ -31,7 +31,7 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
-from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, experiment, harm_in, shortened, weighed
+from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, harm, shortened, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, follows, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
@@ -349,12 +349,7 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
 
 def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:
     """Return what runs of a thousand cycles on the plant and on the model show against the adaptation, and the span that counts."""
-    if not controller.deformation.adapts:
-        return ()
     short = shortened(problem, 1000)
-    try:
-        against = harm_in(*experiment(short, controller, short.cycles))
-    except FpirhcError:
-        return ()
+    against = harm(short, controller, short.cycles)
     span = f"t = {short.measure_from:.4g} to {short.duration:.4g}{with_space(problem.time_unit)}"
     return (f"{name}, {span}: {against}.",) if against else ()

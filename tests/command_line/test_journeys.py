@@ -88,7 +88,7 @@ WITH_CASES = edited("controllers = {", 'cases = fp.Cases({"soft": {"exact.k": 1.
 MASS = "A mass on a line with a wrong gain. Errors from t = 0.5 s on, seed 0."
 RUN = "A mass on a line with a wrong gain."
 HARMED = (
-    "CTC+FPI: errors from t = 0.5 s on, seed 0.\n- CTC+FPI, t = 0.5 to 2 s: with the wrong model the rms error of y is"
+    "CTC+FPI: errors from t = 0.5 s on, seed 0.\n- CTC+FPI, t = 0.5 to 2 s: on its own model, with nothing to adapt"
 )
 # What is done before, the words, the exit code, and what the first line says. Those of a row follow one another.
 JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {

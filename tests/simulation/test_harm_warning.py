@@ -75,4 +75,4 @@ def test_a_search_says_what_speaks_against_its_best_number(tmp_path):
     harm = fp.tune(tasks.made(PROBLEM, laws, tuning=spans), trials=1, compiled=False, folder=tmp_path).harm
     assert harm["law"] == ()
     [said] = harm["law+FPI"]
-    assert said.startswith("law+FPI, t = 1 to 4 s: with the wrong model the rms error of y is")
+    assert said.startswith("law+FPI, t = 1 to 4 s: on the plant the rms error of y is")
