@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.symbolic.native import cache_folder, find_compiler, native
 
 Finding = tuple[str, str, str, str]  # name; ok, none (not needed by most), warn or fail; evidence; what to do
-_PACKAGES = ("fpirhc", "casadi", "numpy", "scipy", "control")
+_PACKAGES = ("fpirhc", "casadi", "numpy", "scipy")
 _SOLVERS = {"ipopt": "the optimiser Ipopt", "fatrop": "the optimiser Fatrop"}
 _GCC = "sudo apt install gcc (Debian, Ubuntu), xcode-select --install (macOS), pip install ziglang, or name one by FPIRHC_CC"
 _EXTRAS = {

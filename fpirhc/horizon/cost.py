@@ -333,7 +333,7 @@ class Quadratic(Cost):
 class LQRTerminal(Terminal):
     """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
 
-    Near the reference a short horizon then acts like an infinite one. The package `control` solves the equation.
+    Near the reference a short horizon then acts like an infinite one.
     """
 
     def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
@@ -342,7 +342,7 @@ class LQRTerminal(Terminal):
         Raises:
             InvalidProblem: no input is weighed, or its rate is, or the linearised model cannot be stabilised.
         """
-        import control
+        from scipy.linalg import solve_discrete_are  # only here: the import takes long
 
         h = linearisation.step
         q = np.diag([h * cost.states.get(e, 0.0) for e in plant.state.elements])
@@ -352,10 +352,9 @@ class LQRTerminal(Terminal):
                 "LQRTerminal needs a positive effort or deviation weight for every input, and none of a rate"
             )
         try:
-            weight, _, _ = control.dare(linearisation.a, linearisation.b, q, r)
-        except (np.linalg.LinAlgError, control.ControlArgument, ValueError) as error:
+            return np.asarray(solve_discrete_are(linearisation.a, linearisation.b, q, r))
+        except ValueError as error:  # LinAlgError is one
             raise InvalidProblem(f"LQRTerminal: the linearised model has no stabilising solution ({error})") from None
-        return np.asarray(weight)
 
 
 @dataclass(frozen=True, eq=False)
