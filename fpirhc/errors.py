@@ -53,16 +53,8 @@ class InvalidField(InvalidValue, InvalidProblem, TypeError):
         super().__init__(tuple(mistakes), place)
         self.mistakes, self.place = tuple(mistakes), place
 
-    @property
-    def text(self) -> str:
-        """The mistakes without their place."""
-        return _numbered(self.mistakes)
-
     def __str__(self) -> str:
-        if not self.place:
-            return self.text
-        lead = f"{len(self.mistakes)} mistakes\n" if len(self.mistakes) > 1 else ""
-        return f"{self.place}: {lead}{self.text}"
+        return _told(self.mistakes, self.place)
 
 
 class ProblemFileError(FpirhcError):
@@ -259,12 +251,12 @@ class Mistakes(list[str]):
 
     def raise_if_any(self) -> None:
         """Raise InvalidProblem with all mistakes, if there is one."""
-        where = f"{self._where}: " if self._where else ""
         if self:
-            lead = f"{len(self)} mistakes\n" if len(self) > 1 else ""
-            raise InvalidProblem(f"{where}{lead}{_numbered(self)}")
+            raise InvalidProblem(_told(self, self._where))
 
 
-def _numbered(mistakes: Sequence[str]) -> str:
-    """One mistake as it is, several as a list."""
-    return mistakes[0] if len(mistakes) == 1 else "\n".join(f"  {k}. {m}" for k, m in enumerate(mistakes, 1))
+def _told(mistakes: Sequence[str], where: str) -> str:
+    """One mistake as it is, several as a list, behind the words where they are."""
+    lines = mistakes[0] if len(mistakes) == 1 else "\n".join(f"  {k}. {m}" for k, m in enumerate(mistakes, 1))
+    lead = f"{len(mistakes)} mistakes\n" if len(mistakes) > 1 else ""
+    return f"{where}: {lead}{lines}" if where else lines

@@ -17,8 +17,7 @@ import numpy as np
 from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, RequestChange, automatic, scaled_for, with_inner
 from fpirhc.errors import require
-from fpirhc.fields.checked import Checked, replaced, unnamed_inner
-from fpirhc.fields.kinds import described
+from fpirhc.fields.checked import Checked, replaced, wrong_inner
 from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
@@ -131,12 +130,11 @@ class Controller(Checked, ABC):
         inner = None
 
     def _lacks(self) -> Iterator[str]:
-        name, inner = type(self).__name__, self.inner
-        if inner is not None and not isinstance(inner, Controller):
-            yield f"{name}: `inner` is the controller that it wraps, or None, got {described(inner)}"
-            return
-        yield from unnamed_inner(self, Controller)
-        if not isinstance(getattr(self, "deformation", None), Deformation):
+        name = type(self).__name__
+        yield from wrong_inner(self, Controller)
+        if isinstance(self.inner, Controller | None) and not isinstance(
+            getattr(self, "deformation", None), Deformation
+        ):
             yield (
                 f"{name} has no `deformation`, which its contract Controller asks for: the map in use. Add the field "
                 "deformation: Deformation = field(default_factory=Identity); a wrapper has a property that returns "

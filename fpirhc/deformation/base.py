@@ -18,8 +18,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported, require
-from fpirhc.fields.checked import Checked, replaced, unnamed_inner
-from fpirhc.fields.kinds import described, finite_number
+from fpirhc.fields.checked import Checked, replaced, wrong_inner
+from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
@@ -110,10 +110,7 @@ class Deformation(Checked, ABC):
         inner = None  # a plain attribute, so that a dataclass may have a field of this name
 
     def _lacks(self) -> Iterator[str]:
-        if self.inner is not None and not isinstance(self.inner, Deformation):
-            yield f"{type(self).__name__}: `inner` is the map that it is around, or None, got {described(self.inner)}"
-        else:
-            yield from unnamed_inner(self, Deformation)
+        yield from wrong_inner(self, Deformation)
 
     @final
     @property

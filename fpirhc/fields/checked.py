@@ -11,6 +11,7 @@ import sys
 from abc import ABCMeta
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
 from functools import cache, wraps
 from importlib import import_module
 from typing import Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
@@ -18,7 +19,7 @@ from typing import Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 import casadi as ca
 
 from fpirhc.errors import InvalidField, InvalidName, NotSupported, nearest
-from fpirhc.fields.kinds import ANYTHING, Expected, accepts, call_of, described, expected_by
+from fpirhc.fields.kinds import ANYTHING, SHORT, Expected, accepts, call_of, described, expected_by
 from fpirhc.fields.user_code import users_place
 
 
@@ -59,13 +60,16 @@ def expects_whole_number(owner: type, name: str) -> bool:
     return _arguments_of(owner).expected.get(name, ANYTHING).whole
 
 
-def unnamed_inner(value: object, contract: type) -> Iterator[str]:
-    """Yield a mistake for a wrapper that does not say what it wraps: a value of its own contract in a field, and no `inner`."""
+def wrong_inner(value: object, contract: type) -> Iterator[str]:
+    """Yield a mistake for a wrapper whose `inner` is no value of its contract, or which holds one in a field and has no `inner`."""
+    kind, own, inner = type(value).__name__, contract.__name__, getattr(value, "inner", None)
+    if inner is not None and not isinstance(inner, contract):
+        yield f"{kind}: `inner` is the {own} that it wraps, or None, got {described(inner)}"
     for name, content in getattr(value, "__dict__", {}).items():
-        if isinstance(content, contract) and getattr(value, "inner", None) is None:
+        if isinstance(content, contract) and inner is None:
             yield (
-                f"{type(value).__name__} holds a {contract.__name__} in '{name}' and has no `inner`, by which its contract "
-                f"{contract.__name__} finds it; add a property `inner` that returns self.{name}"
+                f"{kind} holds a {own} in '{name}' and has no `inner`, by which its contract {own} finds it; "
+                f"add a property `inner` that returns self.{name}"
             )
 
 
@@ -171,7 +175,7 @@ def _expected(owner: Any, parameter: inspect.Parameter) -> Expected:
 def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
     """Yield what is wrong with a value and its parts; `where` names it."""
     if not expected.fits(value):
-        mend = expected.written(value) or _mended(expected, value)
+        mend = _mended(expected, value)
         yield f"{where}: expected {expected.words}, got {described(value)}{'; ' + mend if mend else ''}"
         return
     for place, inner, part in expected.parts(value):
@@ -179,7 +183,13 @@ def mistakes_in(expected: Expected, where: str, value: object) -> Iterator[str]:
 
 
 def _mended(expected: Expected, value: object) -> str:
-    """Return what to write instead: a part of the value, or a member of what is expected; empty where nothing is near."""
+    """Return what to write instead: a text that is near, the value inside of what is expected, a part of it, or a member."""
+    if isinstance(value, str) and (near := get_close_matches(value, expected.texts, n=1)):
+        return f"write '{near[0]}'"
+    one = SHORT.repr(value) if isinstance(value, int | float | tuple | str) else f"{type(value).__name__}(...)"
+    inside = [f"write {{'NAME': {one}}} with the name of what it belongs to"] * accepts(expected, {"NAME": value})
+    if inside := [*inside, *[f"write {SHORT.repr((value,))}"] * accepts(expected, (value,))]:
+        return ", or ".join(inside)
     if isinstance(value, type):
         return f"write {call_of(value)}" if issubclass(value, expected.classes) else ""
     if isinstance(value, ca.SX | ca.MX):
@@ -215,7 +225,7 @@ def replaced(value: Value, field: str, content: object) -> Value | None:
 
 
 class ByName(dict[str, Value]):
-    """A dictionary with names as keys; dictionaries in it are such ones too."""
+    """A dictionary with names as keys that stays as it is; dictionaries in it are such ones too."""
 
     def __init__(self, entries: Mapping[str, Value] | Iterable[tuple[str, Value]], where: str = "the mapping") -> None:
         """Copy the entries; `where` is the subject of the error: "Task.controllers"."""
@@ -223,7 +233,7 @@ class ByName(dict[str, Value]):
         self._where = where
         for name, value in self.items():
             if type(value) is dict:  # not a subclass, which may have an order or a default of its own
-                super().__setitem__(name, cast(Value, type(self)(cast(Any, value), f"{where}[{name!r}]")))
+                super().__setitem__(name, cast(Value, ByName(cast(Any, value), f"{where}[{name!r}]")))
 
     def __getitem__(self, name: str) -> Value:
         try:
@@ -235,11 +245,7 @@ class ByName(dict[str, Value]):
         raise InvalidName(f"{self._where} has no '{name}'.{nearest(name, self)}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        return type(self), (dict(self), self._where)
-
-
-class Fixed(ByName[Value]):
-    """A dictionary in a field of a frozen value, from which more was computed: a change in place would have no effect."""
+        return ByName, (dict(self), self._where)
 
     def _stays(self, *_: object, **__: object) -> NoReturn:
         raise NotSupported(
@@ -259,8 +265,8 @@ class FoundByName:
 
 
 def find_by_name(value: object) -> None:
-    """Let every dictionary in a public attribute of a value be found by name; those of a frozen value stay as they are."""
-    kind = Fixed if is_dataclass(value) and getattr(value, "__dataclass_params__").frozen else ByName  # noqa: B009
-    for name, content in list(getattr(value, "__dict__", {}).items()):
+    """Let every dictionary in a public attribute of a frozen value be found by name, and stay as it is."""
+    frozen = is_dataclass(value) and getattr(value, "__dataclass_params__").frozen  # noqa: B009
+    for name, content in list(vars(value).items()) if frozen else ():
         if type(content) is dict and not name.startswith("_") and all(isinstance(key, str) for key in content):
-            object.__setattr__(value, name, kind(content, f"{type(value).__name__}.{name}"))
+            object.__setattr__(value, name, ByName(content, f"{type(value).__name__}.{name}"))

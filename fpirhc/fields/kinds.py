@@ -6,7 +6,6 @@ A type checker reads a kind as float or int.
 from __future__ import annotations
 
 import collections.abc
-import difflib
 import inspect
 import math
 import numbers
@@ -23,9 +22,9 @@ import numpy as np
 from fpirhc.errors import InvalidField
 from fpirhc.symbolic.open import is_open
 
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 60
-_SHORT.maxdict = 2
+SHORT = reprlib.Repr()
+SHORT.maxstring = SHORT.maxother = 60
+SHORT.maxdict = 2
 
 
 def described(value: object) -> str:
@@ -33,15 +32,15 @@ def described(value: object) -> str:
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if isinstance(value, ca.SX | ca.MX):
-        return f"a CasADi {'symbol' if value.is_valid_input() else 'expression'} ({_SHORT.repr(value)})"
+        return f"a CasADi {'symbol' if value.is_valid_input() else 'expression'} ({SHORT.repr(value)})"
     if isinstance(value, str):
-        return f"the text {_SHORT.repr(value)}"
+        return f"the text {SHORT.repr(value)}"
     if inspect.isroutine(value):
         return f"the function {getattr(value, '__name__', value)}{_signature(value) or '(...)'}"
     if isinstance(value, np.ndarray):
         return f"an array of the shape {value.shape} and the type {value.dtype}"
     plain = value is None or isinstance(value, int | float | tuple | list | dict | set)
-    return _SHORT.repr(value) if plain else f"a value of the class {type(value).__name__}"
+    return SHORT.repr(value) if plain else f"a value of the class {type(value).__name__}"
 
 
 def call_of(one: type | Callable[..., object]) -> str:
@@ -154,19 +153,14 @@ class Expected:
     words: str  # after the word "expected"
     fits: Callable[[Any], bool]  # whether a value itself is of the right kind, whatever its parts are
     parts: Callable[[Any], Iterable[Part]] = lambda _: ()  # of a value that fits
-    written: Callable[[Any], str] = lambda _: ""  # how a value that is near, or a part of one, is written
+    texts: tuple[str, ...] = ()  # that are expected, for the nearest one
     classes: tuple[type, ...] = ()  # whose values are expected, for a hint at the members of a family
     whole: bool = False  # whether whole numbers are
 
 
 def accepts(expected: Expected, value: object) -> bool:
     """Whether the value and all its parts are as expected."""
-    if not expected.fits(value):
-        return False
-    for _, inner, part in expected.parts(value):  # noqa: SIM110 -- most values have no parts, and a generator costs a call
-        if not accepts(inner, part):
-            return False
-    return True
+    return expected.fits(value) and all(accepts(inner, part) for _, inner, part in expected.parts(value))
 
 
 ANYTHING = Expected("anything", lambda _: True)  # an annotation that is not understood checks nothing
@@ -193,12 +187,8 @@ def _number(integer: bool, within: Range | None = None) -> Expected:
 
 
 def _one_of(texts: tuple[str, ...]) -> Expected:
-    def written(value: Any) -> str:
-        near = difflib.get_close_matches(value, texts, n=1) if isinstance(value, str) else []
-        return f"write '{near[0]}'" if near else ""
-
     words = " or ".join(f"'{text}'" for text in texts)
-    return Expected(words, lambda value: isinstance(value, str) and value in texts, written=written)
+    return Expected(words, lambda value: isinstance(value, str) and value in texts, texts=texts)
 
 
 def _instance(one: type) -> Expected:
@@ -223,14 +213,10 @@ def _is_array(value: object) -> bool:
 def _entries(key: Expected, entry: Expected) -> Expected:
     def parts(value: Mapping[Any, Any]) -> Iterable[Part]:
         for name, one in value.items():
-            yield f": name {_SHORT.repr(name)}", key, name
-            yield f"[{_SHORT.repr(name)}]", entry, one
+            yield f": name {SHORT.repr(name)}", key, name
+            yield f"[{SHORT.repr(name)}]", entry, one
 
-    def written(value: Any) -> str:
-        one = _SHORT.repr(value) if isinstance(value, int | float | tuple | str) else f"{type(value).__name__}(...)"
-        return f"write {{'NAME': {one}}} with the name of what it belongs to" if accepts(entry, value) else ""
-
-    return Expected(f"{{name: {entry.words}}}", lambda value: isinstance(value, Mapping), parts, written)
+    return Expected(f"{{name: {entry.words}}}", lambda value: isinstance(value, Mapping), parts)
 
 
 def _items(items: tuple[Expected, ...], fixed: bool) -> Expected:
@@ -245,11 +231,8 @@ def _items(items: tuple[Expected, ...], fixed: bool) -> Expected:
     def parts(value: Any) -> Iterable[Part]:
         return ((f"[{k}]", items[k if fixed else 0], part) for k, part in enumerate(value))
 
-    def written(value: Any) -> str:
-        return "" if fixed or not accepts(items[0], value) else f"write {_SHORT.repr((value,))}"
-
     words = ", ".join(item.words for item in items)
-    return Expected(f"({words})" if fixed else f"({words}, ...)", fits, parts, written)
+    return Expected(f"({words})" if fixed else f"({words}, ...)", fits, parts)
 
 
 def _function(arguments: int | None) -> Expected:
@@ -265,14 +248,11 @@ def _choice(options: tuple[Expected, ...]) -> Expected:
         fitting = [option for option in options if option.fits(value)]
         return next((option for option in fitting if accepts(option, value)), fitting[0]).parts(value)
 
-    def written(value: Any) -> str:
-        return ", or ".join(text for option in options if (text := option.written(value)))
-
     return Expected(
         " or ".join(option.words for option in options),
         lambda value: any(option.fits(value) for option in options),
         parts,
-        written,
+        tuple(text for option in options for text in option.texts),
         tuple(one for option in options for one in option.classes),
         any(option.whole for option in options),
     )

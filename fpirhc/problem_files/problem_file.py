@@ -286,7 +286,7 @@ def _at_its_line(path: Path, error: BaseException, cause: str) -> ProblemFileErr
 def _cause_of(error: Exception) -> str:
     """What an error says, without the place, and with what to write instead."""
     if isinstance(error, InvalidField):
-        return textwrap.dedent(error.text.strip("\n"))
+        return textwrap.dedent(str(InvalidField(error.mistakes)).strip("\n"))
     if isinstance(error, FpirhcError):
         return str(error)
     cause = explained(error)

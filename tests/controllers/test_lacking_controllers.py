@@ -88,7 +88,7 @@ LACKING = [
     (lambda: Around(LAW), "Around holds a Controller in 'other' and has no `inner`.*returns self.other"),
     (lambda: Around(LAW), "Around has no `deformation`, which its contract Controller asks for"),
     (lambda: Alone(), "^test_lacking_controllers.py, line .*: Alone has no `deformation`"),
-    (lambda: Halfway(5), "Halfway: `inner` is the controller that it wraps, or None, got 5"),
+    (lambda: Halfway(5), "Halfway: `inner` is the Controller that it wraps, or None, got 5"),
     (cast(Any, Nothing), r"Nothing has no blocks\(...\), which its contract Controller asks for"),
     (lambda: Doubled(fp.Affine(-0.5)), "Doubled holds a Deformation in 'map' and has no `inner`"),
 ]
