@@ -30,11 +30,7 @@ class InvalidName(FpirhcError, AttributeError, KeyError):
 
 
 class InvalidValue(FpirhcError, ValueError):
-    """A number or value outside its allowed range."""
-
-
-class InvalidShape(FpirhcError, ValueError):
-    """A vector or matrix of the wrong size."""
+    """A number or value outside its allowed range, or a vector or matrix of the wrong size."""
 
 
 class InvalidProblem(FpirhcError, ValueError):
@@ -59,10 +55,6 @@ class InvalidField(InvalidValue, InvalidProblem, TypeError):
 
 class ProblemFileError(FpirhcError):
     """A problem file that cannot be found, imported, or understood."""
-
-
-class NotInvertible(FpirhcError, ValueError):
-    """The response cannot be solved for the inputs."""
 
 
 class NotContractive(FpirhcError, ValueError):

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
-from fpirhc.errors import InvalidShape, InvalidValue, NotContractive
+from fpirhc.errors import InvalidValue, NotContractive
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
@@ -101,7 +101,7 @@ def _response_jacobian(plant: Plant) -> ca.Function:
         f(r) = response(state, inverse(state, r; approximate); exact)
 
     Raises:
-        NotInvertible: the inputs and the controlled coordinates differ in number.
+        InvalidProblem: the inputs and the controlled coordinates differ in number.
     """
     matrix = kind(plant.equations.inverse_opaque)
     x = matrix.sym("x", plant.state.size)
@@ -282,7 +282,7 @@ def identified_factor(
     """
     requests, responses = np.asarray(deformed, dtype=float), np.asarray(realised, dtype=float)
     if requests.shape != responses.shape or requests.ndim != 2:
-        raise InvalidShape(
+        raise InvalidValue(
             f"deformed has shape {requests.shape} but realised {responses.shape}; expected the same, (cycles, n)"
         )
     request_steps, response_steps = np.diff(requests, axis=0)[:-1], np.diff(responses, axis=0)[1:]

@@ -14,7 +14,7 @@ from fpirhc.controllers.built import Built
 from fpirhc.controllers.contract import Undeformed
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
-from fpirhc.errors import NotInvertible, require
+from fpirhc.errors import InvalidProblem, require
 from fpirhc.members import Example
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay
@@ -52,7 +52,7 @@ class FeedforwardOnly(Undeformed):
         """Raise if the model has no inverse, or a derivative is prescribed where states have no reference."""
         plant = problem.plant
         if len(plant.controlled_names) != len(plant.inputs):
-            raise NotInvertible("FeedforwardOnly needs as many controlled coordinates as inputs")
+            raise InvalidProblem("FeedforwardOnly needs as many controlled coordinates as inputs")
         slow = ", ".join(name for name in plant.controlled_names if name not in plant.at_once)
         if slow:
             require(

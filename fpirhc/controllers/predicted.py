@@ -139,7 +139,11 @@ class Predicted(ControllerWrapper):
                 at, later = answered.arrived(s, "state_answered", s.state)
                 error = corrected(s.residual, at, queue.delayed(queued, before.size), s.realised, s.parameters)
                 values |= {"residual_next": error, **later}
-            state = queue.driven(advance, s.state, queued, before.size, [s.parameters, error])
+            state = s.state
+            if cycles:
+                held = (ca.repmat(v, 1, cycles) for v in (s.parameters, error))
+                sent = ca.horzcat(*(queued[before.size * k : before.size * (k + 1)] for k in reversed(range(cycles))))
+                state = advance.mapaccum("fpirhc_driven", cycles)(s.state, sent, *held)[:, -1]
             for name, function in outputs_ahead.items():
                 values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, cycles * period)
             return {"time_ahead": s.time + self.inputs, "state_ahead": state, **values}

@@ -10,7 +10,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidShape, InvalidValue
+from fpirhc.errors import InvalidValue
 from fpirhc.fields.checked import ByName, checked_call
 from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.optimisers import Optimiser, feasible_to, first_plan, improved, judge, tolerated
@@ -151,8 +151,7 @@ def solve(
 
     Raises:
         NotSupported: the optimiser cannot serve the problem.
-        InvalidShape: a state, data or first inputs of another shape.
-        InvalidValue: numbers of them that are not finite.
+        InvalidValue: a state, data or first inputs of another shape, or numbers of them that are not finite.
     """
     optimiser.check(ocp)
     state = _checked("state", state, (ocp.state.size,))
@@ -187,7 +186,7 @@ def _checked(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray
     """The value as an array of this shape, which a column may have in place of a vector."""
     array = np.asarray(value.full() if isinstance(value, ca.DM) else value, dtype=float)
     if array.shape not in (shape, (*shape, 1)):
-        raise InvalidShape(f"solve: {name} has the shape {array.shape}, expected {shape}")
+        raise InvalidValue(f"solve: {name} has the shape {array.shape}, expected {shape}")
     if not np.isfinite(array).all():
         raise InvalidValue(f"solve: {name} is not finite")
     return array.reshape(shape)

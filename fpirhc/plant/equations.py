@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 
-from fpirhc.errors import Mistakes, NotInvertible
+from fpirhc.errors import InvalidProblem, Mistakes
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.chain import Symbols, derivatives, output_order
 from fpirhc.plant.motion import arguments_of, believed_in, by_name, sampling, words
@@ -138,7 +138,7 @@ class Equations:
     def inverse(self) -> ca.Function:
         """Function (state, response of the controlled coordinates, parameters) -> input."""
         if len(self.plant.controlled_names) != len(self.plant.inputs):
-            raise NotInvertible(f"{len(self.plant.controlled_names)} controlled coordinates need as many inputs")
+            raise InvalidProblem(f"{len(self.plant.controlled_names)} controlled coordinates need as many inputs")
         if self.plant.inverse is not None:
             return inverse_by_user(self.plant, self.plant.inverse)
         x, u, p = self.plant.symbols()

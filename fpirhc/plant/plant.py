@@ -11,7 +11,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import NotInvertible
+from fpirhc.errors import InvalidProblem
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.plant.equations import Equations
@@ -241,13 +241,13 @@ class Plant(Checked):
             return tuple(self.controlled)
         names, what = (tuple(self.outputs), "outputs") if self.outputs else (self.names, "coordinates")
         if len(self.inputs) > len(names):
-            raise NotInvertible(
+            raise InvalidProblem(
                 f"{len(self.inputs)} inputs ({', '.join(self.inputs)}) for {len(names)} of the {what} ({', '.join(names)}): each "
                 "input holds one. Add an output that the other input moves, leave an input out, or make one input of several: an "
                 "effort that the equations share out among them, by weights ('More inputs than outputs' in docs/plants.md)"
             )
         if len(self.inputs) != len(names):
-            raise NotInvertible(
+            raise InvalidProblem(
                 f"{len(self.inputs)} input{'s' * (len(self.inputs) > 1)} cannot hold {len(names)} {what}: name the "
                 f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
             )

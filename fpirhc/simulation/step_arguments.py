@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.gate import HELD
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.kinds import described, named_entries, real_number
 from fpirhc.fields.user_code import called
 from fpirhc.simulation.machine import SKIPPED
@@ -143,7 +143,7 @@ class StepArguments:
     def accept(self, time: object, state: object, realised: object, memory: object, measures: tuple[str, ...]) -> None:
         """Take arguments that are no arrays of float64, or say what is wrong with them."""
         if self.estimates and np.size(cast(float, realised)):
-            raise InvalidShape(
+            raise InvalidValue(
                 f"this controller estimates its state and response from {', '.join(measures)}: use "
                 "step_measured(time, measured, memory) with these, in this order"
             )
@@ -219,7 +219,7 @@ def numbers_of(name: str, value: object, size: int) -> np.ndarray:
             f"argument '{name}' must be made of real numbers, got {described(value)} of type '{array.dtype}'"
         )
     if array.size != size or sum(n != 1 for n in array.shape) > 1 or array.ndim == 0:
-        raise InvalidShape(f"argument '{name}' has {size} entries (shape ({size},)), got shape {array.shape}")
+        raise InvalidValue(f"argument '{name}' has {size} entries (shape ({size},)), got shape {array.shape}")
     return np.ascontiguousarray(array.ravel(), dtype=np.float64)
 
 

@@ -226,8 +226,7 @@ class Stepper(Checked):
             setpoints: set-points from this step on, by coordinate or output; see `set_reference`.
 
         Raises:
-            InvalidShape: a wrong number of entries, named.
-            InvalidValue: an argument that is not made of numbers, or the memory of another controller.
+            InvalidValue: an argument of another size, or not made of numbers, named; the memory of another controller.
             InvalidField: settings or set-points that are no mapping of names.
             InvalidName: a setting that is not live; a coordinate without set-point.
             ConcurrentUse: another thread is inside this stepper.

@@ -14,7 +14,7 @@ from typing import NoReturn, cast
 
 import casadi as ca
 
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, nearest
+from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, kind
 from fpirhc.symbolic.layout import Layout, Signal
 from fpirhc.symbolic.open import SETTINGS, with_settings
@@ -71,7 +71,7 @@ class Block:
             written = values[key]
             value = written if isinstance(written, matrix) else matrix(written)
             if value.numel() != size:
-                raise InvalidShape(f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {size}")
+                raise InvalidValue(f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {size}")
             is_column = value.is_dense() and value.is_column()  # not built anew, which costs more than most operations
             results.append(value if is_column else ca.densify(value.reshape((value.numel(), 1))))
         keys = list(self._results)
@@ -275,4 +275,4 @@ def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:
 def _refuse_size(reader: str, signal: Signal, source: str, sizes: Mapping[str, int]) -> NoReturn:
     if source not in sizes:
         raise InvalidName(f"{reader} reads '{source}', which no earlier block writes.{nearest(source, sizes)}")
-    raise InvalidShape(f"{reader} reads '{source}' with {signal.size} entries, but it has {sizes[source]}")
+    raise InvalidValue(f"{reader} reads '{source}' with {signal.size} entries, but it has {sizes[source]}")

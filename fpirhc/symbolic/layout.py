@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue, derivative_of, nearest
+from fpirhc.errors import InvalidName, InvalidValue, derivative_of, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, column
 
 __all__ = ["Expression", "Layout", "Named", "Signal", "like", "scalar", "vector"]
@@ -121,7 +121,7 @@ class Layout:
 
     Raises:
         InvalidName: two signals of one name; a name that is not there.
-        InvalidShape, InvalidValue: start values of another number, or not finite.
+        InvalidValue: start values of another number, or not finite.
     """
 
     signals: tuple[Signal, ...] = ()
@@ -137,7 +137,7 @@ class Layout:
                 raise InvalidName(f"signal '{s.name}' appears twice in one layout")
             size = len(s.elements) or 1
             if s.start and len(s.start) != size:
-                raise InvalidShape(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
+                raise InvalidValue(f"signal '{s.name}' has {size} entries but {len(s.start)} start values")
             if not all(map(math.isfinite, s.start)):
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
             slices[s.name], sizes[s.name] = slice(at, at + size), size
@@ -194,14 +194,14 @@ class Layout:
             except (OverflowError, TypeError, ValueError):
                 raise InvalidValue(f"signal '{name}' is made of numbers, got {value!r}") from None
             if entries.size != place.stop - place.start:
-                raise InvalidShape(f"signal '{name}' has {place.stop - place.start} entries, got {entries.size}")
+                raise InvalidValue(f"signal '{name}' has {place.stop - place.start} entries, got {entries.size}")
             flat[place] = entries
         return flat
 
     def unpack(self, flat: np.ndarray) -> dict[str, np.ndarray]:
         """Flat vector(s), entries along the last axis -> arrays by name."""
         if flat.shape[-1] != self.size:
-            raise InvalidShape(f"expected {self.size} entries, got {flat.shape[-1]}")
+            raise InvalidValue(f"expected {self.size} entries, got {flat.shape[-1]}")
         return {name: flat[..., place] for name, place in self._slices.items()}
 
     def split(self, flat: Matrix) -> dict[str, Matrix]:

@@ -138,18 +138,6 @@ class Queue:
         )
         return ca.vertcat(*entries)
 
-    def driven(
-        self, step: ca.Function, state: Expression, queue: Expression, size: int, held: Sequence[Expression]
-    ) -> Expression:
-        """Return a state after the values that are on their way, the oldest first; the delay is whole and one for all entries."""
-        assert not isinstance(self.cycles, tuple)
-        longest = int(self.cycles)
-        if not longest:
-            return state
-        columns = ca.horzcat(*(queue[size * k : size * (k + 1)] for k in reversed(range(longest))))
-        repeated = (ca.repmat(v, 1, longest) for v in held)
-        return step.mapaccum("fpirhc_driven", longest)(state, columns, *repeated)[:, -1]
-
     @staticmethod
     def _shares(cycles: float) -> dict[int, float]:
         """Weights of what was pushed k cycles ago."""

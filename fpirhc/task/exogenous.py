@@ -13,7 +13,7 @@ from typing import ClassVar, TypeAlias
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidShape, InvalidValue, Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import outside_names
@@ -130,8 +130,7 @@ class Samples(Checked):
         values: the samples, shape (m,).
 
     Raises:
-        InvalidValue: times that do not increase, or numbers that are not finite.
-        InvalidShape: lengths that differ, or no sample.
+        InvalidValue: times that do not increase, numbers that are not finite, lengths that differ, or no sample.
     """
 
     times: Sequence[float] | np.ndarray
@@ -140,7 +139,7 @@ class Samples(Checked):
     def __post_init__(self) -> None:
         times, values = (np.asarray(v, dtype=float) for v in (self.times, self.values))
         if times.ndim != 1 or not times.size or values.shape != times.shape:
-            raise InvalidShape(
+            raise InvalidValue(
                 f"Samples: times have shape {times.shape} and values {values.shape}; expected one value per time, at least 1"
             )
         if not (np.isfinite(times).all() and np.isfinite(values).all()) or np.any(np.diff(times) <= 0):

@@ -16,7 +16,7 @@ from helpers.replay import samples, status
 import fpirhc as fp
 from fpirhc.conformance import two_masses
 from fpirhc.contracts import Deformation
-from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidShape, InvalidValue, NotSupported
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidValue, NotSupported
 
 TRACK = fp.Exponential(rate=6.0)
 SHAPE = fp.Sigmoid(gain=-0.5, scale=50.0)
@@ -86,7 +86,7 @@ def test_raw_measurements_are_given_in_their_order():
     assert not one.estimates
     expected = one.step(*SAMPLE, one.start())[0]
     np.testing.assert_array_equal(one.step_measured(0.0, np.array([0.1, 0.3, 0.7]), one.start())[0], expected)
-    with pytest.raises(InvalidShape):
+    with pytest.raises(InvalidValue):
         one.step_measured(0.0, np.array([0.1, 0.3]), one.start())
     estimating = small(replace(SMALL, sensing=fp.Sensing({}, fp.PositionDifference())))
     assert estimating.measures == ("y",)
@@ -151,12 +151,12 @@ def misuses(memory: np.ndarray) -> dict[str, tuple[type[FpirhcError], str, tuple
         "truth value": (InvalidValue, "'state' must be made of real numbers", (0.0, True, r, memory)),
         "text": (InvalidValue, "'state' must be made of real numbers", (0.0, "5", r, memory)),
         "no memory": (InvalidValue, "'memory' is not made of numbers", (0.0, x, r, None)),
-        "short state": (InvalidShape, "'state' has 4 entries", (0.0, x[:3], r, memory)),
-        "matrix": (InvalidShape, "'state' has 4 entries", (0.0, x.reshape(2, 2), r, memory)),
+        "short state": (InvalidValue, "'state' has 4 entries", (0.0, x[:3], r, memory)),
+        "matrix": (InvalidValue, "'state' has 4 entries", (0.0, x.reshape(2, 2), r, memory)),
         "ragged": (InvalidValue, "'state' is not made of numbers", (0.0, [[1.0], [1.0, 2.0]], r, memory)),
         "complex": (InvalidValue, "real numbers", (0.0, x + 0j, r, memory)),
         "dictionary": (InvalidValue, "'state' is not made of numbers", (0.0, {"a": 1.0}, r, memory)),
-        "short memory": (InvalidShape, "'memory' has", (0.0, x, r, memory[:-1])),
+        "short memory": (InvalidValue, "'memory' has", (0.0, x, r, memory[:-1])),
         "masked": (FpirhcError, "masked", (0.0, np.ma.masked_array(x, [True, *3 * [False]]), r, memory)),
         "text in an array": (FpirhcError, "numbers", (0.0, x, np.array(["a", "b"]), memory)),
         "truth value in a list": (InvalidValue, "state", (0.0, [True, 0.0, 0.0, 0.0], r, memory)),

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import fpirhc as fp
 from fpirhc.contracts import Block, Layout, Signal, scalar, vector
-from fpirhc.errors import InvalidName, InvalidShape, InvalidValue
+from fpirhc.errors import InvalidName, InvalidValue
 
 U, Y = scalar("u"), scalar("y")
 LAYOUT = Layout(
@@ -50,15 +50,15 @@ def block(step) -> object:
 
 WRONG = {
     "nearest": (lambda: LAYOUT.slice("qq"), InvalidName, "Did you mean 'q'"),
-    "size": (lambda: LAYOUT.pack({"q": [1, 2, 3]}), InvalidShape, "'q' has 2 entries, got 3"),
-    "whole size": (lambda: LAYOUT.unpack(np.zeros(5)), InvalidShape, "expected 6 entries, got 5"),
+    "size": (lambda: LAYOUT.pack({"q": [1, 2, 3]}), InvalidValue, "'q' has 2 entries, got 3"),
+    "whole size": (lambda: LAYOUT.unpack(np.zeros(5)), InvalidValue, "expected 6 entries, got 5"),
     "twice": (lambda: Layout((U, U)), InvalidName, "appears twice"),
     "start": (lambda: Layout((scalar("u", start=float("inf")),)), InvalidValue, "not finite"),
-    "starts": (lambda: Layout((Signal("q", ("a", "b"), (), (1.0,)),)), InvalidShape, "2 entries but 1 start values"),
+    "starts": (lambda: Layout((Signal("q", ("a", "b"), (), (1.0,)),)), InvalidValue, "2 entries but 1 start values"),
     "not given": (lambda: block(lambda s: {"yy": s.u}), InvalidName, "does not give 'y'.*Did you mean 'yy'"),
     "too many": (
         lambda: block(lambda s: {"y": ca.vertcat(s.u, s.u)}),
-        InvalidShape,
+        InvalidValue,
         "gives 'y' with 2 entries, expected 1",
     ),
 }
