@@ -130,14 +130,13 @@ class Controller(Checked, ABC):
         inner = None
 
     def _lacks(self) -> Iterator[str]:
-        name = type(self).__name__
         yield from wrong_inner(self, Controller)
         if isinstance(self.inner, Controller | None) and not isinstance(
             getattr(self, "deformation", None), Deformation
         ):
             yield (
-                f"{name} has no `deformation`, which its contract Controller asks for: the map in use. Add the field "
-                "deformation: Deformation = field(default_factory=Identity); a wrapper has a property that returns "
+                f"{type(self).__name__} has no `deformation`, which its contract Controller asks for: the map in use. Add the "
+                "field deformation: Deformation = field(default_factory=Identity); a wrapper has a property that returns "
                 "self.inner.deformation, and a law without a map derives from fpirhc.contracts.Undeformed"
             )
 
