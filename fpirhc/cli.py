@@ -241,9 +241,9 @@ def probe(
         str | None, typer.Option("--controller", "-c", metavar="NAME", help="runs the plant [default: first that can]")
     ] = None,
     cycles: Annotated[int | None, given("N", "length of the excitation [default: 300]")] = None,
-    amplitude: Annotated[float | None, given("NUMBER", "size of the excitation, in the unit of the response")] = None,
+    amplitude: Annotated[float | None, given("NUMBER", "its size, in the response's unit [default: by a first run]")] = None,
     recording: Annotated[Path | None, given("CSV", "estimate from a run: time, what is measured, inputs after it")] = None,
-    chatter: Annotated[float | None, given("NUMBER", "largest rms step of a command per cycle that is allowed")] = None,
+    chatter: Annotated[float | None, given("NUMBER", "largest rms step of a command [default: 1.5 times the controller's]")] = None,
     trials: Annotated[bool, typer.Option(help="try candidates on the plant itself")] = True, seed: opt.Seed = 0,
     json: opt.Json = False,
 ) -> None:  # fmt: skip
@@ -279,7 +279,7 @@ def tune(
     problem: opt.Problem, controllers: opt.Controllers = None,
     trials: Annotated[int, given("N", "number of trials of every controller", min=1, max=1_000_000)] = 50,
     draws: Annotated[int | None, opt.Count] = None, mismatch: opt.Mismatch = 0.0, cases: opt.Cases = None,
-    metric: Annotated[str | None, given("METRIC", "number that is to become better [default: the error]")] = None,
+    metric: Annotated[str | None, given("NAME", "number that is to become better [default: the error]")] = None,
     seed: opt.Seed = 0, out: opt.Out = None, json: opt.Json = False,
 ) -> None:  # fmt: skip
     """Search better settings, at equal cost for every controller. The problem file says what is searched: tuning = {...}."""
