@@ -232,7 +232,10 @@ def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
     given: object = built.controller.blocks(built)
     pair = given if isinstance(given, tuple) and len(given) == 2 else None
     kinds = (Block, Delay)
-    if pair is None or [part for part, kind in zip(pair, kinds, strict=True) if not _holds(part, kind)]:
+    if pair is None or not all(
+        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
+        for part, kind in zip(pair, kinds, strict=True)
+    ):
         raise InvalidProblem(
             f"{type(built.controller).__name__}.blocks(built) must return two lists (blocks, delays), got {described(given)}"
         )
@@ -243,10 +246,6 @@ def with_aim(built: Built, blocks: Sequence[Block]) -> list[Block]:
     """Return the blocks of a controller after the reference's own block, where some of them read its signals."""
     own = {signal.name for signal in built.own}
     return [*([built.aim] if built.aim is not None and own & _read_by(blocks) else []), *blocks]
-
-
-def _holds(part: object, kind: type) -> bool:
-    return isinstance(part, list | tuple) and not [one for one in part if not isinstance(one, kind)]
 
 
 def _informed(

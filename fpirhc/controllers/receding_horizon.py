@@ -107,7 +107,8 @@ class RecedingHorizon(Controller):
             closing = closing if self.planner.corrects(plant) else at_consistent_start(plant, closing)
         if built.follows:
             held, own = held_model(problem)
-            after, delays = [held, *(as_planned(block, problem) for block in after)], [*delays, own]
+            newest, planned = problem.plant.parameter.name, _planned(problem)
+            after, delays = [held, *(fed(block, newest, planned) for block in after)], [*delays, own]
         blocks = [reference_block(built), _due_block(cycles), *before, plan, *after, *closing, *late]
         delays = [*delays, *remembered]
         blocks.append(_command_shift_block(problem, self.deformation))
@@ -334,11 +335,6 @@ def held_model(problem: Problem) -> tuple[Block, Delay]:
 
     reads = Layout((scalar("_due"), parameters, before))
     return Block("planned_model", reads, Layout((_planned(problem),)), step), Delay(before, _PLANNED)
-
-
-def as_planned(block: Block, problem: Problem) -> Block:
-    """Return the block with the parameters of the last plan in place of the newest ones."""
-    return fed(block, problem.plant.parameter.name, _planned(problem))
 
 
 def _planned(problem: Problem) -> Signal:

@@ -61,7 +61,7 @@ class ModelReferenced(Wrapper):
     @property
     def form(self) -> Form:
         inner, late = self.map.form, self.measurement
-        return replace(inner, compares="model", cycles=self._cycles, measurement=late, lag=self._lag)
+        return replace(inner, compares="model", cycles=self._cycles, measurement=late, lag=self.lag or 0.0)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
@@ -88,10 +88,6 @@ class ModelReferenced(Wrapper):
     @property
     def _cycles(self) -> Cycles:
         return 0.0 if self.cycles is None else self.cycles
-
-    @property
-    def _lag(self) -> float | tuple[float, ...]:
-        return 0.0 if self.lag is None else self.lag
 
     @property
     def _queue(self) -> Queue:

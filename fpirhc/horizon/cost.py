@@ -7,9 +7,9 @@ terminal cost.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias, TypeVar
+from typing import Literal, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -24,13 +24,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import stays, total
 from fpirhc.symbolic.layout import Expression, Named, Signal
-
-Entry = TypeVar("Entry")
-
-
-def in_tuple(values: Sequence[Entry]) -> tuple[Entry, ...]:
-    """Return the entries of a tuple, a list or an array, which is neither true nor equal to another, as a tuple."""
-    return tuple(values.tolist() if isinstance(values, np.ndarray) else values)
 
 
 @dataclass(frozen=True)
@@ -73,8 +66,8 @@ class Horizon(Checked):
     share: float = field(default=1.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        for name in ("blocks", "lengths", "measured"):
-            object.__setattr__(self, name, in_tuple(getattr(self, name)))
+        for name in ("blocks", "lengths", "measured"):  # an array is neither true nor equal to another
+            object.__setattr__(self, name, tuple(np.asarray(getattr(self, name), dtype=object).tolist()))
         if self.lengths and (len(self.lengths) != self.stages or self.lengths[0] != 1):
             raise InvalidValue(
                 f"horizon: lengths must be {self.stages} finite numbers of at least 1, one for every stage in steps of the first, "

@@ -203,7 +203,10 @@ def expand_along(
     """Return the quadratic model along nodes (states, inputs, data); `functions` keeps its Functions for the next call."""
     functions = {} if functions is None else functions
     if "linearised" not in functions:
-        functions |= {"linearised": _linearised(dynamics, stage_cost), "final": _curved_end(terminal_cost)}
+        end, theta = terminal_cost.sx_in()
+        curved = [ca.densify(ca.hessian(terminal_cost(end, theta), end)[0])]
+        functions["final"] = ca.Function("fpirhc_final", [end, theta], curved)
+        functions["linearised"] = _linearised(dynamics, stage_cost)
     states, inputs, data = nodes
     stages = inputs.shape[1]
     linearised = functions["linearised"]
@@ -286,12 +289,6 @@ def _linearised(dynamics: ca.Function, stage_cost: ca.Function) -> ca.Function:
     second = [ca.hessian(cost, s)[0], ca.jacobian(slope, s), ca.jacobian(slope, u)]
     results = [ca.jacobian(next_state, s), ca.jacobian(next_state, u), *second]
     return ca.Function("fpirhc_linearised", [s, u, theta], [ca.densify(r) for r in results])
-
-
-def _curved_end(terminal_cost: ca.Function) -> ca.Function:
-    """Function (s, theta) -> d2T/ds2."""
-    s, theta = terminal_cost.sx_in()
-    return ca.Function("fpirhc_final", [s, theta], [ca.densify(ca.hessian(terminal_cost(s, theta), s)[0])])
 
 
 def rollout(ocp: OptimalControl) -> ca.Function:

@@ -379,7 +379,9 @@ def scales(ocp: OptimalControl) -> Scales:
     states = state_units(ocp)
     places = np.flatnonzero(np.isfinite(ocp.state_lower) | np.isfinite(ocp.state_upper))
     inputs = _input_units(ocp, states, places)
-    cost = float(np.median(_answered_curvature(ocp) * inputs**2))
+    answered = answered_curvature(ocp.along)
+    usable = np.isfinite(answered) & (answered > 0)
+    cost = float(np.median(np.where(usable, answered, ocp.step * ocp.curvature) * inputs**2))
     hard = ocp.hard[places]
     capacity = np.where(hard, _CAPACITY * cost / states[places], ocp.state_price[places])
     return Scales(inputs, states, cost, tuple(int(k) for k in places), capacity, hard)
@@ -403,10 +405,3 @@ def _input_units(ocp: OptimalControl, states: np.ndarray, places: np.ndarray) ->
     with np.errstate(divide="ignore", invalid="ignore"):
         moves = (states[places, None] / slopes.max(axis=(0, 2))).min(axis=0)
     return np.where(free & np.isfinite(moves) & (moves > 0), moves, units)
-
-
-def _answered_curvature(ocp: OptimalControl) -> np.ndarray:
-    """The curvature (nu,) along the inputs of the first stage once later inputs answer; that of later inputs at rest else."""
-    diagonal = answered_curvature(ocp.along)
-    usable = np.isfinite(diagonal) & (diagonal > 0)
-    return np.where(usable, diagonal, ocp.step * ocp.curvature)

@@ -68,13 +68,6 @@ def by_unit(run: Run, signal: str, names: Sequence[str]) -> dict[str, list[str]]
     return groups
 
 
-def draw_bands(axis: Axes, run: Run) -> None:
-    """Draw time slots as shaded bands, named in the legend."""
-    for start, end, slot in run.spans():
-        name = run.layout["desired"].elements[slot]
-        axis.axvspan(start, end, color=BANDS[slot % len(BANDS)], alpha=0.12, lw=0, label=f"slot {name}")
-
-
 def extremes(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return times and values of the extremes of equal intervals in their order; a short series as it is.
 
@@ -172,7 +165,9 @@ def run_figure(run: Run) -> Figure:
     for axis, (signal, what, draw, names) in zip(axes, panels, strict=True):
         draw(axis, run, names, signal)
         axis.set_ylabel(quantity_label(run, signal, names, what))
-        draw_bands(axis, run)
+        for start, end, slot in run.spans():
+            name = run.layout["desired"].elements[slot]
+            axis.axvspan(start, end, color=BANDS[slot % len(BANDS)], alpha=0.12, lw=0, label=f"slot {name}")
         draw_legend(axis)
     axes[-1].set_xlabel(time_label(run))
     return figure

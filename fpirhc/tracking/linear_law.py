@@ -68,7 +68,8 @@ class LinearLaw(IntegralLaw):
             errors, own = error_chains(plant, error), own_errors(plant, error)
             first_integral = ca.vertcat(*map(self._first_integral, gains, own, errors))
             integral = ca.if_else(s.warm_up > 0.5, s._integral_before, first_integral)
-            feedback = [self._feedback(gains[k], integral[k], chain) for k, chain in enumerate(errors)]
+            terms = [[*([integral[k]] if self.integral else []), *chain] for k, chain in enumerate(errors)]
+            feedback = [total(g * e for g, e in zip(*own, strict=True)) for own in zip(gains, terms, strict=True)]
             return {
                 "_target_error": ca.vertcat(*own),
                 "desired": s.nominal + ca.vertcat(*feedback),
@@ -82,10 +83,6 @@ class LinearLaw(IntegralLaw):
             return []
         gains = [(*own, 1.0)[:2] for own in self.gains_of(plant)]
         return [Useful(integral, error, most) for (integral, error), most in zip(gains, self.largest, strict=True)]
-
-    def _feedback(self, gains: Sequence[float], integral: Expression, chain: list[Expression]) -> Expression:
-        terms = [integral, *chain] if self.integral else chain
-        return total(g * e for g, e in zip(gains, terms, strict=True))
 
     def _first_integral(self, gains: Sequence[float], error: Expression, chain: list[Expression]) -> Expression:
         if not (self.integral and self.bumpless):
