@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -172,7 +172,6 @@ def study(
     mismatch: opt.Mismatch = 0.0, controllers: opt.Controllers = None,
     metric: Annotated[str | None, given("NAME", "number by which runs are compared [default: the error]")] = None,
     processes: Annotated[int | None, given("N", "number of processes [default: one per core]", min=1)] = None,
-    cluster: Annotated[str | None, given("ADDRESS", "run on the Dask cluster with this scheduler, tcp://HOST:PORT")] = None,
     seed: opt.Seed = 0, out: opt.Out = None, no_compile: opt.NoCompile = False, json: opt.Json = False,
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
@@ -186,8 +185,8 @@ def study(
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
     if sum(map(bool, (cases, draws, over, limits))) != 1:
         raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
-    if limits and (metric or (processes or 1) > 1 or cluster):
-        raise typer.BadParameter("--limits takes the error, run by run: leave out --metric, --processes, --cluster")
+    if limits and (metric or (processes or 1) > 1):
+        raise typer.BadParameter("--limits takes the error, run by run: leave out --metric and --processes")
     task = _task(problem)
     from fpirhc.studies.compare import select
     from fpirhc.studies.limits import limits as find_limits
@@ -198,37 +197,23 @@ def study(
 
     select(task, controllers)
     folder = opt.folder_of(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")
-    import joblib
-
     from fpirhc.report.html import render_charted
     from fpirhc.report.terminal import progress_bars
 
-    with ExitStack() as stack:
+    with progress_bars() as progress:
         facts: dict[str, Any] = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
-        facts["progress"] = stack.enter_context(progress_bars())
-        if cluster:
-            stack.enter_context(_cluster(cluster))
-            stack.enter_context(joblib.parallel_config(backend="dask"))
+        facts["progress"] = progress
         if limits:
             result: Any = find_limits(task, over=limits, seed=seed, folder=folder, **facts)
             page = render_charted(result.view)
         else:
             named: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)
             variants = Grid.parsed(over, seed) if over else named
-            facts["processes"] = processes or (None if cluster else -1)
+            facts["processes"] = processes or -1
             result = run_study(task, variants, metric=metric, folder=folder, **facts)
             page = render_charted(result.view, figure_of(result))
     write_csv(result.table, folder / "study.csv")
     _publish(result.view, page, folder, json, verbose)
-
-
-def _cluster(address: str) -> Any:
-    from fpirhc.errors import InvalidValue, package
-
-    try:
-        return package("distributed", "cluster", "--cluster").Client(address)
-    except (ValueError, OSError) as error:
-        raise InvalidValue(f"--cluster {address}: {error}; start a scheduler by: dask scheduler") from None
 
 
 @command(

@@ -20,7 +20,6 @@ _GCC = "sudo apt install gcc (Debian, Ubuntu), xcode-select --install (macOS), p
 _EXTRAS = {
     "tune": ("fpirhc tune", ("optuna",)),
     "test": ("the test that fpirhc new writes", ("pytest",)),
-    "cluster": ("fpirhc study --cluster", ("distributed",)),
     "fmu": ("fpirhc export --to fmu2, and plants that are units of FMI", ("fmpy",)),
     "compiler": ("fpirhc export --to wasm and --to lab, and C without a compiler of the system", ("ziglang",)),
     "outside": ("plants in simulators of others", ("mujoco", "rotorpy", "tclab", "vehiclemodels")),

@@ -47,6 +47,9 @@ def with_filter(deformation: Deformation, pole: float) -> Deformation:
     return Filtered(deformation, pole) if inner is None else with_inner(deformation, with_filter(inner, pole))
 
 
+_THRESHOLD = 3.0  # deviations of a detail, noise / 2^(j/2) for white noise, up to which it counts as noise
+
+
 @dataclass(frozen=True)
 class Haar(Wrapper):
     """The wrapped map on a response error whose small details are left out: jumps pass at once, noise is averaged.
@@ -55,12 +58,10 @@ class Haar(Wrapper):
         map: any deformation that iterates.
         noise: deviation of the response's noise, in its unit.
         levels: J; what is small is the mean of 2^J cycles.
-        threshold: details up to so many of their own deviations, noise / 2^(j/2) for white noise, count as noise.
     """
 
     noise: Positive
     levels: Annotated[int, whole(1, 8)] = 4
-    threshold: Positive = 3.0
 
     @property
     def form(self) -> Form:
@@ -82,7 +83,7 @@ class Haar(Wrapper):
             apart = 2 ** (level - 1)
             count = smooth.size2() - apart
             coarse = (smooth[:, :count] + smooth[:, apart:]) / 2
-            detail, small = smooth[:, 0] - coarse[:, 0], self.threshold * self.noise / math.sqrt(2.0) ** level
+            detail, small = smooth[:, 0] - coarse[:, 0], _THRESHOLD * self.noise / math.sqrt(2.0) ** level
             jumps = jumps + ca.if_else(ca.fabs(detail) > small, detail, 0)
             smooth = coarse
         next_request, next_memory = self.map.step(request, desired + smooth[:, 0] + jumps, desired, inner)

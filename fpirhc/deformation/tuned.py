@@ -8,25 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Self
+from typing import Self
 
 import casadi as ca
 
 from fpirhc.deformation.base import Deformation, Form, Wrapper, memory_of_map
 from fpirhc.errors import InvalidValue
-from fpirhc.fields.kinds import Range
 from fpirhc.symbolic.expression import power
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 
 _RATE = 0.02  # gamma
 _GROWING, _RETURNING = 5, 8  # in a row
 _FAST, _SLOW = 1.5, 1 / 3  # an error that grew by less than the one counts the other
+_TARGET = 0.5  # g*, the product of effective gain and the plant's gain that the rule aims at in noise
 _RECOVERY = 1.0  # target below the map's own gain: the product of a deadbeat iteration
 _RETURNED = 0.3  # relative distance below which an error counts as equal to the error of two cycles before
 _SMALLEST = 1e-3  # smallest factor that oscillation may lead to
-
-
-_PRODUCTS = Range("a product of gain and plant between 0 and 2, such as 0.5", lambda v: 0 < v < 2)
 
 
 @dataclass(frozen=True)
@@ -36,15 +33,12 @@ class Tuned(Wrapper):
     Args:
         map: any deformation that iterates; the tuner begins at its gain, and noise does not lower the gain below it.
         largest_gain: cap of the effective gain, the bound that the model guarantees (see `assess_gain`: `sector_limit`).
-        target: g*, the product of effective gain and the plant's gain that the rule aims at in noise, in (0, 2). 0.5 favours
-            tracking, 0.3 little chatter.
 
     Raises:
-        InvalidValue: a cap that is not positive in the direction of the map's own gain, or below it; a target out of range.
+        InvalidValue: a cap that is not positive in the direction of the map's own gain, or below it.
     """
 
     largest_gain: float
-    target: Annotated[float, _PRODUCTS] = 0.5
 
     def __post_init__(self) -> None:
         gain = self.map.effective_gain()
@@ -88,7 +82,7 @@ class Tuned(Wrapper):
 
     def _tuned(self, factor: Expression, error: Expression, before: Expression) -> Expression:
         """The factor after one step towards the target."""
-        signs = [_mean_sign(target, error.numel()) for target in (self.target, ca.fmax(self.target, _RECOVERY))]
+        signs = [_mean_sign(target, error.numel()) for target in (_TARGET, _RECOVERY)]
         product, target_sign = ca.dot(error, before), ca.if_else(factor < 1, signs[1], signs[0])
         # Without a sign (a zero error, or one that is not a number) the factor stays.
         rise = ca.if_else(product > 0, 1 - target_sign, ca.if_else(product < 0, -1 - target_sign, 0))

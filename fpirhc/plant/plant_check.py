@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import casadi as ca
@@ -35,7 +35,7 @@ def check_plant(plant: Plant) -> None:
     for name, (low, high) in plant.ranges.items():
         if not low < high:
             mistakes.add(f"ranges: '{name}' must be (lowest, highest), got {(low, high)!r}")
-    _check_expressions(plant, mistakes)
+    mistakes.join(_wrong_arguments(plant))
     mistakes.raise_if_any()
     _check_response(plant, mistakes)
     mistakes.raise_if_any()
@@ -80,12 +80,9 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
 def _check_response(plant: Plant, mistakes: Mistakes) -> None:
     """What is wrong with the response, the orders, and the user's inverse."""
     x, u, p = plant.symbols()
-    arguments, (quantity, function) = arguments_of(plant, x, u, p), words(plant)
-    if not takes(plant.response, len(arguments)):
-        mistakes.add(_wrong_arguments(plant, len(arguments)))
-        return
+    quantity, function = words(plant)
     try:
-        response = named_results(function, called(function, plant.response, *arguments))
+        response = named_results(function, called(function, plant.response, *arguments_of(plant, x, u, p)))
     except FpirhcError as error:
         mistakes.add(str(error))
         return
@@ -101,30 +98,33 @@ def _check_response(plant: Plant, mistakes: Mistakes) -> None:
     if not mistakes:
         _check_orders(plant, mistakes)
     if not mistakes and plant.inverse is not None:
-        count = max(plant.orders, default=0) + 2
-        if takes(plant.inverse, count):
-            with mistakes.caught():
-                inverse_by_user(plant, plant.inverse)
-        else:
-            mistakes.add(
-                f"inverse is called with {count} arguments: the derivatives below the order, responses, parameters"
+        with mistakes.caught():
+            inverse_by_user(plant, plant.inverse)
+
+
+def _wrong_arguments(plant: Plant) -> Iterator[str]:
+    """Which functions of the user take other arguments than they are called with, and what they should be."""
+    (quantity, function), order, place = words(plant), max(plant.orders, default=0), place_of(plant.response)
+    state, expected = quantity == "state", order + 2
+    lower = ", ".join((["x"] if state else _LOWER)[:order])
+    if not takes(plant.response, expected):
+        kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
+        arguments, fitting = len(kinds), order + len(kinds) - expected
+        of_states = "; equations in states go to Plant.of_states(rates=...)"
+        mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else of_states
+        mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
+        yield (
+            f"{function} takes {arguments} argument{'s' * (arguments != 1)}{f' ({place})' if place else ''}; "
+            f"{'' if state else f'with order {order} '}it is called as {function}({lower}, u, p){mend}"
+        )
+    if plant.inverse is not None and not takes(plant.inverse, expected):
+        yield f"inverse is called as inverse({lower}, r, p), with the wanted responses r; got {described(plant.inverse)}"
+    for name, one in plant.outputs.items():
+        if not (takes(one.expression, expected - 1) or takes(one.expression, expected)):
+            yield (
+                f"outputs: the expression of '{name}' is called as function({lower}, p), or as function({lower}, u, p) where the "
+                f"command moves it at once; got {described(one.expression)}; write lambda {lower}, p: ..."
             )
-
-
-def _wrong_arguments(plant: Plant, expected: int) -> str:
-    """What a response of another number of arguments is, and what it should be."""
-    quantity, function = words(plant)
-    kinds = [one.kind for one in inspect.signature(plant.response).parameters.values()]
-    arguments, order = len(kinds), max(plant.orders, default=0)
-    state, fitting, place = quantity == "state", order + arguments - expected, place_of(plant.response)
-    names = [*(["x"] if state else _LOWER)[:order], "u", "p"]
-    of_states = "; equations in states go to Plant.of_states(rates=...)"
-    mend = f"; {arguments} arguments are those of order {fitting}" if fitting > 0 else of_states
-    mend = "" if state or inspect.Parameter.KEYWORD_ONLY in kinds else mend
-    return (
-        f"{function} takes {arguments} argument{'s' * (arguments != 1)}{f' ({place})' if place else ''}; "
-        f"{'' if state else f'with order {order} '}it is called as {function}({', '.join(names)}){mend}"
-    )
 
 
 def _check_order_numbers(plant: Plant, mistakes: Mistakes) -> None:
@@ -163,18 +163,6 @@ def _check_orders(plant: Plant, mistakes: Mistakes) -> None:
             mistakes.add(
                 f"order of '{name}' is given as {stated}, but its response has no input: the first derivative that an "
                 f"input reaches is number {order}. Write the response of order {order}, or control another coordinate"
-            )
-
-
-def _check_expressions(plant: Plant, mistakes: Mistakes) -> None:
-    """Which outputs have a function of other arguments."""
-    lower = max(plant.orders, default=0)
-    names = ", ".join((["x"] if words(plant)[0] == "state" else _LOWER)[:lower])
-    for name, one in plant.outputs.items():
-        if not (takes(one.expression, lower + 1) or takes(one.expression, lower + 2)):
-            mistakes.add(
-                f"outputs: the expression of '{name}' is called as function({names}, p), or as function({names}, u, p) where the "
-                f"command moves it at once; got {described(one.expression)}; write lambda {names}, p: ..."
             )
 
 

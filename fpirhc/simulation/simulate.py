@@ -140,7 +140,7 @@ class Simulator:
             disturbed: whether disturbances act; the sensors' noise always does.
             progress: called with (cycles done, cycles in all).
             settings: numbers of live settings by path; the others have the numbers of the build. None: all have them.
-            setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
+            setpoints: by coordinate, in place of those of the reference: a number, or pairs (time, set-point).
 
         Raises:
             InvalidName: a setting that is not live; a coordinate without set-point.
@@ -231,7 +231,7 @@ def simulate(
         name: of the controller in the results; '': its name in the task from which it comes, else the name of its class.
         compiled: whether the loop is compiled to C where there is a compiler; None: unless the run is short.
         progress: called with (cycles done, cycles in all).
-        setpoints: by coordinate, in place of those of the reference: a number, pairs (time, set-point), or a function of time.
+        setpoints: by coordinate, in place of those of the reference: a number, or pairs (time, set-point).
     """
     ready = simulator(problem, controller, compiled=compiled)
     return ready.run(seed=seed, name=name, progress=progress, setpoints=setpoints)

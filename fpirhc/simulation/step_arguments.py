@@ -5,7 +5,7 @@ A view takes arrays of float64 of its own shape and nothing else; numpy's assign
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import isnan
 from typing import Protocol, cast
 
@@ -15,7 +15,6 @@ import numpy as np
 from fpirhc.controllers.gate import HELD
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.kinds import described, named_entries, real_number
-from fpirhc.fields.user_code import called
 from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
@@ -26,10 +25,8 @@ from fpirhc.task.checks import check_values
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps, in_force, pairs
 
-# by coordinate: a number, pairs (time, set-point), function of the time
-Setpoints = Mapping[str, Steps | Callable[[float], float]]
+Setpoints = Mapping[str, Steps]  # by coordinate: a number, or pairs (time, set-point)
 SetpointsNow = Mapping[str, float]  # by coordinate
-_FUNCTION = "a function of time"
 
 
 def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) -> np.ndarray:
@@ -38,15 +35,14 @@ def set_point_table(problem: Problem, setpoints: Setpoints | None, cycles: int) 
     if not signals:
         return np.zeros((cycles, 0))
     times = np.arange(cycles) * problem.period
-    columns = {name: _values(problem, name, steps[name], times) for name in problem.plant.chains}
+    columns = {n: in_force(pairs(n, steps[n]), times, problem.period) for n in problem.plant.chains}
     check_values(problem.plant, problem.limits, {n: c.tolist() for n, c in columns.items()})
     return np.stack([*columns.values()], axis=1)
 
 
 def set_point_record(problem: Problem, setpoints: Setpoints | None) -> dict[str, object]:
-    """Return the set-points of a run as plain data: [[time, set-point], ...] by coordinate, or words for a function."""
-    steps = _steps(problem, setpoints)
-    return {n: _FUNCTION if callable(s) else [list(p) for p in pairs(n, s)] for n, s in steps.items()}
+    """Return the set-points of a run as plain data: [[time, set-point], ...] by coordinate."""
+    return {n: [list(pair) for pair in pairs(n, steps)] for n, steps in _steps(problem, setpoints).items()}
 
 
 def set_points_now(problem: Problem, setpoints: SetpointsNow, before: np.ndarray) -> np.ndarray:
@@ -78,19 +74,6 @@ def _check_names(problem: Problem, setpoints: Mapping[str, object]) -> None:
             )
         if name not in known:
             raise InvalidName(f"set-point '{name}' is unknown.{nearest(str(name), known)}")
-
-
-def _values(problem: Problem, name: str, steps: Steps | Callable[[float], float], times: np.ndarray) -> np.ndarray:
-    """Set-points of one coordinate at some times."""
-    if not callable(steps):
-        return in_force(pairs(name, steps), times, problem.period)
-    what = f"set-points of '{name}': the function of time"
-    results = [called(what, steps, float(t)) for t in times]
-    values = [real_number(one) for one in results]
-    if None in values:
-        wrong = results[values.index(None)]
-        raise InvalidValue(f"{what} does not return a number, but {described(wrong)}")
-    return np.array(values, dtype=float)
 
 
 NOTHING = np.zeros(0)

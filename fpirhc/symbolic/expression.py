@@ -80,12 +80,6 @@ def total(terms: Iterable[Expression]) -> Expression:
     return cast(Expression, sum(terms))
 
 
-def pair(results: Expression) -> tuple[Expression, Expression]:
-    """Return the two results of a call; CasADi's stub has calls with one result only."""
-    first, second = results
-    return first, second
-
-
 def holds_nan(function: ca.Function) -> bool:
     """Whether a Function, or one that it calls, holds the constant NaN."""
     for f in (function, *function.find_functions()):

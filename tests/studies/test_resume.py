@@ -128,7 +128,7 @@ def test_a_killed_process_is_told_and_the_same_call_goes_on(task):
 @pytest.mark.slow
 def test_a_cluster_of_dask_gives_the_rows_of_one_process(task):
     """Two workers, one of which is killed on the way: Dask gives its jobs to others."""
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    distributed = pytest.importorskip("distributed", reason="Dask is not installed")
     whole = rows(task, DRAWS)
     killed: list[int] = []
     with (

@@ -169,15 +169,6 @@ def test_bad_references():
         )
 
 
-def test_functions_of_time():
-    """A function of time is sampled in every cycle; steps are the function that jumps."""
-    ready = fp.simulator(two_mass(), tasks.two_mass.controllers["CTC+FPI (eq 6)"], compiled=False)
-    functions = {n: lambda t, s=s: [v for at, v in s if at <= t + 1e-9][-1] for n, s in STEPS.items()}
-    sampled, stepped = ready.run(seed=0, setpoints=functions), ready.run(seed=0)
-    np.testing.assert_array_equal(sampled.log, stepped.log)
-    assert sampled.settings["setpoints"] == {"q1": "a function of time", "q2": "a function of time"}
-
-
 def test_run_and_file_record_what_was_in_force(tmp_path):
     """Signal 'setpoint' has it cycle by cycle, the facts have it as steps; the terminal shows it."""
     run = fp.simulate(

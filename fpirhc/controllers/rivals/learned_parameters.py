@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -22,7 +23,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.plant.regressor import Regressor
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.expression import Signals, is_finite, pair
+from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.problem import Problem
 
@@ -100,7 +101,7 @@ class Learning:
             old = ca.if_else(running, s.learned, clip(s.parameters[regressor.places], lower, upper))
             evidence = Evidence(
                 lambda: gradient(s, state, old),
-                lambda: pair(equation(state, s.realised, command, old, s.parameters)),
+                lambda: cast(Pair, equation(state, s.realised, command, old, s.parameters)),
                 s._clipped_before,
             )
             candidate = old + self.rule.change(evidence, self.bounds, built.period)
