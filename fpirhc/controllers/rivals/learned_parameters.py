@@ -73,7 +73,6 @@ class Learning:
         '_believed' holds the plant's parameters, the learned ones among them.
 
         Args:
-            problem: with the plant.
             extra: signals that `gradient` reads.
             gradient: of the Lyapunov function, for rules that follow it.
         """
