@@ -16,7 +16,7 @@ import casadi as ca
 
 from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.believed import ACTED, NOW, Pairs, Path, Told, believed_path, measured
-from fpirhc.controllers.contract import Controller, PlantModel, resolved
+from fpirhc.controllers.contract import Controller, PlantModel, resolved, tracking_law
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
@@ -160,6 +160,8 @@ def _checked(problem: Problem, controller: Controller, numbers_only: bool, any_g
     ready = resolved(problem, controller)
     if ready.inner is not None:
         checked(ready.inner_problem(problem), ready.inner, numbers_only=numbers_only, any_gain=any_gain)
+    elif (law := ready.planner.tracking if ready.planner else tracking_law(ready)) is not None:
+        law.check(problem.plant, problem.period)
     if numbers_only and ready.inner is None and ready.planner is not None:
         ready.planner.planned(problem)  # which checks the weights of a cost of its own
     else:

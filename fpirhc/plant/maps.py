@@ -14,7 +14,6 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.motion import sampling
 from fpirhc.symbolic.layout import Expression
-from fpirhc.symbolic.open import nominal
 
 if TYPE_CHECKING:
     from fpirhc.plant.plant import Plant
@@ -109,7 +108,7 @@ def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
     if plant.step is None or not gains:
         return
     cycle = sampling(plant)
-    poles = 1 + cycle * np.roots([1.0, *reversed([float(nominal(g)) for g in gains])])
+    poles = 1 + cycle * np.roots([1.0, *reversed(gains)])
     if np.abs(poles).max() >= 1:
         worst = complex(poles[int(np.abs(poles).argmax())])
         shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"

@@ -44,6 +44,9 @@ class Tracking(Checked, ABC):
         """
         return self
 
+    def check(self, plant: Plant, period: float) -> None:
+        """Raise if the law cannot act on the plant in this control cycle; by default it acts on every plant."""
+
     @abstractmethod
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, memory) -> (_target_error, desired, ...).

@@ -80,9 +80,12 @@ class Fractional(IntegralLaw):
         """Weights w_1 ... w_L of the past, shape (cycles,)."""
         return np.cumprod(1 - (float(self.order) + 1) / np.arange(1, cycles + 1))
 
+    def check(self, plant: Plant, period: float) -> None:  # noqa: ARG002
+        """Raise if the error does not decay in the steps of a map."""
+        check_modes(self, plant, [self.rate])
+
     def law(self, plant: Plant, period: float) -> Block:
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
-        check_modes(self, plant, [self.rate])
         cycles, size = self.cycles(period), len(plant.controlled_names)
         past = tuple(f"{c}@{j}" for c in plant.controlled_names for j in range(1, cycles + 1))
         memory = Layout((Signal("decay_past", past), Signal("decay_first", plant.controlled_names)))

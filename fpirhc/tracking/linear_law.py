@@ -51,15 +51,13 @@ class LinearLaw(IntegralLaw):
         """Gains of every controlled coordinate; by default those of its order."""
         return [self.gains(order) for order in plant.response_orders.values()]
 
-    def check_cycle(self, plant: Plant, period: float) -> None:
-        """Raise if the law cannot act on the plant in this cycle; by default, if its modes do not decay in the steps of a map."""
-        del period
+    def check(self, plant: Plant, period: float) -> None:  # noqa: ARG002
+        """Raise if modes do not decay in the steps of a map."""
         for gains in self.gains_of(plant):
             check_modes(self, plant, gains)
 
-    def law(self, plant: Plant, period: float) -> Block:
+    def law(self, plant: Plant, period: float) -> Block:  # noqa: ARG002
         """Block (state, target, nominal, warm_up, integral) -> (error to the target, desired, integral in use)."""
-        self.check_cycle(plant, period)
         reads, writes = law_signals(plant)
         gains = self.gains_of(plant)
 
@@ -175,7 +173,7 @@ class ShiftPolynomial(LinearLaw):
         coefficients = np.real(np.poly([(z - 1) / self.step for z in self.poles]))
         return tuple(float(c) for c in coefficients[:0:-1])
 
-    def check_cycle(self, plant: Plant, period: float) -> None:
+    def check(self, plant: Plant, period: float) -> None:
         """Raise if the poles are meant for another cycle.
 
         Raises:
@@ -186,7 +184,7 @@ class ShiftPolynomial(LinearLaw):
                 f"ShiftPolynomial(step={self.step:g}): the control cycle is {period:g} {plant.time_unit}, and poles in z belong to "
                 f"one cycle; write step={period:g}, with the poles of that cycle"
             )
-        super().check_cycle(plant, period)
+        super().check(plant, period)
 
 
 EXAMPLES = (
