@@ -179,9 +179,8 @@ def integral_delay(plant: Plant) -> tuple[Delay, ...]:
 
 def error_signal(plant: Plant) -> Signal:
     """Error to the target of every controlled coordinate."""
-    every = followed_units(plant)
-    units = [every[c] for c in plant.controlled_names]
-    return vector("_target_error", plant.controlled_names, units)
+    units = followed_units(plant)
+    return vector("_target_error", plant.controlled_names, [units[c] for c in plant.controlled_names])
 
 
 def integral_signal(plant: Plant, name: str) -> Signal:
