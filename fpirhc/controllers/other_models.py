@@ -40,12 +40,9 @@ class ExactModel(ControllerWrapper):
     """
 
     def inner_problem(self, problem: Problem) -> Problem:
-        return _MODELLED.of((problem,), (), lambda: self._modelled(problem))
-
-    def _modelled(self, problem: Problem) -> Problem:
         model = self.plant_model(problem)
-        plant = _EXACT.of((model.plant,), (), lambda: _known(model.plant))
-        return replace(problem, plant=plant, reality=None, signals=signals_of(model.plant, model.signals))
+        plant, told = _EXACT.of((model.plant,), (), lambda: _known(model.plant)), signals_of(model.plant, model.signals)
+        return _MODELLED.of((problem, plant), (), lambda: replace(problem, plant=plant, reality=None, signals=told))
 
     def plant_model(self, problem: Problem) -> PlantModel:
         plant = problem.moves.as_model(problem.plant)
