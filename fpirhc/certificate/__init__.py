@@ -127,7 +127,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     """What the theorem does not cover."""
     plant, planner, deformation = problem.plant, ready.planner, ready.deformation
     if plant.outputs or plant.step is not None or not plant.equations.affine:
-        yield "the plant is a map, has outputs, or its response is not affine in the inputs"
+        yield "the plant is in discrete time, has outputs, or its response is not affine in the inputs"
     rated = problem.limits.rates.keys() - problem.limits.prices.keys()
     if problem.disturbances or problem.reality is not None or problem.signals or rated:
         yield "there are disturbances, signals from outside, hard limits of rates, or a reality that is not the plant"

@@ -189,7 +189,7 @@ def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
     if plant.step is not None and any(every(form.lag)):
-        yield f"{type(deformation).__name__}: a map has no lag; write an actuator as a state of the map"
+        yield f"{type(deformation).__name__}: a discrete-time plant has no lag; write an actuator as a state of it"
 
 
 def _reads(built: Built, *seen: Signal) -> Layout:

@@ -182,7 +182,7 @@ def require_derivatives(plant: Plant, who: str, *, of_time: bool, instead: str) 
     """Raise for an output of order 0, and where derivatives are `of_time` for a map: they have none."""
     reasons = [f"the command moves '{name}' at once (order 0)" for name in plant.at_once]
     if of_time and plant.step is not None:
-        reasons.append("a map has differences of its steps")
+        reasons.append("discrete time has only differences")
     refuse(f"{who} needs derivatives below the response, and {why}; {instead}" for why in reasons)
 
 

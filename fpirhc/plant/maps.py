@@ -31,7 +31,7 @@ def over(plant: Plant, cycle: float) -> Plant:
         unit, below = plant.time_unit, math.floor(ratio)
         lengths = [f"{k * plant.step:g} {unit}" for k in (below, below + 1) if k > 0]
         raise InvalidValue(
-            f"period {cycle:g} {unit} is no whole number of the map's steps of {plant.step:g} {unit}; use {' or '.join(lengths)}"
+            f"period {cycle:g} {unit} is no whole number of the plant's steps of {plant.step:g} {unit}; use {' or '.join(lengths)}"
         )
     return plant if count == plant.steps else replace(plant, steps=count)
 
@@ -50,7 +50,7 @@ def unlike(plant: Plant, model: Plant) -> str:
     """Return how a plant moves otherwise than a model; empty where both step, or neither."""
     if (plant.step is None) == (model.step is None):
         return ""
-    return "differential equations, and the model is a map" if plant.step is None else "steps, and the model has none"
+    return "differential equations, and the model has steps" if plant.step is None else "steps, and the model has none"
 
 
 def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
@@ -66,8 +66,8 @@ def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
         return
     if model.step is None and others:
         mistakes.add(
-            "reality: it is a map, and the model has differential equations, whose derivatives a map does not have; write "
-            "the model as a map with the same step"
+            "reality: it is in discrete time and has no derivatives, which the responses of the model are; write "
+            "the model in discrete time with the same step"
         )
     elif model.step is not None and later:
         mistakes.add(
@@ -113,6 +113,6 @@ def check_modes(law: object, plant: Plant, gains: Sequence[float]) -> None:
         worst = complex(poles[int(np.abs(poles).argmax())])
         shown = f"{worst.real:.3g}" if abs(worst.imag) < 1e-6 * abs(worst) else f"{worst:.3g}"
         raise InvalidValue(
-            f"{law!r}: in the map's cycles of {cycle:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
+            f"{law!r}: in cycles of {cycle:g} {plant.time_unit} a mode of the error has the pole z = {shown} "
             f"and does not decay; use a rate below {2 / cycle:g} 1/{plant.time_unit} ({1 / cycle:g} is deadbeat)"
         )

@@ -235,7 +235,7 @@ def estimated_problem(
 
 def _plant(model: Plant, gains: np.ndarray) -> tuple[Plant, tuple[str, ...]]:
     """The plant without its lags, and the names of its drifts."""
-    require(model.step is None, "the estimated plant of a map has no equations yet")
+    require(model.step is None, "an estimated plant in discrete time has no equations yet")
     direct = set(model.controlled_names) == set(model.coordinates)  # else what else the inputs move has to follow
     opaque = "the estimated plant of outputs of a model that is not affine in its inputs has no equations yet"
     require(direct or not model.equations.inverse_opaque, opaque)

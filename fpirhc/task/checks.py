@@ -108,7 +108,7 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
         mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
     if (horizon := problem.horizon) is not None:
         if problem.plant.step is not None and any(length % 1 for length in horizon.lengths):
-            mistakes.add(f"horizon: the stages of a map are whole steps of it, got lengths {horizon.lengths}")
+            mistakes.add(f"horizon: stages in discrete time are whole steps, got lengths {horizon.lengths}")
         with mistakes.caught():
             cycles_per_plan(horizon, problem.period, unit)
 
@@ -224,7 +224,7 @@ def _check_disturbances(problem: Problem) -> None:
     for name, order in problem.disturbed_outputs.items():
         if order > 1 and problem.plant.step is not None:
             mistakes.add(
-                f"the output '{name}' of a map has relative order {order}, and its differences look ahead to unknown "
+                f"the output '{name}' in discrete time has relative order {order}, and its differences look ahead to unknown "
                 "disturbances; disturb a state or an input, or an output of order 1"
             )
         with mistakes.caught():

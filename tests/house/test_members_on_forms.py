@@ -120,7 +120,7 @@ REFUSED: dict[tuple[str, str], str] = {
     ("Estimating", "states"): NO_FILTER,
     ("Estimating", "believed"): NO_FILTER,
     **{(one, "at once"): NEEDS.format(one, "the command moves 'y' at once (order 0)") for one in OF_DERIVATIVES},
-    **{(one, form): NEEDS.format(one, "a map has differences of its steps") for one in OF_TIME for form in IN_STEPS},
+    **{(one, form): NEEDS.format(one, "discrete time has only differences") for one in OF_TIME for form in IN_STEPS},
     ("ExactModel", "reality"): "it cannot be the exact model of this controller; leave ExactModel out",
     ("ExactModel", "outside"): "an ExternalPlant has no equations that could be the exact model; leave ExactModel out",
 }

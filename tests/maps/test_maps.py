@@ -122,11 +122,11 @@ def test_the_order_is_counted_in_cycles(order: int) -> None:
 BAD: dict[str, tuple[Callable[[], object], str]] = {
     "period": (
         lambda: task(period=15.0),
-        r"period 15 s is no whole number of the map's steps of 10 s; use 10 s or 20 s",
+        r"period 15 s is no whole number of the plant's steps of 10 s; use 10 s or 20 s",
     ),
     "estimator": (
         lambda: task(sensing=fp.Sensing(estimator=fp.PositionDifference())),
-        r"PositionDifference needs derivatives below the response, and a map has differences of its steps; leave the estimator out",
+        r"PositionDifference needs derivatives below the response, and discrete time has only differences; leave the estimator out",
     ),
     "state": (
         lambda: fishery(next=lambda x, u, p: {}),
