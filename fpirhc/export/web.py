@@ -28,7 +28,7 @@ from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.loop import loses, start_memory
 from fpirhc.simulation.moved import moving
-from fpirhc.simulation.ranges import ranges_of
+from fpirhc.simulation.ranges import Ranges
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables
@@ -86,7 +86,7 @@ class LabLoop:
         problem, loop = self.ready.problem, self.ready.loop
         own, sizes = c_of(loop.function, "lab")
         places = {name: k for k, name in enumerate(loop.trace.columns)}
-        errors, ranges = loop.trace[self.error].columns, ranges_of(problem, loop.trace)
+        errors, ranges = loop.trace[self.error].columns, Ranges(problem, loop.trace)
         count = [table.shape[1] for table in self.tables]
         numbers = {
             "memory": loop.memory.size,

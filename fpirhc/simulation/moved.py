@@ -20,7 +20,6 @@ from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names
 from fpirhc.plant.plant import Plant
-from fpirhc.simulation.ranges import Ranges, physical_ranges, ranges_of
 from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal, logged_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -55,10 +54,6 @@ class Exchange:
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
 
-    def ranges(self, trace: Layout) -> Ranges:
-        """Return what ends the run: the physical ranges of what moves, and errors beyond all sense."""
-        return ranges_of(self.problem, trace)
-
     def begin(self, read: Sequence[np.ndarray]) -> None:
         """Fill in what the first cycle reads beside memory and tables."""
 
@@ -76,9 +71,6 @@ class _Conversation(Exchange):
     def __init__(self, problem: Problem, body: ExternalPlant, seed: int) -> None:
         super().__init__(problem)
         self._body, self._seed, self._bridged, self._cycles = body, seed, 0, 0
-
-    def ranges(self, trace: Layout) -> Ranges:
-        return physical_ranges(self.problem, trace)
 
     def begin(self, read: Sequence[np.ndarray]) -> None:
         self._answer, self._held = read

@@ -5,8 +5,9 @@ A level below zero is a run that no plant would make. An error of a million time
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -21,7 +22,6 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
-_Entries: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[str, str]]]
 _RUNAWAY = 1e6  # times the largest value of the reference, or of the start
 _INSTANTS = 200  # of the reference
 _MOTIONS: Latest[np.ndarray] = Latest(4)  # of references
@@ -31,56 +31,48 @@ _SIGNALS = ("foreign", "reality_state", "plant_state", "state")
 _DIVERGED = 1e100  # size of numbers that no loop but a diverging one has
 
 
-@dataclass(frozen=True, eq=False)
-class Ranges:
-    """Where logged numbers must be, and what is said of one that is not."""
+class Range(NamedTuple):
+    """Where a logged number must be, and what is said of one that is not."""
 
-    columns: np.ndarray  # of the log, shape (m,)
-    lower: np.ndarray  # shape (m,)
-    upper: np.ndarray  # shape (m,)
-    words: tuple[tuple[str, str], ...]  # (before, behind) a number that is outside
+    column: int  # of the log
+    lower: float
+    upper: float
+    words: tuple[str, str]  # before and behind a number that is outside
+
+
+class Ranges:
+    """What ends a run: the physical ranges of what moves, and errors beyond all sense; one absurd sample of a body is none."""
+
+    def __init__(self, problem: Problem, trace: Layout) -> None:
+        every = [*_of_states(problem, trace), *(_of_errors(problem, trace) if problem.moves.simulated else ())]
+        self.columns = np.array([one.column for one in every], dtype=int)
+        self.lower, self.upper = np.array([one.lower for one in every]), np.array([one.upper for one in every])
+        self._words = [one.words for one in every]
 
     def first_outside(self, rows: np.ndarray) -> tuple[int, str] | None:
         """Return the first row of a log in which a number is outside, and which one; None where all are inside."""
-        if not self.words:
-            return None
         values = rows[:, self.columns]
         outside = (values < self.lower) | (values > self.upper)
         if not outside.any():
             return None
         row = int(np.argmax(outside.any(axis=1)))
         k = int(np.argmax(outside[row]))
-        before, behind = self.words[k]
+        before, behind = self._words[k]
         return row, f"{before} {values[row, k]:.6g} {behind}"
 
 
-def ranges_of(problem: Problem, trace: Layout) -> Ranges:
-    """Return the physical ranges of the plant that a run moves, and what errors may be, at the columns where they are logged."""
-    states, errors = _of_states(problem, trace), _of_errors(problem, trace)
-    columns, lower, upper = (np.concatenate([a, b]) for a, b in zip(states[:3], errors[:3], strict=True))
-    return Ranges(columns.astype(int), lower, upper, (*states[3], *errors[3]))
-
-
-def physical_ranges(problem: Problem, trace: Layout) -> Ranges:
-    """Return the physical ranges alone, for what a body outside gives: one absurd sample is no loop that runs away."""
-    columns, lower, upper, words = _of_states(problem, trace)
-    return Ranges(columns, lower, upper, tuple(words))
-
-
-def _of_states(problem: Problem, trace: Layout) -> _Entries:
+def _of_states(problem: Problem, trace: Layout) -> Iterator[Range]:
     signal = trace[next(name for name in _SIGNALS if name in trace)]
     first = trace.slice(signal.name).start
-    named = [(n, ends) for n, ends in problem.real_plant.ranges.items() if n in signal.elements]
-    places = [signal.elements.index(n) for n, _ in named]
-    lower, upper = (np.array([ends[k] for _, ends in named], dtype=float) for k in (0, 1))
-    words = []
-    for (name, (low, high)), k in zip(named, places, strict=True):
-        unit = signal.entry_units[k]
-        words.append((f"state '{name}' is", f"{unit}, outside its physical range of {low:g} to {high:g} {unit}"))
-    return np.array([first + k for k in places], dtype=int), lower, upper, words
+    for name, (low, high) in problem.real_plant.ranges.items():
+        if name in signal.elements:
+            k = signal.elements.index(name)
+            unit = signal.entry_units[k]
+            behind = f"{unit}, outside its physical range of {low:g} to {high:g} {unit}"
+            yield Range(first + k, low, high, (f"state '{name}' is", behind))
 
 
-def _of_errors(problem: Problem, trace: Layout) -> _Entries:
+def _of_errors(problem: Problem, trace: Layout) -> Iterator[Range]:
     """Errors that no reference explains: the loop has run away, whatever its signals still are."""
     signal = trace[next(name for name in _ERRORS if name in trace)]
     plant, first = problem.plant, trace.slice(signal.name).start
@@ -91,22 +83,13 @@ def _of_errors(problem: Problem, trace: Layout) -> _Entries:
         return np.asarray(function.map(_INSTANTS)(times[None, :])[0].full())
 
     motion = _MOTIONS.of((function,), (problem.duration,), moved)
-    places, sizes, words = [], [], []
-    for k, name in enumerate(signal.elements):
+    for k, (name, unit) in enumerate(zip(signal.elements, signal.entry_units, strict=True)):
         row = plant.output.elements.index(name)
         along = np.append(motion[row], problem.start_output[row])
         size = float(np.abs(along[np.isfinite(along)]).max(initial=0.0))
         if size > 0:
-            places.append(first + k)
-            sizes.append(_RUNAWAY * size)
-            unit = signal.entry_units[k]
-            words.append(
-                (
-                    f"the error of '{name}' is",
-                    f"{unit}, more than a million times the {size:.3g} {unit} of its reference and start",
-                )
-            )
-    return np.array(places, dtype=int), -np.array(sizes), np.array(sizes), words
+            behind = f"{unit}, more than a million times the {size:.3g} {unit} of its reference and start"
+            yield Range(first + k, -_RUNAWAY * size, _RUNAWAY * size, (f"the error of '{name}' is", behind))
 
 
 class Dropped:

@@ -21,7 +21,7 @@ from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.loop import closed_loop, cycles_per_call, plans_exactly, start_memory
 from fpirhc.simulation.moved import Exchange, moving
-from fpirhc.simulation.ranges import Dropped
+from fpirhc.simulation.ranges import Dropped, Ranges
 from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
@@ -257,7 +257,7 @@ def run_cycles(
     """
     cycles, trace, dropped, padded = problem.cycles, loop.trace, Dropped(loop), _padded(problem, patches)
     count = evaluator.results[1].size // trace.size  # a call
-    log, ranges = np.empty((padded, trace.size)), talk.ranges(trace)
+    log, ranges = np.empty((padded, trace.size)), Ranges(problem, trace)
     memory, *read, run = evaluator.arguments
     windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
     after, sent = evaluator.results[0], evaluator.results[2:]
