@@ -48,49 +48,6 @@ def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
     return [delay_block("send_command", plant.input, arriving, waits), mover.advance(disturbed, arriving)]
 
 
-class Exchange:
-    """What passes between a run and what it moves after every call of the loop: nothing, where that is inside."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-
-    def begin(self, read: Sequence[np.ndarray]) -> None:
-        """Fill in what the first cycle reads beside memory and tables."""
-
-    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:  # noqa: ARG002
-        """Return why the run ends after this cycle, and what to do; None where it goes on."""
-        return None
-
-    def end(self) -> None:
-        """Leave what moves as it is to be left, however the run ended."""
-
-
-class _Conversation(Exchange):
-    """A body is sent the inputs of every cycle, and answers with measurements."""
-
-    def __init__(self, problem: Problem, body: ExternalPlant, seed: int) -> None:
-        super().__init__(problem)
-        self._body, self._seed, self._bridged, self._cycles = body, seed, 0, 0
-
-    def begin(self, read: Sequence[np.ndarray]) -> None:
-        self._answer, self._held = read
-        self._held[0] = 0.0
-        self._answer[:] = self._body.first(self._seed)
-
-    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:
-        self._cycles = cycle + 1
-        answer = self._body.read(cycle * self.problem.period, sent[0].copy())
-        bad = self._held[0] = isinstance(answer, str)
-        self._bridged = self._bridged + 1 if bad else 0
-        if not isinstance(answer, str):
-            self._answer[:] = answer
-            return None
-        return (answer, self._body.remedy) if self._bridged > self._body.holds else None
-
-    def end(self) -> None:
-        self._body.end(self._cycles * self.problem.period, self.problem.plant.inputs)
-
-
 class Mover(ABC):
     """What a run moves, as the loop meets it."""
 
@@ -107,9 +64,15 @@ class Mover(ABC):
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
 
-    def exchange(self, seed: int) -> Exchange:  # noqa: ARG002
-        """Return what passes between a run with this seed and what it moves."""
-        return Exchange(self.problem)
+    def begin(self, read: Sequence[np.ndarray], seed: int) -> None:  # noqa: B027
+        """Fill in what the first cycle of a run reads beside memory and tables: nothing, where what moves is inside."""
+
+    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:  # noqa: ARG002
+        """Return why the run ends after this cycle, and what to do; None where it goes on."""
+        return None
+
+    def end(self) -> None:  # noqa: B027
+        """Leave what moves as it is to be left, however the run ended."""
 
     @property
     @abstractmethod
@@ -246,12 +209,27 @@ class Body(Mover):
 
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)
-        self._body = body
+        self._body, self._bridged, self._cycles = body, 0, 0
         units = quantities(problem.plant)
         self.measures = {name: units[name] for name in body.measures}
 
-    def exchange(self, seed: int) -> Exchange:
-        return _Conversation(self.problem, self._body, seed)
+    def begin(self, read: Sequence[np.ndarray], seed: int) -> None:
+        self._answer, self._held = read
+        self._held[0] = 0.0
+        self._answer[:] = self._body.first(seed)
+
+    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:
+        self._cycles = cycle + 1
+        answer = self._body.read(cycle * self.problem.period, sent[0].copy())
+        bad = self._held[0] = isinstance(answer, str)
+        self._bridged = self._bridged + 1 if bad else 0
+        if not isinstance(answer, str):
+            self._answer[:] = answer
+            return None
+        return (answer, self._body.remedy) if self._bridged > self._body.holds else None
+
+    def end(self) -> None:
+        self._body.end(self._cycles * self.problem.period, self.problem.plant.inputs)
 
     @property
     def states(self) -> tuple[str, ...]:

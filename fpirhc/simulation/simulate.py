@@ -20,7 +20,7 @@ from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.loop import closed_loop, cycles_per_call, plans_exactly, start_memory
-from fpirhc.simulation.moved import Exchange, moving
+from fpirhc.simulation.moved import moving
 from fpirhc.simulation.ranges import Dropped, Ranges
 from fpirhc.simulation.replay import replaying
 from fpirhc.simulation.run import Run, with_common_columns
@@ -157,9 +157,8 @@ class Simulator:
             problem, controller, numbers = live.changed(settings)
         start = start_memory(own.loop, problem, controller)
         start[live.places(own.loop.memory)] = list(numbers.values())
-        rows, talk = _padded(problem, ()), moving(problem).exchange(seed)
-        tables = run_tables(problem, seed, rows, disturbed=disturbed, setpoints=setpoints)
-        logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, talk, progress)
+        tables = run_tables(problem, seed, _padded(problem, ()), disturbed=disturbed, setpoints=setpoints)
+        logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, seed, progress)
         layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)
         model, gain = controller.plant_model(problem), float(controller.deformation.effective_gain())
@@ -243,7 +242,7 @@ def run_cycles(
     loop: Composite,
     evaluator: Evaluator,
     tables: Sequence[np.ndarray],
-    talk: Exchange,
+    seed: int,
     progress: Progress | None = None,
     patches: Sequence[Patch] = (),
 ) -> tuple[np.ndarray, str | None]:
@@ -252,7 +251,7 @@ def run_cycles(
     Args:
         evaluator: of the loop over as many cycles as a call runs, see `chained`.
         tables: disturbances and the sensors' random series, one row per cycle, in whole chunks.
-        talk: what passes between the loop and a plant outside after every call.
+        seed: for a plant outside.
         progress: called with (cycles done, cycles in all).
     """
     cycles, trace, dropped, padded = problem.cycles, loop.trace, Dropped(loop), _padded(problem, patches)
@@ -261,10 +260,10 @@ def run_cycles(
     memory, *read, run = evaluator.arguments
     windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
     after, sent = evaluator.results[0], evaluator.results[2:]
-    again = replaying(problem, loop, evaluator)
+    mover, again = moving(problem), replaying(problem, loop, evaluator)
     memory[:] = start
     try:
-        talk.begin(read[len(tables) :])
+        mover.begin(read[len(tables) :], seed)
         for at, end in pieces(cycles, count, [cycle for cycle, _, _ in patches]):
             for cycle, places, values in patches:
                 if cycle == at:
@@ -287,14 +286,14 @@ def run_cycles(
                 row, what = outside
                 return log[: at + row].copy(), stopped(problem, at + row, what)
             memory[:] = after
-            ended = talk.after(end - 1, sent)
+            ended = mover.after(end - 1, sent)
             if ended and end < cycles:
                 return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]
             if progress:
                 progress(end, cycles)
         return log[:cycles], None
     finally:
-        talk.end()
+        mover.end()
 
 
 def _padded(problem: Problem, patches: Sequence[Patch]) -> int:
