@@ -81,11 +81,9 @@ class CasesOf(Variants):
         made, variants, chosen = dict[object, Problem](), [], cases.matching(self.patterns)
         paths = dict.fromkeys(path for name in chosen for path in cases.changes[name])
         for name in chosen:
-            key, seed = cases.key(name), cases.seed(name)
+            key, seed = cases.key(name), int(_streams(self.seed, cases.names.index(name)).generate_state(1)[0])
             if key not in made:
                 made[key] = cases.build(name, task.problem)
-            if seed is None:
-                seed = int(_streams(self.seed, cases.names.index(name)).generate_state(1)[0])
             problem = cases.exactly(name, made[key])
             numbers = {path: value for path in paths if (value := number_of_case(problem, path)) is not None}
             variants.append(Variant(name, problem, key, {}, seed, cases.group(name), numbers, made[key]))

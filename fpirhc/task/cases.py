@@ -21,7 +21,7 @@ from fpirhc.symbolic.dotted import changed_at, content_at, mapped
 from fpirhc.task.problem import Problem
 
 EVERY = "all"  # names every case
-_GROUP, _SEED = "group", "seed"  # what a case has beside its changes
+_GROUP = "group"  # what a case has beside its changes
 _EXACT, _APPROXIMATE, START = "exact", "approximate", "start"
 PARAMETERS = {_EXACT: "what moves", _APPROXIMATE: "what the controllers know"}
 _WORDS = (*PARAMETERS, START)
@@ -42,11 +42,11 @@ class Cases(Checked):
         changes: by name of the case and path. The path is 'exact.NAME' (the parameter of what moves), 'approximate.NAME' (of the
             controllers' model), 'start.NAME', or begins with another field of the problem: 'reference',
             'reality', 'signals', 'dead_time.inputs.Q1', 'limits.inputs.Q1' (a pair) or 'limits.inputs.Q1.1' (its upper end).
-            'group' is a text by which cases are summed up, 'seed' the seed of the case's noise.
+            'group' is a text by which cases are summed up.
 
     Raises:
-        InvalidProblem: all mistakes together: no case, a name that is no text, changes that are no mapping, a wrong group or seed,
-            a number that a case sets twice.
+        InvalidProblem: all mistakes together: no case, a name that is no text, changes that are no mapping, a wrong group, a
+            number that a case sets twice.
     """
 
     changes: Mapping[str, Mapping[str, object]]
@@ -72,10 +72,6 @@ class Cases(Checked):
     def group(self, name: str) -> str:
         """Return the group of a case; '' where it has none."""
         return str(self.changes[name].get(_GROUP, ""))
-
-    def seed(self, name: str) -> int | None:
-        """Return the seed of a case's noise; None where the study chooses it."""
-        return cast(int | None, self.changes[name].get(_SEED))
 
     @checked_call
     def matching(self, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -114,7 +110,7 @@ class Cases(Checked):
         """Raise with all mistakes where a path or a number of some cases, or of all, does not fit the problem."""
         mistakes = Mistakes("cases")
         for name in names or self.names:
-            for path in (p for p in self.changes[name] if p not in (_GROUP, _SEED)):
+            for path in (p for p in self.changes[name] if p != _GROUP):
                 with mistakes.caught(f"case {name!r}, '{path}': "):
                     check_change(problem, self.changes[name], path)
         mistakes.raise_if_any()
@@ -130,14 +126,14 @@ class Cases(Checked):
         return tuple(
             (path, value if isinstance(value, int | float | str) else id(value))
             for path, value in sorted(self.changes[name].items())
-            if path not in (_GROUP, _SEED) and not path.startswith(f"{_EXACT}.")
+            if path != _GROUP and not path.startswith(f"{_EXACT}.")
         )
 
 
 def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     """The problem with all changes but those of exact parameters."""
     for path, value in changes.items():
-        if path.partition(".")[0] not in (*_WORDS, _GROUP, _SEED):
+        if path.partition(".")[0] not in (*_WORDS, _GROUP):
             problem = changed_at(problem, path, as_declared(problem, path, value))
     model, start = _named(changes, _APPROXIMATE), _named(changes, START)
     if model:
@@ -170,11 +166,8 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
     """What is wrong with a case whatever its problem is."""
     if not name.strip() or name == EVERY:
         yield f"the name of a case is a text that is not empty; '{EVERY}' means every case"
-    group, seed = changes.get(_GROUP, ""), changes.get(_SEED)
-    if not isinstance(group, str):
+    if not isinstance(group := changes.get(_GROUP, ""), str):
         yield f"'{_GROUP}' is a text, got {described(group)}"
-    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
-        yield f"'{_SEED}' is a whole number of at least 0, got {described(seed)}"
     for path in changes:
         above = [path[:at] for at, mark in enumerate(path) if mark == "."]
         for other in (one for one in above if one in changes):

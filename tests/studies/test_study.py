@@ -22,7 +22,7 @@ cases = fp.Cases({
     "weak": {"exact.b": 0.9, "group": "light"},
     "stiff": {"exact.k": 8.0, "exact.b": 1.2, "group": "heavy"},
     "known": {"exact.b": 2.0, "approximate.b": 2.0, "group": "heavy"},
-    "far": {"start.y": 1.0, "start.y'": -0.5, "seed": 7},
+    "far": {"start.y": 1.0, "start.y'": -0.5},
 })
 """
 LINE = line_text(
@@ -154,7 +154,7 @@ def test_a_case_changes_what_it_states_and_nothing_else(task):
 
 
 def test_cases_are_their_problems(task):
-    """The run of a case is that of its problem; a seed of its own is its own, else it follows from its place among all cases."""
+    """The run of a case is that of its problem; its seed follows from its place among all cases."""
     table = rows(task, fp.CasesOf(("all",), 2), controllers=["CTC"]).set_index("variant")
     assert list(table.index) == ["usual", "weak", "stiff", "known", "far"]
     for name, row in table.iterrows():
@@ -163,7 +163,6 @@ def test_cases_are_their_problems(task):
     heavy = rows(task, fp.CasesOf(("heavy",), 2), controllers=["CTC"])
     assert heavy.variant.tolist() == ["stiff", "known"]
     assert heavy.seed[1] == table.seed["known"] != table.seed["usual"]
-    assert table.seed["far"] == 7
     assert table["exact.k"].tolist() == [5.0, 5.0, 8.0, 5.0, 5.0]
     assert table["start.y'"].tolist() == [0.0, 0.0, 0.0, 0.0, -0.5]
     assert table["approximate.b"].tolist() == [1.0, 1.0, 1.0, 2.0, 1.0]
@@ -207,7 +206,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "no case": (lambda t: fp.Cases({}), "there is none; expected "),
     "the name of all": (lambda t: fp.Cases({"all": {}}), "'all' means every case"),
-    "a seed below zero": (lambda t: fp.Cases({"weak": {"seed": -1}}), "case 'weak': 'seed' is a whole number"),
+    "a group that is no text": (lambda t: fp.Cases({"weak": {"group": 1}}), "case 'weak': 'group' is a text, got 1"),
     "a parameter that is not there": (of_case({"exact.c": 1.0}), r"'exact\.c': .* there is no 'c'\. .*Valid: b, k"),
     "a parameter alone": (of_case({"b": 1.0}), r"It is a parameter: 'exact\.b' is what moves"),
     "a field that is misspelt": (of_case({"dead_tme.measurement": 0.1}), r"'dead_tme.*Did you mean 'dead_time'\?"),
