@@ -208,7 +208,7 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
         names: of controllers; None: all.
     """
     chosen = {name: one for name, one in task.controllers.items() if not names or name in names}
-    shared = {path for path in values if of_problem(task.problem, path)}
+    shared = {path for path in values if of_problem(path)}
     read = {path: values[path] for path in shared if not chosen or not all(is_own(c, path) for c in chosen.values())}
     problem, controllers = with_numbers(task.problem, read), dict(task.controllers)
     lacked: dict[str, list[InvalidName]] = {path: [] for path in values}
@@ -223,8 +223,8 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
         controllers[name] = with_settings(controller, own)
     for path, errors in lacked.items():
         if chosen and len(errors) == len(chosen):
-            if path in task.problem.moves.parameters:
-                mend = f"write exact.{path} for the plant, approximate.{path} for the model"
+            if (name := path.partition(".")[0]) in task.problem.moves.parameters:
+                mend = f"write exact.{name} for the plant, approximate.{name} for the model"
                 raise InvalidName(f"setting '{path}': {mend}")
             raise max(errors, key=lambda error: "Did you mean" in str(error))
     return replace(task, problem=problem, controllers=controllers)

@@ -38,24 +38,19 @@ def with_settings(owner: Owner, values: Mapping[str, float]) -> Owner:
     return changed
 
 
-def of_problem(problem: Problem, path: str) -> str | None:
-    """Return a path as a case has it, 'exact.m1' for 'm1.exact'; None where it does not begin with a word of a case."""
-    name, _, word = path.rpartition(".")
-    named = word in PARAMETERS and (name in problem.plant.parameters or name in problem.moves.parameters)
-    of_case = f"{word}.{name}" if named else path
-    return of_case if of_case.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(problem))} else None
+def of_problem(path: str) -> bool:
+    """Whether a path begins with a word of a case, see `Cases`."""
+    return path.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(Problem))}
 
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
-    """Return a problem with other numbers at paths of a case, see `Cases`, or as `of_problem` takes them."""
+    """Return a problem with other numbers at paths of a case."""
     if not values:
         return problem
-    written = {of_problem(problem, path) or path: path for path in values}
-    changes = {path: values[own] for path, own in written.items()}
-    case, mistakes = Cases({"--set": changes}), Mistakes("--set")
-    for path, own in written.items():  # a mistake names a path as it was written
-        with mistakes.caught(f"'{own}': "):
-            check_change(problem, changes, path)
+    case, mistakes = Cases({"--set": values}), Mistakes("--set")
+    for path in values:
+        with mistakes.caught(f"'{path}': "):
+            check_change(problem, values, path)
     mistakes.raise_if_any()
     return case.problem("--set", problem)
 

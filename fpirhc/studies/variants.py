@@ -164,7 +164,6 @@ class Grid(Variants):
         return {"kind": "grid", "axes": [*self.axes], "seed": self.seed}
 
     def of(self, task: Task) -> Sequence[Variant]:
-        paths = {path: of_problem(task.problem, path) for path in self.axes}
         with_numbers_of_all(task, {path: values[0] for path, values in self.axes.items()})  # refuses what nobody has
         made, variants = dict[object, Problem](), []
 
@@ -176,10 +175,10 @@ class Grid(Variants):
 
         for values in itertools.product(*self.axes.values()):
             numbers = dict(zip(self.axes, values, strict=True))
-            ours = {own: numbers[path] for path, own in paths.items() if own}
+            ours = {path: value for path, value in numbers.items() if of_problem(path)}
             fixed = {path: value for path, value in ours.items() if not path.startswith("exact.")}
             name = ", ".join(f"{path} = {value:.10g}" for path, value in numbers.items())
-            settings = {path: value for path, value in numbers.items() if paths[path] is None}
+            settings = {path: value for path, value in numbers.items() if path not in ours}
             build, own = tuple(sorted(fixed.items())), problem_with(ours)
             variants.append(Variant(name, own, build, settings, self.seed, "", numbers, problem_with(fixed)))
         return _told_apart(variants)

@@ -185,7 +185,9 @@ def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> 
     else:
         paths = [f.name for f in fields(problem) if f.name not in _OWN]
         if word not in paths:
-            meant = _meant(problem, path.rpartition(".")[2]) or nearest(word, [*_WORDS, *paths])
+            meant = (
+                _meant(problem, word) or _meant(problem, path.rpartition(".")[2]) or nearest(word, [*_WORDS, *paths])
+            )
             raise InvalidName(f"the problem has no '{path}'.{meant}")
         if isinstance(content_at(problem, path, "the problem"), int | float):
             _check_number(changes[path])
