@@ -26,8 +26,7 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
-from fpirhc.simulation.loop import loses, start_memory
-from fpirhc.simulation.moved import moving
+from fpirhc.simulation.loop import cycles_per_call, start_memory
 from fpirhc.simulation.ranges import Ranges
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -129,7 +128,7 @@ def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: P
         "a lab runs the plant's equations in the page; a plant outside Python's equations has none",
     )
     require(
-        not loses(moving(problem)),
+        cycles_per_call(problem, compiled=True) > 1,
         "a page steps its loop without the driver that runs missing cycles afterwards; leave dropout and range out of sensors",
     )
     package("ziglang", "compiler", "a lab")

@@ -115,6 +115,8 @@ class HeldInput(Undeformed):
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
 _LOST_QUEUE = "lost_samples_queue"
+_CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
+_SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _PAST, _FULL = "_outputs_past", "_outputs_known"
 
 
@@ -179,15 +181,9 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
 
 
 def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
-    """Return how many cycles one call of the loop runs: one where samples may be lost, and the caller replays them."""
-    mover = moving(problem)
-    many = mover.cycles_of_call if compiled else mover.cycles_interpreted
-    return 1 if loses(mover) else many
-
-
-def loses(mover: Mover) -> bool:
-    """Return whether samples may be lost, or lie outside the range of their sensor."""
-    return bool(lost_blocks(mover) or sensor_ranges(mover.problem))
+    """Return how many cycles one call of the loop runs: one where samples may be lost, as those of a body outside, and replayed."""
+    loses = bool(lost_blocks(moving(problem)) or sensor_ranges(problem))
+    return 1 if loses else _CHUNK if compiled else _SHORT
 
 
 def lost_blocks(mover: Mover) -> list[Block]:

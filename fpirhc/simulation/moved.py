@@ -31,8 +31,6 @@ from fpirhc.task.problem import Problem
 
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
 SENT = "_acting"  # signal of the inputs that a foreign reality is sent
-CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
-SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _RAW, HELD = "_foreign", "_foreign_held"
 
 
@@ -51,10 +49,6 @@ def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
 class Mover(ABC):
     """What a run moves, as the loop meets it."""
 
-    cycles_of_call: ClassVar[int] = CHUNK
-    """Cycles that one call of the compiled loop runs."""
-    cycles_interpreted: ClassVar[int] = SHORT
-    """The same in the virtual machine."""
     sent: ClassVar[tuple[str, ...]]
     """Signals that the step returns to it."""
 
@@ -205,7 +199,6 @@ class Body(Mover):
     """A body outside, which is sent inputs and answers with measurements."""
 
     sent = (SENT,)
-    cycles_of_call = cycles_interpreted = 1  # it answers after each
 
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)

@@ -29,7 +29,7 @@ class AccelerationFeedback(Undeformed):
 
     Args:
         tracking: the law that gives the desired response.
-        gain: kappa, dimensionless.
+        gain: kappa, dimensionless; the loop is stable for kappa lambda_max(J) below (1 + p) / (1 - p), p the pole of the low-pass.
         time_constant: of the low-pass on the response error, s; 0: no low-pass.
     """
 
@@ -40,10 +40,6 @@ class AccelerationFeedback(Undeformed):
     def pole(self, period: float) -> float:
         """Return the pole p of the low-pass for control cycles of that period, s."""
         return left_after(period, self.time_constant)
-
-    def largest_gain(self, period: float) -> float:
-        """Return the stability limit (1 + p) / (1 - p) of kappa lambda_max(J) for control cycles of that period, s."""
-        return (1 + self.pole(period)) / (1 - self.pole(period))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         return tracked_blocks(built, self.tracking, self._feedback_block(built), invert_block(built.plant))
