@@ -29,11 +29,6 @@ class Status(IntEnum):
         return _BEST_TO_WORST.index(self)
 
     @property
-    def skips(self) -> bool:
-        """Whether the cycle was skipped, with the last command and every memory as it was."""
-        return self in _SKIPPED
-
-    @property
     def remedy(self) -> str:
         """A sentence that states what happened and what to do next."""
         return _REMEDIES[self]
@@ -53,7 +48,6 @@ _BEST_TO_WORST = (
     Status.SOLVER_FAILED,
     Status.NON_FINITE,
 )
-_SKIPPED = (Status.NON_FINITE, Status.BAD_SAMPLE, Status.BAD_TIME, Status.SOLVER_FAILED)
 _REMEDIES = {
     Status.OK: "solved: residuals are within the tolerance.",
     Status.NOT_CONVERGED: "the optimiser used all its iterations before its residual met the tolerance: "

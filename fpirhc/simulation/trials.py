@@ -125,13 +125,8 @@ class ModelAsPlant:
 
     def run(self, loop: Simulator, model: Problem) -> Run:
         """Return the run of a loop, of the problem, on one of the models."""
-        own = self._behind(model, loop)
-        # Random series of another length are others.
-        length = () if not own.problem.sensing.drawn else (model.cycles,)
-        longest = _RUNS.of((own, *_untimed(model)), (self._seed, *length), list)
-        if not longest or (longest[0].cycles < model.cycles and longest[0].stop is None):
-            longest[:] = [own.run(seed=self._seed, variant=model, disturbed=False)]
-        return longest[0].first(model.cycles)
+        own, made = self._behind(model, loop), (self._seed, model.cycles)
+        return _RUNS.of((own, *_untimed(model)), made, lambda: own.run(seed=self._seed, variant=model, disturbed=False))
 
     def _behind(self, model: Problem, loop: Simulator) -> Simulator:
         """The loop itself where it moves a plant of the model's kind; else the one that does, whose plans are built already."""
@@ -155,7 +150,7 @@ def _untimed(problem: Problem) -> tuple[object, ...]:
 
 
 _LOOPS: Latest[Simulator] = Latest(8)
-_RUNS: Latest[list[Run]] = Latest(8)  # at most one each, from which shorter ones are taken
+_RUNS: Latest[Run] = Latest(8)
 _TIMES = {"duration", "measure_from"}  # of a problem, which are no part of its loop
 
 
