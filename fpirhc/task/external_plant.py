@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import reprlib
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import ClassVar, NoReturn, Protocol
@@ -46,9 +46,9 @@ class ExternalPlant(Checked):
 
     Args:
         body: object with `reset(seed)` and `step(time, command)`, see `Body`; None: `make` makes it.
-        measures: names of what it measures, or name -> unit, in the order of its answers: elements of the model's state ("q1",
+        measures: names of what it measures -> unit, in the order of its answers: elements of the state ("q1",
             "q1'"), outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled
-            ("q1''"). Units are those of the model; stated ones are compared with them.
+            ("q1''"). Units are those of the model.
         holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
             A bad answer is an exception, another shape, or a number that is not finite: a body that has measured nothing in a
             cycle, or waited for it too long, returns NaN.
@@ -66,7 +66,7 @@ class ExternalPlant(Checked):
     """
 
     body: Body | None = None
-    measures: Mapping[str, str] | Sequence[str] = field(default_factory=dict)
+    measures: Mapping[str, str] = field(default_factory=dict)
     holds: CountOrZero = 0
     rest: Mapping[str, Finite] | None = None
     lag: Mapping[str, NotNegative] = field(default_factory=dict)
@@ -82,9 +82,7 @@ class ExternalPlant(Checked):
             raise InvalidValue(
                 "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body"
             )
-        mistakes, names = Mistakes("ExternalPlant"), [*self.measures]
-        for name in dict.fromkeys(n for n in names if names.count(n) > 1):
-            mistakes.add(f"measures: {name} is named {names.count(name)} times; an answer has every quantity once")
+        mistakes = Mistakes("ExternalPlant")
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
         if self.make is None and (mistake := self._wrong(self.body)):
@@ -137,8 +135,7 @@ class ExternalPlant(Checked):
                 f"it does not measure {name} ({units[name]}), which the sensing of the problem needs; add it to measures, or "
                 "choose an estimator that does without: Sensing(estimator=...)"
             )
-        stated = self.measures if isinstance(self.measures, Mapping) else {}
-        for name, unit in stated.items():
+        for name, unit in self.measures.items():
             if units.get(name, unit) != unit:
                 mistakes.add(f"it measures {name} in {unit}, the model has it in {units[name]}; write both in one unit")
         mistakes.raise_if_any()

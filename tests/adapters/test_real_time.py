@@ -54,7 +54,7 @@ class Machine:
 def task(machine: Machine, holds: int = 0, rest=None) -> fp.Problem:
     return fp.Problem(
         plant=TANK,
-        reality=fp.ExternalPlant(machine, ["h"], holds=holds, rest={"q": 0.25} if rest is None else rest),
+        reality=fp.ExternalPlant(machine, {"h": "m"}, holds=holds, rest={"q": 0.25} if rest is None else rest),
         sensing=fp.Sensing(estimator=fp.PositionDifference()),
         reference=fp.Trajectory(lambda t: {"h": 1.0 + 0.1 * t}),
         start={"h": 1.0},
@@ -69,7 +69,7 @@ def run(problem: fp.Problem) -> fp.Run:
 
 def mistakes(machine: Machine, own: list[float]) -> list[str]:
     """Why the answer of each cycle is bad, or nothing; the controller takes its own time, s, before each."""
-    body = fp.ExternalPlant(machine, ["h"], rest={})
+    body = fp.ExternalPlant(machine, {"h": "m"}, rest={})
     body.first(0)
     found = []
     for k, seconds in enumerate(own):
@@ -136,7 +136,7 @@ def test_a_machine_is_left_with_what_rests_however_a_run_ends(bad, cycles, ends)
 def test_what_rests_is_stated():
     """A machine has no default that nobody chose; a body without `close` is not a machine, and {} sends nothing."""
     with pytest.raises(InvalidValue, match=r"has close\(\), and would keep its last command .* rest={'u': 0.0}"):
-        fp.ExternalPlant(Machine(), ["h"])
+        fp.ExternalPlant(Machine(), {"h": "m"})
     with pytest.raises(InvalidProblem, match="input 'p' is unknown"):
         task(Machine(), rest={"p": 0.0})
     machine = Machine()
@@ -147,7 +147,7 @@ def test_what_rests_is_stated():
 
 def test_a_body_has_the_period_that_it_was_made_with():
     """Commands would else be held for another time than the problem's cycle, and nobody would see it."""
-    body = fp.ExternalPlant(Machine(), ["h"], rest={}, period=0.1)
+    body = fp.ExternalPlant(Machine(), {"h": "m"}, rest={}, period=0.1)
     with pytest.raises(InvalidProblem, match=r"one step of it takes 0\.1, and the problem's period is 0\.2"):
         body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.2)
     body.check_motion(np.zeros(1), np.zeros(1), fp.RungeKutta4(), 0.1)
@@ -182,7 +182,7 @@ class Heater:
 plant = fp.Plant({"T": "K"}, {"Q": "%"}, {}, lambda q, u, p: {"T": (0.8 * u.Q - q.T) / 20}, order=1)
 problem = fp.Problem(
     plant, fp.Trajectory(lambda t: {"T": 60.0 + 0 * t}), start={"T": 0.0}, period=1.0, duration=8.0,
-    reality=fp.ExternalPlant(Heater(), ["T"], rest={"Q": 0.0}), sensing=fp.Sensing(estimator=fp.PositionDifference()),
+    reality=fp.ExternalPlant(Heater(), {"T": "K"}, rest={"Q": 0.0}), sensing=fp.Sensing(estimator=fp.PositionDifference()),
 )
 controllers = {"CTC": fp.ComputedTorque(fp.Exponential(rate=0.2))}
 """
