@@ -38,26 +38,18 @@ def reference_states(problem: Problem, count: int) -> np.ndarray:
     """Return states at evenly spaced instants of a run, shape (nx, count); NaN after a nominal run that does not stay finite."""
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
     if plant.equations.hidden:
-        return _of_nominal_run(problem, count)[0]
+        places = np.round(times / problem.period).astype(int)
+        return problem.nominal_run[:, np.minimum(places, problem.nominal_run.shape[1] - 1)]
     outputs = problem.reference.function(plant).map(count)(times[None, :])[0]
     return np.asarray(plant.equations.state_of(outputs, outputs).full())
 
 
-def _of_nominal_run(problem: Problem, count: int) -> tuple[np.ndarray, np.ndarray]:
-    states, inputs = problem.nominal_run
-    places = np.round(np.linspace(0.0, problem.duration, count) / problem.period).astype(int)
-    places = np.minimum(places, states.shape[1] - 1)
-    return states[:, places], inputs[:, places]
-
-
 def reference_inputs(problem: Problem, count: int) -> np.ndarray:
-    """Return the model's inputs beside these states, shape (nu, count), by its inverse or its nominal run.
+    """Return the model's inputs beside these states, shape (nu, count), by its inverse.
 
     Those before the run stand for a model with more or fewer inputs than controlled coordinates.
     """
     plant, times = problem.plant, np.linspace(0.0, problem.duration, count)
-    if plant.equations.hidden:
-        return _of_nominal_run(problem, count)[1]
     if len(plant.controlled_names) != len(plant.inputs):
         return np.repeat(problem.inputs_before[:, None], count, axis=1)
     states, repeated = reference_states(problem, count), np.repeat(plant.approximate[:, None], count, axis=1)
@@ -121,7 +113,8 @@ def _largest_response(problem: Problem) -> tuple[float, ...]:
     if not np.isfinite(upper - lower).all():
         return (float("inf"),) * len(problem.plant.controlled_names)
     states, middle = _states(problem), (lower + upper) / 2
-    corners = [middle] + [_with(middle, k, v) for k in range(middle.size) for v in (lower[k], upper[k])]
+    inputs = np.arange(middle.size)
+    corners = [middle, *(np.where(inputs == k, end[k], middle) for k in inputs for end in (lower, upper))]
     at_middle, *at_limits = (_responses(problem, states, corner) for corner in corners)
     with np.errstate(all="ignore"):
         reach = [
@@ -143,12 +136,6 @@ def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.nda
     count = states.shape[1]
     repeated = [np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate)]
     return np.asarray(task.plant.equations.controlled_response.map(count)(states, *repeated).full())
-
-
-def _with(command: np.ndarray, k: int, value: float) -> np.ndarray:
-    other = command.copy()
-    other[k] = value
-    return other
 
 
 _INSTANTS = 2000

@@ -94,8 +94,8 @@ def nominal_run(
     start: tuple[float, ...],
     bounds: Bounds,
     times: tuple[float, int],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return states (nx, m) and inputs (nu, m) of the model that follows the reference of its outputs for 20 000 cycles."""
+) -> np.ndarray:
+    """Return states (nx, m) of the model that follows the reference of its outputs for 20 000 cycles."""
     period, cycles = times[0], min(times[1], _CYCLES)
     x, u, p = plant.symbols()
     advance, w = integrator.step(plant, period), np.zeros(len(plant.names))
@@ -103,7 +103,7 @@ def nominal_run(
     step = ca.Function("fpirhc_advance", [xm, um, pm], [advance(xm, um, pm, w)])
     rate = min(_DECAYS / (period * times[1]), _FASTEST / period)
     ends = np.array(bounds[0]), np.array(bounds[1])
-    return nominal_motion(plant, reference, step, np.array(start), ends, period * np.arange(cycles), rate)
+    return nominal_motion(plant, reference, step, np.array(start), ends, period * np.arange(cycles), rate)[0]
 
 
 _STEPS = 4

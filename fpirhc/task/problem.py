@@ -263,8 +263,8 @@ class Problem(Checked):
         return (*(e for signal in first for e in signal.elements), *names)
 
     @cached_property
-    def nominal_run(self) -> tuple[np.ndarray, np.ndarray]:
-        """States (nx, m) and inputs (nu, m) of the model that follows the reference of its outputs, by cycles."""
+    def nominal_run(self) -> np.ndarray:
+        """States (nx, m) of the model that follows the reference of its outputs, by cycles."""
         lower, upper = self.limits.input_bounds(self.plant)
         bounds, start = (tuple(map(float, lower)), tuple(map(float, upper))), tuple(map(float, self.start_state))
         return nominal_run(self.plant, self.reference, self.integrator, start, bounds, (self.period, self.cycles))
