@@ -75,7 +75,7 @@ def _header(device: Device) -> str:
         "COMMANDS": command.size,
         "MEMORY": memory.size,
         "TRACE": trace.size,
-        "STATUSES": len(Status),
+        "STATUSES": max(Status) + 1,
     }
     own = [f"  {name}_{part} {part};" for part in ("memory", *data_of(device), "trace")]
     lines = [
