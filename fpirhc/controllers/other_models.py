@@ -99,7 +99,7 @@ class Estimating(ControllerWrapper):
         notes, model, names = super().notes(problem), self.inner_problem(problem).plant, self.estimator.learned()
         (x, u, p), equations, places = model.symbols(), model.equations, map(model.parameter.elements.index, names)
         moved = ca.vertcat(equations.rate(x, u, p), equations.controlled_response(x, u, p))
-        reached = ca.DM(ca.jacobian_sparsity(moved, p), 1)[:, [*places]].nnz()
+        reached = ca.DM(ca.jacobian_sparsity(moved, p))[:, [*places]].nnz()
         shifts = self.planner is not None and (not self.planner.restarts or self.planner.starts_consistent(model))
         if reached or shifts or self.controller.inner is not None or not all(equations.output_orders.values()):
             return notes
