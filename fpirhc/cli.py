@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib.util import find_spec
+from os.path import isdir
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -58,12 +59,12 @@ def compare(
     from fpirhc.studies.open_loop import first_plans
 
     named = list(select(task, controllers)) if controllers else None
-    folder = opt.folder_of(out, task.name, *["part"] * bool((controllers or set_) and not plans))
     if plans:
         with progress_bars() as progress:
             progress("first plans", 0, 1)
             solved = first_plans(task, named)
-        return _show_plans(task, solved, folder)
+        return _show_plans(task, solved)
+    folder = opt.folder_of(out, task.name, *["part"] * bool(controllers or set_))
     with progress_bars() as progress:
         result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
     announce_backend(entry.run for entry in result.entries)
@@ -73,13 +74,11 @@ def compare(
     raise typer.Exit(130 if interrupted else 0 if finished else 1 if result.entries else 2)
 
 
-def _show_plans(task: Any, solved: Any, folder: Path) -> None:
-    from fpirhc.report.html import plan_figure, save_figure
+def _show_plans(task: Any, solved: Any) -> None:
     from fpirhc.report.terminal import show_plans
     from fpirhc.status import Status
 
-    save_figure(plan_figure(task.problem, solved), folder / "plan.png")
-    show_plans(task.name, solved, folder / "plan.png")
+    show_plans(task.name, solved)
     raise typer.Exit(0 if all(one.plan.status == Status.OK for one in solved) else 4)
 
 
@@ -130,7 +129,7 @@ def run(
     from dataclasses import replace
 
     from fpirhc.problem_files.problem_file import in_case
-    from fpirhc.studies.compare import harm_of_adaptation, select
+    from fpirhc.studies.compare import select
 
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], opt.folder_of(out, task.name)
@@ -153,9 +152,9 @@ def run(
     found.save(files[0])
     save_figure(found.plot(), files[1])
     announce_backend([found])
-    harm, since = harm_of_adaptation(task.problem, controller, chosen), task.problem.measure_from
-    say(task.title, "bold", f" {controller}: errors from t = {since:g} {task.problem.time_unit} on, seed {seed}.")
-    show_run(found, measure(task.problem, found, task.metrics), harm, files)
+    since = f"{task.problem.measure_from:g} {task.problem.time_unit}"
+    say(task.title, "bold", f" {controller}: errors from t = {since} on, seed {seed}.")
+    show_run(found, measure(task.problem, found, task.metrics), files)
     raise typer.Exit(0 if found.stop is None else 4)
 
 
@@ -269,10 +268,9 @@ def tune(
 ) -> None:  # fmt: skip
     """Search better settings, at equal cost for every controller. The problem file says what is searched: tuning = {...}."""
     task = _task(problem)
-    from fpirhc.report.terminal import progress_bars, show_sentences
+    from fpirhc.report.terminal import progress_bars
     from fpirhc.studies.tune import tune as ask
     from fpirhc.studies.variants import CasesOf, Draws
-    from fpirhc.studies.verdict import Outcome
 
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
@@ -281,15 +279,13 @@ def tune(
     facts: dict[str, Any] = {"trials": trials, "seed": seed, "controllers": controllers, "metric": metric}
     with progress_bars() as progress:
         found = ask(task, variants=variants, folder=opt.folder_of(out, task.name, "tuning"), progress=progress, **facts)
-    for sentences in found.harm.values():
-        show_sentences((one, Outcome.WORSE) for one in sentences)
     table = found.table
     print(table.to_json(orient="records") if json else f"{table.to_string(index=False)}\n\n{found.python()}")
 
 
 @command(
     "check                        every problem of ./problems, or of this folder",
-    "check my_arm.py two_mass     these problems",
+    "check my_arm.py work/arms    these problems, and those of a folder",
     "check --ignore-below 0.1%    another machine or library, whose last digits differ",
 )
 def check(
@@ -308,10 +304,11 @@ def check(
 
     facts: dict[str, Any] = {"baselines": baselines, "processes": processes, "compiled": not no_compile}
     found, broken = list[Judgement](), list[str]()
+    every = [one for name in problems or ["."] for one in (problems_here(Path(name)) if isdir(name) else [name])]
     with progress_bars() as progress:
-        for name in problems or map(str, problems_here(Path())):
+        for name in every:
             try:
-                found.append(judge(_task(name), ignore=ignore_below / 100, progress=progress, **facts))
+                found.append(judge(_task(str(name)), ignore=ignore_below / 100, progress=progress, **facts))
             except FpirhcError as error:
                 broken.append(str(error))
     for one in found:

@@ -19,11 +19,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.errors import FpirhcError, OutputError
-from fpirhc.simulation.drawing import BANDS, PALETTE, draw_legend, literal, new_figure, responses_of, shown_motion
+from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import player
 from fpirhc.studies import finite_alone
 from fpirhc.studies.verdict import IN_FULL, Outcome
@@ -36,9 +35,7 @@ if TYPE_CHECKING:
 
     from fpirhc.simulation.picture import Drawing
     from fpirhc.studies import View
-    from fpirhc.studies.compare import Comparison, Contraction, Entry
-    from fpirhc.studies.open_loop import Solved
-    from fpirhc.task.problem import Problem
+    from fpirhc.studies.compare import Comparison, Contraction
 
 
 @dataclass(frozen=True)
@@ -246,7 +243,6 @@ def _round(values: Sequence[float] | np.ndarray) -> list[float]:
     return [float(f"{v:.5g}") for v in np.asarray(values).tolist()]
 
 
-_CYCLES = 150  # of the decay of a response error
 _BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
 _GOLDEN = 0.618034  # of a turn, from hue to hue
 
@@ -263,34 +259,6 @@ def save_figure(figure: Figure, path: Path) -> None:
         raise OutputError(f"cannot write the figure to '{path}': {error.strerror}") from None
 
 
-def plan_figure(problem: Problem, solved: Sequence[Solved]) -> Figure:
-    """Return the figure of states with their reference and inputs of open-loop plans, one line per optimiser."""
-    assert problem.horizon is not None
-    plant, plan = problem.plant, solved[0].plan
-    names = [*plant.state.elements, *plant.input.elements]
-    figure = new_figure(9, 2.0 * len(names) + 1, f"plans of {plan.problem.stages} stages")
-    axes = np.atleast_1d(figure.subplots(len(names), 1, sharex=True))
-    times = np.arange(plan.problem.stages + 1) * plan.problem.step
-    reference = plan.data[plan.problem.data.slice("reference")]
-    unknown = np.full((plant.state.size, times.size), np.nan)
-    known = plant.equations.state_of(ca.DM(reference), ca.DM(unknown)).full()
-    for k, (axis, name) in enumerate(zip(axes, names, strict=True)):
-        is_state = k < plant.state.size
-        if is_state and np.isfinite(known[k]).any():
-            axis.plot(times, known[k], "--", color="#777777", label="reference")
-        for row, (one, colour) in enumerate(zip(solved, PALETTE, strict=False)):
-            width = max(1.0, 3.0 - 0.7 * row)  # plans that agree lie on each other
-            if is_state:
-                axis.plot(times, one.plan.states[k], color=colour, label=literal(one.name), linewidth=width)
-            else:
-                axis.stairs(one.plan.inputs[k - plant.state.size], times, baseline=None, color=colour, linewidth=width)
-        unit = plant.state.units[k] if is_state else plant.input.units[k - plant.state.size]
-        axis.set_ylabel(literal(f"{name} [{unit}]"))
-    draw_legend(axes[0])
-    axes[-1].set_xlabel(literal(f"time [{problem.time_unit}]"))
-    return figure
-
-
 def colours_of(comparison: Comparison) -> dict[str, str]:
     """Return the colour of every controller that ran, by name: that of its place in the problem file, whichever others ran."""
     more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(comparison.places)))
@@ -300,7 +268,7 @@ def colours_of(comparison: Comparison) -> dict[str, str]:
 
 
 def contraction_charts(comparison: Comparison) -> list[dict[str, Any]]:
-    """Return a chart for every gain by its own name and scale, and one of the response errors; none where nothing contracts."""
+    """Return a chart of the factor for every gain by its own name and scale."""
     entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
     groups: dict[tuple[str, float], list[tuple[str, Contraction]]] = {}
     for entry in entries:
@@ -308,8 +276,7 @@ def contraction_charts(comparison: Comparison) -> list[dict[str, Any]]:
             name, scale = entry.contraction.report.own  # where no gain converges: of the effective gain
             own = (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
             groups.setdefault(own, []).append((entry.name, entry.contraction))
-    charts = [_chart_of_factor(name, scale, same) for (name, scale), same in groups.items()]
-    return [*charts, _chart_of_errors(entries)] if entries else []
+    return [_chart_of_factor(name, scale, same) for (name, scale), same in groups.items()]
 
 
 def _chart_of_factor(gain: str, scale: float, entries: Sequence[tuple[str, Contraction]]) -> dict[str, Any]:
@@ -319,25 +286,6 @@ def _chart_of_factor(gain: str, scale: float, entries: Sequence[tuple[str, Contr
     bound = np.abs(1 - gains[:, None] / scale * spectrum.eigenvalues.ravel()).max(axis=1)
     lines = [("bound", bound), ("limit", np.ones(gains.size))]
     lines += [(n, np.where(gains == scale * one.report.effective_gain, one.measured, np.nan)) for n, one in entries]
-    return _across("contraction factor of the iteration alone", "1", gain, gains, lines)
-
-
-def _chart_of_errors(entries: Sequence[Entry]) -> dict[str, Any]:
-    units = {e.run.unit(f"desired.{n}") for e in entries for n in e.run.layout["desired"].elements}
-    lines, cycles = list[tuple[str, np.ndarray]](), min(_CYCLES, max(e.run.cycles for e in entries) - 1)
-    for entry in entries:
-        apart = (entry.run[responses_of(entry.run.layout)["realised"]][1:] - entry.run["desired"][:-1])[:cycles]
-        if len(units) > 1:  # of different units: shares of their own ranges
-            apart = apart / np.maximum(np.ptp(entry.run["desired"], axis=0), 1e-300)
-        size = np.hypot.reduce(apart, axis=1)  # a square of what diverges may be too large for a number
-        lines.append((entry.name, np.append(np.where(size > 0, size, np.nan), np.full(cycles - len(size), np.nan))))
-    unit = units.pop() if len(units) == 1 else "of the ranges of desired"
-    return {**_across("|realised - desired|", unit, "control cycle", np.arange(1, cycles + 1), lines), "log": True}
-
-
-def _across(
-    title: str, unit: str, label: str, values: np.ndarray, lines: Sequence[tuple[str, np.ndarray]]
-) -> dict[str, Any]:
-    """A chart over another axis than time."""
     series = [{"name": name, "values": finite_alone(_round(line))} for name, line in lines]
-    return {"title": title, "unit": unit, "series": series, "across": {"label": label, "values": _round(values)}}
+    across = {"label": gain, "values": _round(gains)}
+    return {"title": "contraction factor of the iteration alone", "unit": "1", "series": series, "across": across}

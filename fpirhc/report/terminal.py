@@ -60,13 +60,13 @@ _EDGES = 2  # columns left and right of a table
 
 def say(text: str, style: str = "", more: str = "", *, wrap: bool = True) -> None:
     """Print text in which nothing is markup, and more without the style; `wrap`: lines go on below the text of a list."""
-    console, whole = Console(), Text.assemble((printable(text), style), printable(more))
+    first = re.sub(r"^(- |  \w* *(-> )?)?.*", r"\1", text, flags=re.DOTALL)
+    console, whole = Console(), Text.assemble((printable(text[len(first) :]), style), printable(more))
     whole.plain = _IN_NUMBER.sub(_HELD, whole.plain)
-    below = len(re.sub(r"^(- |  \w* *(-> )?)?.*", r"\1", text, flags=re.DOTALL))
-    for k, line in enumerate(whole.wrap(console, console.width - below) if wrap else [whole]):
+    for k, line in enumerate(whole.wrap(console, console.width - len(first)) if wrap else [whole]):
         line.plain = line.plain.replace(_HELD, " ").rstrip()
-        line.pad_left(below * (k > 0))
-        console.print(line, highlight=False, soft_wrap=True)
+        before = " " * len(first) if k else first
+        console.print(Text(before, style) + line, highlight=False, soft_wrap=True)
 
 
 def show(view: View, report: Path, *, verbose: bool = False) -> None:
@@ -221,9 +221,8 @@ def announce_backend(runs: Iterable[Run]) -> None:
         print(f"fpirhc: loops ran in CasADi's virtual machine, more slowly, because {why}", file=sys.stderr)
 
 
-def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Path]) -> None:
-    """Print what speaks against its adaptation, one run's metrics and the paths of its files."""
-    show_sentences((sentence, Outcome.WORSE) for sentence in harm)
+def show_run(run: Run, metrics: Metrics, saved: Sequence[Path]) -> None:
+    """Print one run's metrics and the paths of its files."""
     for column in columns([metrics]):
         say(f"{column.heading}: {column.text(column.number(metrics), missing='-', none='none')}")
     if run.stop:
@@ -233,7 +232,7 @@ def show_run(run: Run, metrics: Metrics, harm: Sequence[str], saved: Sequence[Pa
     say(f"saved: {', '.join(map(str, saved))}", wrap=False)
 
 
-def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
+def show_plans(task: str, solved: Sequence[Solved]) -> None:
     """Print the plans of open-loop solves."""
     caption = "K: contraction factor; du <: bound of the error of every input; dV <: of the cost above the optimum"
     heads = ("optimiser", "cost", "residual", "iter", "K", "du <", "dV <", "status")
@@ -250,7 +249,6 @@ def show_plans(task: str, solved: Sequence[Solved], picture: Path) -> None:
             say(f"{one.name}: {one.plan.overflow()}")
         if one.plan.status != Status.OK:
             say(f"{one.name}: {one.plan.status.remedy}")
-    say(f"picture: {picture}", wrap=False)
 
 
 def _plan_row(solved: Solved) -> list[str]:

@@ -17,8 +17,9 @@ from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
 from fpirhc.plant.chain import zero_dynamics
+from fpirhc.plant.motion import with_space
 from fpirhc.review.experiments import BUSY, GOOD, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, with_gain
-from fpirhc.simulation.ranges import TOLERANCE, hard_limits
+from fpirhc.simulation.ranges import TOLERANCE, Followed, hard_limits
 from fpirhc.simulation.trials import ModelAsPlant
 from fpirhc.status import Status
 from fpirhc.summary import written_out
@@ -27,9 +28,11 @@ from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.symbolic.expression import TINY
 from fpirhc.task.problem import Problem
 
+INSTANTS = 2000  # of the reference
 MINOR, ROUNDING = 1e-3, 1e-6  # added error as a share of the largest, and of the task
 NEAR, FAR, BAD = 0.2, 0.5, 1.0  # errors as shares of the task: it follows, it does not, and adaptation shows nothing
 MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loop; push that latency leaves; of a limit
+TIMID = 10.0  # times the error at a gain that is as calm
 CALM, CHATTER, RINGING = 0.1, 0.01, 0.9  # step of a command a cycle: mean, rms from noise; what a swing leaves
 SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
 GROWS = "a push leaves {largest_factor:5} of itself a cycle later"
@@ -84,6 +87,26 @@ def _posed(case: Case) -> Fact | None:
     return (
         Fact(Verdict.YES if finite.all() else bad, {"share_finite": finite.mean()}, root=True) if len(finite) else None
     )
+
+
+def misplaced(problem: Problem) -> list[str]:
+    """Return which states start, or have a reference, outside their hard limits, in words."""
+    plant, times, found = problem.plant, np.linspace(0.0, problem.duration, INSTANTS), list[str]()
+    along = problem.reference.function(plant).map(INSTANTS)(times[None, :])[0].full()
+    for at, (name, place) in enumerate(zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)):
+        low, high = problem.limits.states.get(name, (-np.inf, np.inf))
+        unit, wanted = with_space(plant.state.units[at]), along[place] if place >= 0 else np.zeros(0)
+        for what, values in ("start", problem.start_state[[at]]), ("reference", wanted[np.isfinite(wanted)]):
+            beyond = Followed(name, unit, low, high, values).beyond
+            if name not in problem.limits.prices and beyond.max(initial=0.0) > TOLERANCE:
+                worst = f"{values[beyond.argmax()]:.4g}{unit}"
+                found.append(f"the {what} of {name} is {worst}, outside its hard limits of {low:g} and {high:g}{unit}")
+    return found
+
+
+def _inside(case: Case) -> Fact | None:
+    found, verdict = misplaced(case.problem), Verdict.NO
+    return Fact(verdict, {"outside": len(found)}, "; ".join(found), root=True) if found else None
 
 
 def _ranges(case: Case) -> Fact | None:
@@ -285,11 +308,17 @@ def apart(problem: Problem) -> dict[str, float]:
     return {n: ratio for n, ratio in ratios.items() if ratio and not 0.1 < abs(ratio) < 10}
 
 
+def slips(problem: Problem) -> str:
+    """The same in words."""
+    return ", ".join(f"{name} is {written_out(ratio)} times the plant's" for name, ratio in apart(problem).items())
+
+
 def recommended_gain(case: Case) -> Fact:
     """What a run shows of the gain, and another one to take, with which its own review says yes."""
     fact, controller, good = gain_by_run(case)._replace(root=True), case.bench.controller, None
     times, seen = fact.numbers.get("recommended_times", 1.0), [1.0]
-    if fact.verdict == Verdict.YES or times == 1.0:
+    rungs, right = ladder(case).rungs, fact.verdict == Verdict.YES
+    if times == 1.0 or (right and not (times > 1 and rungs[1.0].error > max(SLIGHT, TIMID * rungs[times].error))):
         return fact
     while times and times not in seen:
         other, shared = with_gain(controller, times), (case.draws, case.outside, case.known)
@@ -298,13 +327,13 @@ def recommended_gain(case: Case) -> Fact:
         seen, times = [*seen, times], times * then.numbers.get("recommended_times", 0.0)
     numbers = {name: v for name, v in fact.numbers.items() if not name.startswith("recommended")}
     if not good:
-        return fact._replace(numbers=numbers, ways="model gain")
+        return fact if right else fact._replace(numbers=numbers, ways="model gain")
     (times, rung), worst = good, list(case.problem.plant.inputs).index(fact.of)
     numbers |= {"recommended_times": times, "recommended_gain": times * own_gain(controller.deformation)[1]}
     numbers |= {"error_recommended": rung.error, "movement_recommended": rung.moves[worst]}
     change = set_gain(controller, times) + price(numbers["error"], rung.error) * ladder(case).rungs[1.0].admitted
     ways = "model gain" * bool(apart(case.problem) and fact.verdict == Verdict.NO)
-    return fact._replace(numbers=numbers, change=change, ways=ways)
+    return fact._replace(verdict=Verdict.CAUTION if right else fact.verdict, numbers=numbers, change=change, ways=ways)
 
 
 def price(before: float, after: float) -> str:
@@ -390,6 +419,8 @@ def _pays(case: Case) -> Fact:
 
 
 QUESTIONS = (
+    Question("inside", "Do start and reference keep the hard limits of states?", _inside, "{of}", "Move them inside, or widen the "
+             "limits.", of="problem"),
     Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns, "{jumps} of {of}",
              "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its error.", of="problem"),
     Question("posed", "Has the reference finite commands?", _posed, "by the model in {share_finite:%} of the cycles",
@@ -404,12 +435,12 @@ QUESTIONS = (
              "period of {period} {time}", "", "gain rate weight window Predicted limits speed"),
     Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}| {error_without:%} without "
              "adaptation| {error_recommended:%} at {recommended_gain:4}", "No gain that was run helps, is calm, and has reserve.",
-             "filter form Predicted window sensors without", "adaptive"),
+             "filter form lag Predicted window sensors without", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
-             "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain without rate weight window Predicted "
-             "limits speed"),
+             "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain lag without rate weight window "
+             "Predicted rival limits speed"),
     Question("returns", "Does it come back from a push?", _returns, "{left:%} of the push is left after {pushed}", "",
-             "model gain rate weight window Predicted form without limits"),
+             "model gain lag rate weight window Predicted form without limits"),
     Question("horizon", "Is the horizon long enough?", _horizon, "the relative error is {error:%}| "
              "{error_with_twice_the_horizon:%} with twice the stages", "Give the horizon {recommended_stages:.0f} stages."),
     Question("box", "Does it come back for every plant in the range of the parameters?", _box, "{share_that_come_back:%} of "
@@ -431,5 +462,5 @@ QUESTIONS = (
              "{error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides, where it may cure more.",
              "form window gain without", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "the rms error of {of} is {error_without:u} "
-             "without adaptation| {error_with:u} with it", "", "gain form window Predicted sensors without", "adaptive"),
+             "without adaptation| {error_with:u} with it", "", "gain form lag window Predicted sensors without", "adaptive"),
 )  # fmt: skip

@@ -21,7 +21,7 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
-from fpirhc.review.experiments import Bench
+from fpirhc.review.questions import misplaced, slips
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
@@ -31,12 +31,11 @@ from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
-from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, harm, shortened, weighed
+from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, follows, objective
-from fpirhc.summary import Column, Table, in_percent, written_out
+from fpirhc.summary import Column, Table, written_out
 from fpirhc.symbolic.evaluate import attempted
-from fpirhc.symbolic.expression import TINY
 from fpirhc.symbolic.native import compile_all
 from fpirhc.task.problem import Problem
 
@@ -59,7 +58,8 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            owners.setdefault(f"{error}{best and f'. {best}'}", []).append(f"'{name}'")
+            more = " ".join(filter(None, (_slip(task.problem), best)))
+            owners.setdefault(f"{error}{more and f'. {more}'}", []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
     for why, names in owners.items():
@@ -104,7 +104,7 @@ class Entry:
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
     cycle: tuple[float, ...] | None = None  # mean time of a cycle, that of 99 %, and the longest, us
     left: tuple[Followed, ...] = ()  # hard limits that it leaves, the worst first
-    noise: Finding | None = None  # what noise of its response costs, where that has none
+    noise: str = ""  # that its response has none, and how to see what it costs
     notes: tuple[str, ...] = ()
 
     @property
@@ -232,11 +232,22 @@ def compare(
         rivals=frozenset(e.name for e in entries if not e.exact and (aim.metric or follows(e, yard))),
         entries=tuple(entries),
         skipped=skipped,
-        findings=findings(entries, task.headline, yard, skipped, aim),
+        findings=findings(entries, task.headline, yard, skipped, aim, _causes(problem, entries, yard)),
         pictures=task.pictures,
         time_unit=problem.time_unit,
         steps=problem.real_plant.step is not None,
     )
+
+
+def _causes(problem: Problem, entries: Sequence[Entry], yard: Yardstick) -> list[str]:
+    """What the file itself says of loops that do not follow, or leave a limit."""
+    placed = [f"{text[0].upper()}{text[1:]}." for text in misplaced(problem)]
+    lost = any(not e.adaptive and not follows(e, yard) for e in entries)
+    return [*placed, *filter(None, [_slip(problem) * lost])]
+
+
+def _slip(problem: Problem) -> str:
+    return f"In the model {slip}: is it a slip of units?" if (slip := slips(problem)) else ""
 
 
 class _Rows:
@@ -272,7 +283,7 @@ class _Rows:
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
         cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-        noise = part("the run with noise", cost_of_noise, problem, ready, run) if name == self._asked else None
+        noise = _without_noise(problem, ready, name) if name == self._asked else ""
         left = limits_left(problem, run)
         told = [one.sentence for one in left]
         notes = (*told, *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
@@ -301,26 +312,16 @@ def _has_exact_model(problem: Problem, controller: Controller) -> bool:
     return bool(wrong and fixed and model.plant is real and np.array_equal(model.parameters(model.plant), real.exact))
 
 
-NOISE = 1e-3  # rms of white noise, of the range of every response in the run
-
-
-def cost_of_noise(problem: Problem, controller: Controller, run: Run) -> Finding | None:
-    """Return what white noise of the response costs in as many cycles as a review runs; None where it has some."""
-    names, sensing = {*response_names(problem.plant)}, problem.sensing
-    right = names <= {*sensing.measures(problem.plant)} - {n for n, sensor in sensing.sensors.items() if sensor.acts}
-    if not (right and problem.moves.simulated) or controller.deforms in ("target", "turns") or run.stop is not None:
-        return None
-    bench = Bench(problem, controller, short=True, seed=run.seed)
-    quiet = run.first(bench.cycles)
-    noise = np.random.default_rng(run.seed).standard_normal(quiet["realised"].shape) * np.ptp(quiet["realised"], axis=0)
-    other = bench.run(bias=NOISE * noise)
-    before, after = bench.errors(quiet), bench.errors(other)
-    moves = float((bench.moves(other) / np.maximum(bench.moves(quiet), TINY)).max())
-    ratios = {n: after[n] / max(e, TINY) for n, e in before.items()}
-    name = max(ratios, key=ratios.__getitem__)
-    text = f"{run.controller} measures its response without noise. White noise of {in_percent(NOISE)} of its range (rms) would "
-    text += f"multiply the rms error of {name} by {written_out(ratios[name])} and the total variation of the command "
-    return Finding(f"{text}by {written_out(moves)}.", ratios=ratios)
+def _without_noise(problem: Problem, controller: Controller, name: str) -> str:
+    """A sentence where the response of a controller that adapts it is measured as no sensor does."""
+    shown = {*problem.sensing.measures(problem.plant)} - {n for n, one in problem.sensing.sensors.items() if one.acts}
+    if (
+        not problem.moves.simulated
+        or controller.deforms in ("target", "turns")
+        or not {*response_names(problem.plant)} <= shown
+    ):
+        return ""
+    return f"{name} measures its response without noise; what noise costs: fpirhc study --limits noise."
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
@@ -345,11 +346,3 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
     return float(taken.mean()) / 1e3, *(np.percentile(taken, (99, 100)) / 1e3).tolist()
-
-
-def harm_of_adaptation(problem: Problem, name: str, controller: Controller) -> tuple[str, ...]:
-    """Return what runs of a thousand cycles on the plant and on the model show against the adaptation, and the span that counts."""
-    short = shortened(problem, 1000)
-    against = harm(short, controller, short.cycles)
-    span = f"t = {short.measure_from:.4g} to {short.duration:.4g}{with_space(problem.time_unit)}"
-    return (f"{name}, {span}: {against}.",) if against else ()

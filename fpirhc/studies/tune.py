@@ -17,9 +17,9 @@ from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting, with_settings
+from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting
 from fpirhc.studies import Progress
-from fpirhc.studies.compare import check_gains, harm_of_adaptation, select
+from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import Runner
 from fpirhc.studies.variants import Draws, Variant, Variants
 from fpirhc.studies.verdict import Objective, objective
@@ -36,12 +36,10 @@ class Tuning:
     Args:
         problem: its name.
         table: a row per setting: controller, setting, before, best, cost_before, cost, trials.
-        harm: what speaks against the adaptation with the best settings, by controller.
     """
 
     problem: str
     table: pd.DataFrame
-    harm: Mapping[str, tuple[str, ...]]
 
     def settings(self) -> dict[str, dict[str, float]]:
         """Return the best settings by controller and path."""
@@ -99,7 +97,7 @@ def tune(
     check_gains(task, chosen)
     aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
     variants = variants or Draws(1, seed=seed)
-    every, rows, harm = list(variants.of(task)), [], {}
+    every, rows = list(variants.of(task)), list[dict[str, Any]]()
     metrics = [m for m in task.metrics if m.name == "rms_error" or m is aim.metric]
     folder.mkdir(parents=True, exist_ok=True)
     storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "trials.log")))
@@ -122,12 +120,10 @@ def tune(
         found = search.numbers(best.params) if best.value < before else now
         facts = {"cost_before": before, "cost": min(before, best.value), "trials": len(done)}
         rows += [{"controller": name, "setting": p, "before": now[p], "best": v, **facts} for p, v in found.items()]
-        tuned = with_settings(controller, found)
-        harm[name] = harm_of_adaptation(task.problem, name, tuned)
     table = pd.DataFrame(rows)
     for column in ("before", "best"):  # a whole number stays one beside others: a setting takes no 2.0 for it
         table[column] = pd.Series([row[column] for row in rows], dtype=object)
-    return Tuning(task.name, table, harm)
+    return Tuning(task.name, table)
 
 
 def _finished(study: Any) -> list[Any]:

@@ -367,8 +367,9 @@ def findings(
     yard: Yardstick,
     skipped: Mapping[str, str],
     aim: Objective,
+    causes: Sequence[str],
 ) -> tuple[Finding, ...]:
-    """Return the verdict: the headline pair first, then the others, the best row, and what was not run."""
+    """Return the verdict: the headline pair first, then the others, what the file says, the best row, and what was not run."""
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     pairs.sort(key=lambda p: ((p[0].name, p[1].name) != headline, "solve" not in p[1].run.layout))
@@ -378,7 +379,8 @@ def findings(
         judged = [Finding("No controller is here both with and without adaptation.", Outcome.NOT_COMPARABLE)]
     told = {n for f in judged if f is judged[0] or f.outcome is Outcome.LIMIT_LEFT for n in f.pair or ()}
     judged += [Finding(leaves(e), Outcome.LIMIT_LEFT) for e in entries if e.left and e.name not in told]
-    judged += [e.noise for e in entries if e.noise is not None]
+    judged += map(Finding, causes)
+    judged += [Finding(e.noise) for e in entries if e.noise]
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 

@@ -136,8 +136,9 @@ def test_problems_of_a_folder_and_the_folders_inside_it(tmp_path, monkeypatch, c
     for name, text in texts.items():
         (tmp_path / "problems" / name).write_text(text)
     monkeypatch.chdir(tmp_path)
-    assert main(["check"]) == 6
-    assert re.findall(r"(\w+): there is no baseline", capsys.readouterr().out) == ["one", "two"]
+    for words, named in (([], ["one", "two"]), (["problems/gallery"], ["two"])):
+        assert main(["check", *words]) == 6
+        assert re.findall(r"(\w+): there is no baseline", capsys.readouterr().out) == named
 
 
 TEST = """

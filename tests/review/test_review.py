@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import tasks
 from helpers.line import line_text
 from helpers.reviewed import PERIOD, answers, biased, heavy, mass, plans, torque
 
@@ -15,7 +16,7 @@ from fpirhc.__main__ import main
 
 LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
 NAMES = {  # of numbers by key, which scripts read
-    "turns": {"jumps"}, "posed": {"share_finite"},
+    "inside": {"outside"}, "turns": {"jumps"}, "posed": {"share_finite"},
     "ranges": {"without", "measured"}, "plans": {"not_converged", "error", "error_with_more_iterations"},
     "gain": {"error", "error_recommended", "error_at_half", "error_at_twice", "error_at_four_times", "error_turned",
              "recommended_times", "recommended_gain", "best_gain", "error_at_best", "error_without", "movement",
@@ -40,6 +41,19 @@ def test_a_limit_that_is_left_has_the_numbers_of_the_run():
     worst, most = int(speed.argmax()), speed.max() - 1
     wanted = {"excess": most, "beyond": most / 2, "time_of_it": worst * PERIOD, "share_of_cycles": np.mean(speed > 1)}
     assert answers(fast)["limits"].numbers == pytest.approx(wanted, rel=5e-3)
+
+
+def test_a_start_and_a_reference_outside_hard_limits_are_named_first_and_as_the_cause():
+    """By what they are and the limits; what has a price, and what keeps its limits, is not named."""
+    ends = fp.Limits(states={"q": (0.1, 0.4), "q'": (-2.0, 2.0)})
+    first, *others = answers(mass(limits=ends)).values()
+    ends_of = "outside its hard limits of 0.1 and 0.4 m"
+    assert first.evidence == f"The start of q is 0 m, {ends_of}; the reference of q is -0.5 m, {ends_of}."
+    assert first.change in {a.change for a in others if a.key == "limits"}
+    verdict = fp.compare(tasks.made(mass(limits=ends), {"it": torque()}), seed=0, compiled=False).verdict
+    assert f"The reference of q is -0.5 m, {ends_of}." in verdict
+    for kept in (replace(ends, prices={"q": 1.0}), fp.Limits(states={"q": (-0.5, 0.5)})):
+        assert "inside" not in answers(mass(limits=kept))
 
 
 def test_the_plants_of_the_box_are_drawn_by_its_mismatch():

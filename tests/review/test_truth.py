@@ -136,6 +136,9 @@ CASES: dict[str, Case] = {
         {("RHC+FPI", "pays"): "no"},
         changes={("RHC+FPI", "pays"): "Mend the sensors: without their noise and bias it passes."},
     ),
+    "a bias with which the loop runs away, and which without adaptation does nothing": Case(
+        lambda: (biased(100.0), plans()), changes={("RHC+FPI", "gain"): "Leave the deformation out."}
+    ),
     "upper tanks that move by themselves": Case(
         foreign("quadruple_tank", "RHC", "CTC+FPI"),
         {("CTC+FPI", "inner"): "yes"},

@@ -7,7 +7,6 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import tasks
 from helpers.plants import linear
 
 import fpirhc as fp
@@ -66,13 +65,3 @@ def test_as_an_error_it_stops_the_build():
         warnings.simplefilter("error", fp.HarmfulAdaptation)
         with pytest.raises(fp.HarmfulAdaptation, match="adaptation does harm"):
             fp.Stepper(PROBLEM, GENTLE, compiled=False)
-
-
-def test_a_search_says_what_speaks_against_its_best_number(tmp_path):
-    """Of the controller that adapts, and of runs of the whole task where it has less than a thousand cycles."""
-    laws = {"law": GENTLE.with_deformation(fp.Identity()), "law+FPI": GENTLE}
-    spans = {"law": {"tracking.rate": fp.Span(6.0, 6.1)}, "law+FPI": {"deformation.gain": fp.LogSpan(-0.05, -0.04)}}
-    harm = fp.tune(tasks.made(PROBLEM, laws, tuning=spans), trials=1, compiled=False, folder=tmp_path).harm
-    assert harm["law"] == ()
-    [said] = harm["law+FPI"]
-    assert said.startswith("law+FPI, t = 1 to 4 s: on the plant the rms error of y is")

@@ -16,7 +16,6 @@ const AXIS_OF_VALUES = {
   values: (_, splits) => (splits.length > 1 ? tickTexts(splits) : splits.map((v) => String(+v.toPrecision(6)))),
   size: (_, texts) => Math.max(62, 16 + 7.5 * Math.max(0, ...(texts ?? []).map((text) => (text ?? "").length))),
 };
-const AXIS_OF_POWERS = { values: (_, splits) => splits.map((v) => (/^1e/.test(v && v.toExponential()) ? v.toExponential().replace("+", "") : "")), size: 62 };
 
 // The range of values of a chart: where a run that ended early is shown whole, what it reached at last does not hide the rest.
 const TALL = 20; // largest size that is shown, over the usual one

@@ -92,8 +92,8 @@ function draw({ box, spec }) {
     width: box.clientWidth,
     height: HEIGHT,
     series,
-    scales: { x: { time: false }, y: spec.log ? { distr: 3 } : { range: rangeOfValues(() => ended(spec)) } },
-    axes: [{ ...axis, ...labelled, ...(spec.across ? { values: AXIS_OF_VALUES.values } : {}), label: across.label }, { ...axis, ...(spec.log ? AXIS_OF_POWERS : AXIS_OF_VALUES) }],
+    scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec)) } },
+    axes: [{ ...axis, ...labelled, ...(spec.across ? { values: AXIS_OF_VALUES.values } : {}), label: across.label }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: spec.across ? {} : { sync: { key: sync.key } },
     legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
     hooks: spec.across ? {} : { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
