@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import fpirhc as fp
-from fpirhc.contraction.spectrum import Spectrum, assess_gain, jacobians_along
+from fpirhc.contraction.spectrum import assess_gain, jacobians_along
 
 task = fp.load_problem("two_mass")
 tracking = fp.Exponential(rate=6.0)
@@ -42,7 +42,7 @@ states, exact = run["state"][rows], np.tile(plant.exact, (len(run["state"][rows]
 jacobians = jacobians_along(
     task.problem, states, states, run["deformed"][rows], plant.approximate, exact
 )
-spectrum = Spectrum(np.linalg.eigvals(jacobians))
+spectrum = np.linalg.eigvals(jacobians)
 report = assess_gain(fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0), spectrum)
 print(textwrap.fill(f"{report.text}. It converges for {report.converging}.", 85))
 

@@ -6,7 +6,7 @@ J is that of the equations, of a cycle of a reality differentiated through its i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import TypeAlias
 
 import casadi as ca
@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
-from fpirhc.errors import InvalidValue, NotContractive
+from fpirhc.errors import NotContractive
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
@@ -23,48 +23,6 @@ from fpirhc.task.problem import Problem
 Array: TypeAlias = np.ndarray
 
 _NO_SIGN = 1e-9  # real parts below this share of the largest eigenvalue have no sign
-
-
-@dataclass(frozen=True, eq=False)
-class Spectrum:
-    """Eigenvalues of the response Jacobian.
-
-    Args:
-        eigenvalues: one row per sample, shape (samples, n), complex; rows that are not finite are left out.
-
-    Raises:
-        InvalidValue: no row is finite.
-    """
-
-    eigenvalues: Array
-
-    def __post_init__(self) -> None:
-        rows = np.atleast_2d(np.asarray(self.eigenvalues, dtype=complex))
-        finite = rows[np.isfinite(rows).all(axis=1)]
-        if finite.size == 0:
-            raise InvalidValue(
-                "no finite eigenvalue of the response Jacobian: the inverse response is singular at every sample; "
-                "check that the inputs act on the controlled coordinates there"
-            )
-        values = np.array(finite)
-        values.setflags(write=False)
-        object.__setattr__(self, "eigenvalues", values)
-
-    @cached_property
-    def smallest_real(self) -> float:
-        """Smallest real part."""
-        return float(self.eigenvalues.real.min())
-
-    @cached_property
-    def largest_real(self) -> float:
-        """Largest real part."""
-        return float(self.eigenvalues.real.max())
-
-    @cached_property
-    def one_sign(self) -> bool:
-        """Whether all real parts have the same sign and none is zero."""
-        small = _NO_SIGN * float(np.abs(self.eigenvalues).max())
-        return self.smallest_real > small or self.largest_real < -small
 
 
 def jacobians_along(
@@ -171,12 +129,21 @@ def linear_limit(eigenvalues: Array) -> tuple[float, float]:
     """Return the open interval of effective gains with |1 - a lambda| < 1 for every eigenvalue.
 
     One end is 0, the other is min 2 Re(lambda) / |lambda|^2, with a minus sign where all real parts are negative.
+
+    Raises:
+        NotContractive: eigenvalues with real parts of both signs, or zero.
     """
-    spectrum = Spectrum(eigenvalues)
-    _require_one_sign(spectrum)
-    flat = spectrum.eigenvalues.ravel()
+    flat = np.asarray(eigenvalues, dtype=complex).ravel()
+    least, most, small = flat.real.min(), flat.real.max(), _NO_SIGN * np.abs(flat).max()
+    if not (least > small or most < -small):
+        raise NotContractive(
+            "the input gains of the plant, over those of the model, have both signs or are zero (from "
+            f"{least:.4g} to {most:.4g}), so no gain makes the iteration converge: "
+            "it enlarges the error in some direction. Check that each input acts on its own coordinate and that the "
+            "approximate parameters give the effect of every input its true sign"
+        )
     outer = float((2 * np.abs(flat.real) / np.abs(flat) ** 2).min())
-    return (0.0, outer) if spectrum.smallest_real > 0 else (-outer, 0.0)
+    return (0.0, outer) if least > 0 else (-outer, 0.0)
 
 
 def sector_limit(deformation: Deformation, eigenvalues: Array) -> tuple[float, float]:
@@ -194,17 +161,6 @@ def sector_limit(deformation: Deformation, eigenvalues: Array) -> tuple[float, f
     right = deformation.with_effective_gain(0.5 * (lower + upper))  # the secant depends on the gain's sign
     steeper = right.secant_gain() / right.effective_gain()
     return lower / steeper, upper / steeper
-
-
-def _require_one_sign(spectrum: Spectrum) -> None:
-    """Check that some gain converges."""
-    if not spectrum.one_sign:
-        raise NotContractive(
-            "the input gains of the plant, over those of the model, have both signs or are zero (from "
-            f"{spectrum.smallest_real:.4g} to {spectrum.largest_real:.4g}), so no gain makes the iteration converge: "
-            "it enlarges the error in some direction. Check that each input acts on its own coordinate and that the "
-            "approximate parameters give the effect of every input its true sign"
-        )
 
 
 @dataclass(frozen=True)
@@ -226,7 +182,7 @@ class ContractionReport:
 
 
 def assess_gain(
-    deformation: Deformation, spectrum: Spectrum, late: float = 0.0, largest: float = np.inf
+    deformation: Deformation, eigenvalues: Array, late: float = 0.0, largest: float = np.inf
 ) -> ContractionReport:
     """Return whether a deformation converges on plants with these eigenvalues, with the fault and what would do instead.
 
@@ -234,11 +190,11 @@ def assess_gain(
     without this delay, and the text says so; the limits end at the `largest` gain behind it, where that is finite.
     """
     gain, (name, value) = deformation.effective_gain(), own_gain(deformation)
-    predicted = predicted_factor(spectrum.eigenvalues, gain)
+    predicted = predicted_factor(eigenvalues, gain)
     try:
         if gain == 0:
             raise NotContractive(f"{deformation} does not iterate, so nothing contracts", "use Sigmoid(gain=...)")
-        linear, sector = linear_limit(spectrum.eigenvalues), sector_limit(deformation, spectrum.eigenvalues)
+        linear, sector = linear_limit(eigenvalues), sector_limit(deformation, eigenvalues)
     except NotContractive as error:
         none = (0.0, 0.0)
         return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error))
@@ -281,10 +237,6 @@ def identified_factor(
         weights: W of the deformation, by rows; None: the one matrix.
     """
     requests, responses = np.asarray(deformed, dtype=float), np.asarray(realised, dtype=float)
-    if requests.shape != responses.shape or requests.ndim != 2:
-        raise InvalidValue(
-            f"deformed has shape {requests.shape} but realised {responses.shape}; expected the same, (cycles, n)"
-        )
     request_steps, response_steps = np.diff(requests, axis=0)[:-1], np.diff(responses, axis=0)[1:]
     finite = np.isfinite(request_steps).all(axis=1) & np.isfinite(response_steps).all(axis=1)
     request_steps, response_steps = request_steps[finite], response_steps[finite]

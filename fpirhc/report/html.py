@@ -283,7 +283,7 @@ def _chart_of_factor(gain: str, scale: float, entries: Sequence[tuple[str, Contr
     own, spectrum = [one.report.effective_gain for _, one in entries], entries[0][1].spectrum
     limit = max((end for _, one in entries for end in one.report.linear_limit), key=abs) or 1.0
     gains = np.unique(scale * np.append(np.linspace(0, _BEYOND * limit, INTERVALS), own))
-    bound = np.abs(1 - gains[:, None] / scale * spectrum.eigenvalues.ravel()).max(axis=1)
+    bound = np.abs(1 - gains[:, None] / scale * spectrum.ravel()).max(axis=1)
     lines = [("bound", bound), ("limit", np.ones(gains.size))]
     lines += [(n, np.where(gains == scale * one.report.effective_gain, one.measured, np.nan)) for n, one in entries]
     series = [{"name": name, "values": finite_alone(_round(line))} for name, line in lines]

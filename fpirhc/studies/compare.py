@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fpirhc.contraction.delayed import largest_behind_estimator
-from fpirhc.contraction.spectrum import ContractionReport, Spectrum, assess_gain
+from fpirhc.contraction.spectrum import ContractionReport, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
@@ -74,7 +74,7 @@ class Contraction:
     growing: float  # share of the cycles in which small errors grow
     measured: float
     report: ContractionReport
-    spectrum: Spectrum
+    spectrum: np.ndarray
 
     def said(self, run: Run, lost: Collection[str]) -> str:
         """What it leaves of an error, which gains converge, and the rms distance of every response from what was desired."""

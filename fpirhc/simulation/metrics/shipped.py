@@ -15,7 +15,7 @@ from typing import cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.spectrum import Spectrum, identified_factor, jacobians_along, predicted_factor
+from fpirhc.contraction.spectrum import identified_factor, jacobians_along, predicted_factor
 from fpirhc.horizon.nominal import stage_data
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.plant.motion import derivative_unit
@@ -182,7 +182,7 @@ def _weights(run: Run) -> np.ndarray | None:
     return None if rows is None else np.array(rows)
 
 
-def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
+def sampled_spectrum(problem: Problem, run: Run) -> np.ndarray:
     """Return the eigenvalues of the weighted response Jacobian at sampled cycles of a run, with its controller's parameters.
 
     The cycles are those from `measure_from` on, without the first of the run, before which there is no request.
@@ -199,12 +199,12 @@ def sampled_spectrum(problem: Problem, run: Run) -> Spectrum:
     exact = rows_of(real_values(task.real_plant, task.signals), times, task.real_plant.exact)
     jacobians = jacobians_along(modelled, real, states, deformed, known, exact)
     finite, weights = jacobians[np.isfinite(jacobians).all(axis=(1, 2))], _weights(run)
-    return Spectrum(np.linalg.eigvals(finite if weights is None else finite @ weights))
+    return np.linalg.eigvals(finite if weights is None else finite @ weights)
 
 
 def _eigenvalues(problem: Problem, run: Run) -> np.ndarray | None:
     """Those of sampled cycles; None where its factors do not follow from equations."""
-    eigenvalues = sampled_spectrum(problem, run).eigenvalues if _adapts(run) and problem.moves.simulated else None
+    eigenvalues = sampled_spectrum(problem, run) if _adapts(run) and problem.moves.simulated else None
     return eigenvalues if eigenvalues is not None and len(eigenvalues) else None
 
 
