@@ -182,12 +182,32 @@ class Linearisation:
     step: float  # length of the stage, in the problem's unit of time
 
 
-class Terminal(Checked, ABC):
-    """Contract: a quadratic terminal cost that is computed from the problem."""
+@dataclass(frozen=True)
+class LQRTerminal(Checked):
+    """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
 
-    @abstractmethod
+    Near the reference a short horizon then acts like an infinite one.
+    """
+
     def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
-        """Return the symmetric weight P of (x - x^N)' P (x - x^N), shape (nx, nx)."""
+        """Return P.
+
+        Raises:
+            InvalidProblem: no input is weighed, or its rate is, or the linearised model cannot be stabilised.
+        """
+        from scipy.linalg import solve_discrete_are  # only here: the import takes long
+
+        h = linearisation.step
+        q = np.diag([h * cost.states.get(e, 0.0) for e in plant.state.elements])
+        r = np.diag([h * (cost.effort.get(i, 0.0) + cost.deviation.get(i, 0.0)) for i in plant.input.elements])
+        if np.any(np.diag(r) <= 0) or cost.rate:
+            raise InvalidProblem(
+                "LQRTerminal needs a positive effort or deviation weight for every input, and none of a rate"
+            )
+        try:
+            return np.asarray(solve_discrete_are(linearisation.a, linearisation.b, q, r))
+        except ValueError as error:  # LinAlgError is one
+            raise InvalidProblem(f"LQRTerminal: the linearised model has no stabilising solution ({error})") from None
 
 
 class Cost(Checked, ABC):
@@ -241,7 +261,7 @@ class Quadratic(Cost):
     effort: Weights = field(default_factory=dict)
     deviation: Weights = field(default_factory=dict)
     rate: Weights = field(default_factory=dict)
-    terminal: Weights | Terminal | None = None
+    terminal: Weights | LQRTerminal | None = None
     outputs: Weights = field(default_factory=dict, kw_only=True)
 
     @property
@@ -276,9 +296,9 @@ class Quadratic(Cost):
                 f"states: the states of a plant with outputs have no reference; weigh {', '.join(plant.output.elements)}, "
                 "Quadratic(outputs=...), or write a CustomCost"
             )
-        if isinstance(self.terminal, Terminal) and not plant.equations.follows_state:
+        if isinstance(self.terminal, LQRTerminal) and not plant.equations.follows_state:
             mistakes.add(
-                f"terminal: {type(self.terminal).__name__} weighs the whole state, which has no reference on a plant with outputs; "
+                "terminal: LQRTerminal weighs the whole state, which has no reference on a plant with outputs; "
                 "give weights by the name of an output"
             )
         for what, (weights, valid) in groups.items():
@@ -320,34 +340,6 @@ class Quadratic(Cost):
         error = view.state.vector[: plant.state.size] - view.reference.vector
         weight = ca.SX(ca.DM(np.asarray(self.terminal.weight(self, plant, linearise()))))
         return ca.bilin(weight, error, error)
-
-
-@dataclass(frozen=True)
-class LQRTerminal(Terminal):
-    """The infinite-horizon weight: P of the discrete algebraic Riccati equation, from the linearised model.
-
-    Near the reference a short horizon then acts like an infinite one.
-    """
-
-    def weight(self, cost: Quadratic, plant: Plant, linearisation: Linearisation) -> np.ndarray:
-        """Return P.
-
-        Raises:
-            InvalidProblem: no input is weighed, or its rate is, or the linearised model cannot be stabilised.
-        """
-        from scipy.linalg import solve_discrete_are  # only here: the import takes long
-
-        h = linearisation.step
-        q = np.diag([h * cost.states.get(e, 0.0) for e in plant.state.elements])
-        r = np.diag([h * (cost.effort.get(i, 0.0) + cost.deviation.get(i, 0.0)) for i in plant.input.elements])
-        if np.any(np.diag(r) <= 0) or cost.rate:
-            raise InvalidProblem(
-                "LQRTerminal needs a positive effort or deviation weight for every input, and none of a rate"
-            )
-        try:
-            return np.asarray(solve_discrete_are(linearisation.a, linearisation.b, q, r))
-        except ValueError as error:  # LinAlgError is one
-            raise InvalidProblem(f"LQRTerminal: the linearised model has no stabilising solution ({error})") from None
 
 
 @dataclass(frozen=True, eq=False)
