@@ -12,7 +12,7 @@ from fpirhc.errors import FpirhcError, InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.symbolic.dotted import changed_at, content_at, mapped, names_in
-from fpirhc.task.cases import PARAMETERS, START, Cases, check_change
+from fpirhc.task.cases import WORDS, Cases, check_change, settable
 from fpirhc.task.problem import Problem
 
 Owner = TypeVar("Owner", Controller, Problem)
@@ -40,7 +40,7 @@ def with_settings(owner: Owner, values: Mapping[str, float]) -> Owner:
 
 def of_problem(path: str) -> bool:
     """Whether a path begins with a word of a case, see `Cases`."""
-    return path.partition(".")[0] in {*PARAMETERS, START, *(f.name for f in fields(Problem))}
+    return path.partition(".")[0] in {*WORDS, *(f.name for f in fields(Problem))}
 
 
 def with_numbers(problem: Problem, values: Mapping[str, Any]) -> Problem:
@@ -63,12 +63,12 @@ def is_own(controller: Controller, path: str) -> bool:
 def unit_of_setting(path: str, problem: Problem) -> str:
     """Return the unit of a setting of a controller or of the problem, '' where its kind does not say it."""
     word, _, name = path.partition(".")
-    if word in PARAMETERS:
-        return (problem.moves if word == "exact" else problem.plant).parameters[name].unit
+    if word in WORDS:
+        return settable(problem, word)[name][2]
     if word in ("dead_time", "duration", "measure_from", "period"):
         return problem.time_unit
     name = name.removeprefix("inputs.").removeprefix("states.") if word == "limits" else name
-    signals = (problem.plant.state, problem.plant.input) if word in (START, "limits") else ()
+    signals = (problem.plant.state, problem.plant.input) if word == "limits" else ()
     units = {n: u for one in signals for n, u in zip(one.elements, one.entry_units, strict=True)}
     return units.get(name) or units.get(name.rpartition(".")[0], "")  # 'Q1.1' is an end of Q1
 
@@ -76,11 +76,8 @@ def unit_of_setting(path: str, problem: Problem) -> str:
 def number_of_case(problem: Problem, path: str) -> float | None:
     """Return the number that a problem has at a path of a case; None where there is none, or no number."""
     word, _, name = path.partition(".")
-    if word in PARAMETERS:
-        one = (problem.moves if word == "exact" else problem.plant).parameters.get(name)
-        return None if one is None else float(one.exact if word == "exact" else one.approximate)
-    if word == START:
-        return dict(zip(problem.plant.state.elements, map(float, problem.start_state), strict=True)).get(name)
+    if word in WORDS:
+        return settable(problem, word).get(name, (None,))[0]
     try:
         return current_setting(problem, path)
     except FpirhcError:

@@ -227,7 +227,7 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
         return Block(
             "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
         )
-    function, reads = problem.motion(), Layout((plant.time, motion, *problem.own_signals))
+    function, reads = problem.reference.motion_now(plant), Layout((plant.time, motion, *problem.own_signals))
 
     def step(s: Signals) -> dict[str, Expression]:
         along = function(s.time, *(getattr(s, one.name) for one in problem.own_signals))[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from fpirhc.task.problem import Problem
 
 EVERY = "all"  # names every case
 _GROUP = "group"  # what a case has beside its changes
-_EXACT, _APPROXIMATE, START = "exact", "approximate", "start"
-PARAMETERS = {_EXACT: "what moves", _APPROXIMATE: "what the controllers know"}
-_WORDS = (*PARAMETERS, START)
+_EXACT, _APPROXIMATE, _START = "exact", "approximate", "start"
+WORDS = {_EXACT: "parameter of what moves", _APPROXIMATE: "parameter of what the controllers know", _START: "state"}
 _OWN = ("plant", "start", "name")  # fields of a problem that no path begins with: they have words of their own
 
 
@@ -133,9 +132,9 @@ class Cases(Checked):
 def _changed(problem: Problem, changes: Mapping[str, object]) -> Problem:
     """The problem with all changes but those of exact parameters."""
     for path, value in changes.items():
-        if path.partition(".")[0] not in (*_WORDS, _GROUP):
+        if path.partition(".")[0] not in (*WORDS, _GROUP):
             problem = changed_at(problem, path, as_declared(problem, path, value))
-    model, start = _named(changes, _APPROXIMATE), _named(changes, START)
+    model, start = _named(changes, _APPROXIMATE), _named(changes, _START)
     if model:
         parameters = {
             name: replace(one, approximate=float(model[name])) if name in model else one
@@ -177,41 +176,36 @@ def _form(name: str, changes: Mapping[str, object]) -> Iterator[str]:
 def check_change(problem: Problem, changes: Mapping[str, object], path: str) -> None:
     """Raise where one change does not fit."""
     word, _, name = path.partition(".")
-    if word in _WORDS:
-        what, settable = _settable(problem, changes, word)
-        if name not in settable:
-            raise InvalidName(f"'{word}.NAME' has a {what}, and there is no '{name}'.{nearest(name, settable)}")
-        _check_number(changes[path], *settable[name])
+    if word in WORDS:
+        # A case with a reality of its own means the parameters of that one.
+        there = settable(changed_at(problem, "reality", changes["reality"]) if "reality" in changes else problem, word)
+        if name not in there:
+            raise InvalidName(f"'{word}.NAME' has a {WORDS[word]}, and there is no '{name}'.{nearest(name, there)}")
+        _check_number(changes[path], *there[name][1:])
     else:
         paths = [f.name for f in fields(problem) if f.name not in _OWN]
         if word not in paths:
-            meant = (
-                _meant(problem, word) or _meant(problem, path.rpartition(".")[2]) or nearest(word, [*_WORDS, *paths])
-            )
+            meant = _meant(problem, word) or _meant(problem, path.rpartition(".")[2]) or nearest(word, [*WORDS, *paths])
             raise InvalidName(f"the problem has no '{path}'.{meant}")
         if isinstance(content_at(problem, path, "the problem"), int | float):
             _check_number(changes[path])
 
 
-def _settable(problem: Problem, changes: Mapping[str, object], word: str) -> tuple[str, dict[str, tuple[Any, str]]]:
-    """What stands behind a word, and range and unit of each by name."""
-    if word == START:
-        return "state", {name: (problem.plant.ranges.get(name), "") for name in problem.plant.state.elements}
-    # A case with a reality of its own means the parameters of that one.
-    moves = changed_at(problem, "reality", changes["reality"]).moves if "reality" in changes else problem.moves
-    stated = (moves if word == _EXACT else problem.plant).parameters
-    within = {name: (one.bounds, one.unit) for name, one in stated.items() if not one.outside}
-    return f"parameter of {PARAMETERS[word]}", within
+def settable(problem: Problem, word: str) -> dict[str, tuple[float, tuple[float, float] | None, str]]:
+    """Return number, range and unit of everything that is named behind a word, by name."""
+    if word == _START:
+        state, ranges = problem.plant.state, problem.plant.ranges
+        facts = zip(state.elements, problem.start_state.tolist(), state.entry_units, strict=True)
+        return {name: (first, ranges.get(name), unit) for name, first, unit in facts}
+    stated = (problem.moves if word == _EXACT else problem.plant).parameters
+    return {name: (float(getattr(one, word)), one.bounds, one.unit) for name, one in stated.items() if not one.outside}
 
 
-def _meant(problem: Problem, path: str) -> str:
+def _meant(problem: Problem, name: str) -> str:
     """What to write for the name of a parameter, a state or an input alone."""
-    if path in problem.plant.parameters or path in problem.moves.parameters:
-        words = ", ".join(f"'{word}.{path}' is {what}" for word, what in PARAMETERS.items())
-        return f" It is a parameter: {words}."
-    if path in problem.plant.state.elements:
-        return f" It is a state: '{START}.{path}' is its first value."
-    return f" It is an input: 'limits.inputs.{path}' are its limits." if path in problem.plant.inputs else ""
+    paths = [f"'{word}.{name}' ({what})" for word, what in WORDS.items() if name in settable(problem, word)]
+    paths += [f"'limits.inputs.{name}' (its limits)"] * (name in problem.plant.inputs)
+    return f" Write {' or '.join(paths)}." if paths else ""
 
 
 def _check_number(value: object, bounds: tuple[float, float] | None = None, unit: str = "") -> None:

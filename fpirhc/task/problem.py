@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
-import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked import Checked
@@ -241,10 +240,6 @@ class Problem(Checked):
     def own_signals(self) -> tuple[Signal, ...]:
         """The reference's own signals, which its block writes."""
         return self.reference.own(self.plant)
-
-    def motion(self, ahead: float = 0.0) -> ca.Function:
-        """Function (t, own signals) -> (outputs, response) of the reference, now or after some time."""
-        return self.reference.motion_now(self.plant, ahead)
 
     @property
     def sample(self) -> tuple[Signal, ...]:
