@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     import pandas as pd
 
+HELD = re.compile(r"(?<=\d) (?=\S{1,12}(?:\s|$))")  # a space in a number, or before its unit: no line ends there
 _LEAST_SHARE = 1e-5
 _ROUNDING = 1e-9  # share of its scale, below which an error has no meaning
 _LONGEST = 1e6  # from which a number is written with a power of ten

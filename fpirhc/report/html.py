@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import re
 import textwrap
 from collections import Counter
 from collections.abc import Sequence
@@ -26,6 +25,7 @@ from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure, responses_of, 
 from fpirhc.simulation.pictures import player
 from fpirhc.studies import finite_alone
 from fpirhc.studies.verdict import IN_FULL, Outcome
+from fpirhc.summary import HELD
 from fpirhc.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -82,7 +82,10 @@ def render(comparison: Comparison) -> str:
 
 def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, Any]]]:
     """Return the pictures that the problem file lists, and those that move; one of whose controllers none ran is left out."""
+    from matplotlib import rc_context, rcsetup
+
     runs, images, motions = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}, [], []
+    colours = colours_of(comparison)
     for wanted in comparison.pictures:
         shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
         if not shown:
@@ -91,9 +94,10 @@ def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, An
             if motion := dict(wanted.motion(shown)):
                 motions.append(motion)
                 continue
-            wanted.draw(figure := new_figure(*wanted.size(len(shown))), runs=shown)
-            caption = f"{wanted.title}. {wanted.caption}".strip()
-            images.append(Image(figure.address, f"{wanted.title}: {', '.join(shown)}", caption))
+            with rc_context({"axes.prop_cycle": rcsetup.cycler(color=[colours[name] for name in shown])}):
+                wanted.draw(figure := new_figure(*wanted.size(len(shown))), runs=shown)
+                caption = f"{wanted.title}. {wanted.caption}".strip()
+                images.append(Image(figure.address, f"{wanted.title}: {', '.join(shown)}", caption))
         except FpirhcError as error:
             images.append(Image("", "", f"{wanted.title} is not drawn: {error}"))
     return images, motions
@@ -147,15 +151,11 @@ def _environment() -> Environment:
     return environment
 
 
-# With its unit, or the word behind it; none inside an escaped character, &#39;.
-_NUMBER = re.compile(r"(?<![\w.#])[-+]?\d[\d.]*(?:e[-+]?\d+)?(?: \d{3})*(?: (?:[^\s,;.()&]|&[#\w]+;){1,12})?")
-
-
 def whole_numbers(text: str) -> Markup:
     """Return a sentence as HTML whose lines do not end inside a number, or between a number and its unit."""
     from markupsafe import Markup, escape
 
-    return Markup(_NUMBER.sub(r"<span class='number'>\g<0></span>", str(escape(text)).replace("-&gt;", "→")))
+    return Markup(str(escape(HELD.sub("\N{NO-BREAK SPACE}", text))).replace("-&gt;", "→"))
 
 
 def css_class(outcome: Outcome | None) -> str:

@@ -28,7 +28,7 @@ from fpirhc.simulation.metrics import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
 from fpirhc.studies.verdict import IN_FULL, Outcome
-from fpirhc.summary import Column, Table, number, printable, written_out
+from fpirhc.summary import HELD, Column, Table, number, printable, written_out
 
 if TYPE_CHECKING:
     from fpirhc.probing.probe import Probe
@@ -49,8 +49,7 @@ STYLES = {
     Outcome.LIMIT_LEFT: "bold red",
     None: "",  # a remark
 }
-# before thousands or a unit, where no line breaks, and what stands there until lines are broken
-_IN_NUMBER, _HELD = re.compile(r"(?<=\d) (?=\S{1,12}(?:\s|$))"), "\ue000"
+_GLUE = "\ue000"  # in place of a space that is held
 _NAMED = 24  # characters of a name that stand on one line where there is little room
 _BETWEEN = 2  # between two columns: a space of each and the box between them
 _DRAWN = 0.1  # s from one picture of a bar to the next
@@ -62,9 +61,9 @@ def say(text: str, style: str = "", more: str = "", *, wrap: bool = True) -> Non
     """Print text in which nothing is markup, and more without the style; `wrap`: lines go on below the text of a list."""
     first = re.sub(r"^(- |  \w* *(-> )?)?.*", r"\1", text, flags=re.DOTALL)
     console, whole = Console(), Text.assemble((printable(text[len(first) :]), style), printable(more))
-    whole.plain = _IN_NUMBER.sub(_HELD, whole.plain)
+    whole.plain = HELD.sub(_GLUE, whole.plain)
     for k, line in enumerate(whole.wrap(console, console.width - len(first)) if wrap else [whole]):
-        line.plain = line.plain.replace(_HELD, " ").rstrip()
+        line.plain = line.plain.replace(_GLUE, " ").rstrip()
         before = " " * len(first) if k else first
         console.print(Text(before, style) + line, highlight=False, soft_wrap=True)
 

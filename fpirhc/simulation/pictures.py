@@ -159,9 +159,9 @@ class Portrait(Picture):
             InvalidName: a run does not have a signal.
         """
         panels = figure.subplots(1, len(runs), sharex=True, sharey=True, squeeze=False)[0]
-        for axis, (name, run) in zip(np.atleast_1d(panels), runs.items(), strict=True):
+        for k, (axis, (name, run)) in enumerate(zip(np.atleast_1d(panels), runs.items(), strict=True)):
             late = run.time >= self.since
-            axis.plot(numbers(run, self.x)[late], numbers(run, self.y)[late], lw=0.8)
+            axis.plot(numbers(run, self.x)[late], numbers(run, self.y)[late], lw=0.8, color=f"C{k}")
             axis.set_title(name, fontsize=10)
             drawing.caption_axes(axis, label(run, self.x), label(run, self.y))
 

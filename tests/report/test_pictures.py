@@ -1,5 +1,8 @@
 """Pictures that a problem wants: what they draw is what the runs hold, and a mistake in one spoils neither file nor report."""
 
+import base64
+import io
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -7,7 +10,9 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers.line import line_text
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 import fpirhc as fp
 from fpirhc.contracts import Layout, Signal, scalar
@@ -101,6 +106,16 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path):
     assert "bad is not drawn" in own
     fp.write_report(replace(comparison, pictures=()), page)
     assert "Pictures of this problem" not in page.read_text(encoding="utf-8")
+
+
+def test_a_picture_of_a_report_has_the_colours_of_its_charts(tmp_path):
+    """The second controller of the file is orange, also alone, and nothing is the blue of the first one."""
+    (tmp_path / "line.py").write_text(FILE % "fp.Portrait('t', x='state.y', y='error.y', controllers=('CTC+FPI',))")
+    fp.write_report(fp.compare(fp.load_problem(tmp_path / "line.py"), seed=0, compiled=False), tmp_path / "report.html")
+    [png] = re.findall(r"data:image/png;base64,([^']*)'", (tmp_path / "report.html").read_text(encoding="utf-8"))
+    pixels = imread(io.BytesIO(base64.b64decode(png)))[..., :3]
+    near = [np.abs(pixels - np.array(to_rgb(colour))).max(axis=-1).min() for colour in ("#d55e00", "#0072b2")]
+    assert (near[0] < 0.15, near[1] > 0.3) == (True, True)
 
 
 def cart(q, p):

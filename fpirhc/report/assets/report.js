@@ -10,7 +10,7 @@ const LINES = {
   nominal: ["#009e73", 1.6, [2, 4]],
   reference: [null, 1.2, [5, 4]],
   "set-point": [null, 1.2, [1, 3]],
-  limit: ["#d55e00", 1.2, [5, 4]],
+  limit: [null, 1.2, [5, 4]],
 };
 const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
 // The palette's black is the page's ink, which is light where the page is dark.
