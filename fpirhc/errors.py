@@ -120,10 +120,14 @@ class OutputError(FpirhcError, OSError):
     """A file or folder that cannot be written or read."""
 
 
-def not_writable(folder: object, error: OSError, option: str) -> OutputError:
-    """The error of a folder for results that cannot be written, with the option that chooses another one."""
-    why = "it is a file" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
-    return OutputError(f"cannot write to the folder '{folder}': {why}; choose another with {option}")
+@contextmanager
+def writing(place: object, option: str) -> Iterator[None]:
+    """Raise OutputError where a folder or file for results cannot be written, with the option that chooses another one."""
+    try:
+        yield
+    except OSError as error:
+        why = "it is a file" if isinstance(error, FileExistsError | NotADirectoryError) else error.strerror
+        raise OutputError(f"cannot write to the folder '{place}': {why}; choose another with {option}") from None
 
 
 class CompileError(FpirhcError, RuntimeError):

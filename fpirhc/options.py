@@ -125,15 +125,13 @@ def numbers(settings: Sequence[str]) -> dict[str, Any]:
 
 def folder_of(out: Path | None, *default: str) -> Path:
     """The folder for results, made before anything runs, so that a wrong path fails at once."""
-    from fpirhc.errors import not_writable
+    from fpirhc.errors import writing
     from fpirhc.whole_file import missing_folders
 
     folder = out or Path("results", *default)
-    try:
+    with writing(folder, "--out"):
         MADE.extend(missing_folders(folder))
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ".fpirhc-probe").touch()
         (folder / ".fpirhc-probe").unlink()
-    except OSError as error:
-        raise not_writable(folder, error, "--out") from None
     return folder

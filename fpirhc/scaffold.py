@@ -8,7 +8,7 @@ import sys
 from importlib.machinery import PathFinder
 from pathlib import Path
 
-from fpirhc.errors import InvalidName, OutputError, not_writable
+from fpirhc.errors import InvalidName, OutputError, writing
 from fpirhc.problem_files.shipped import shipped_problems
 
 _LONGEST = 60  # characters of a name
@@ -22,12 +22,10 @@ def create_problem(name: str, folder: Path) -> tuple[Path, Path]:
     for path in texts:
         if path.exists() or path.is_symlink():
             raise OutputError(f"'{path}' exists already and is kept; choose another name or --dir")
-    try:
+    with writing(folder, "--dir"):
         folder.mkdir(parents=True, exist_ok=True)
         for path, text in texts.items():
             path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise not_writable(folder, error, "--dir") from None
     return problem, test
 
 

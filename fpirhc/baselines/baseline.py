@@ -18,7 +18,7 @@ from typing import Any
 
 import pandas as pd
 
-from fpirhc.errors import InvalidValue, not_writable
+from fpirhc.errors import InvalidValue, writing
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.shipped import missing
@@ -131,10 +131,8 @@ def accept(
         "controllers": controllers,
     }
     path = baseline_path(task.path, baselines)
-    try:
+    with writing(path.parent, "--baselines"):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise not_writable(path.parent, error, "--baselines") from None
     write_whole(written(facts), path, "baseline")
     return path
 

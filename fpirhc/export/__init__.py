@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import Controller
-from fpirhc.errors import CompileError, InvalidName, NotSupported, OutputError, not_writable, package
+from fpirhc.errors import CompileError, InvalidName, NotSupported, OutputError, package, writing
 from fpirhc.members import within
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.simulate import simulate
@@ -290,14 +290,12 @@ def device_of(
 
 def write(device: Device, target: Target, folder: Path) -> list[Path]:
     """Write the files of a target into a new or empty folder, and return their paths."""
-    try:
+    with writing(folder, "--out"):
         taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
         contents = {} if taken else target.files(device)
         for name, content in contents.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
-    except OSError as error:
-        raise not_writable(folder, error, "--out") from None
     if taken:
         raise OutputError(
             f"'{folder}' is not an empty folder, and nothing in it is replaced; choose another one with --out"

@@ -20,7 +20,7 @@ import pandas as pd
 
 from fpirhc.controllers.contract import resolved
 from fpirhc.describe import digest
-from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, not_writable
+from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, writing
 from fpirhc.problem_files.problem_file import Task, load_problem
 from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
 from fpirhc.simulation.metrics import Metric, measure
@@ -294,7 +294,7 @@ class Kept:
         if path is None:
             return
         first, lines = json.loads(json.dumps(header, default=str)), []
-        with self._writing():
+        with writing(self._path, "--out"):
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.exists():
                 lines = path.read_text(encoding="utf-8").split("\n")[:-1]  # a torn last line is run again
@@ -310,23 +310,16 @@ class Kept:
             raise OutputError(
                 f"'{path}' holds rows of another study ({said}); give another folder with --out, or remove the file"
             )
-        with self._writing():
+        with writing(self._path, "--out"):
             path.write_text("".join(f"{line}\n" for line in (json.dumps(head | first), *lines[1:])), encoding="utf-8")
             self._file = path.open("a", encoding="utf-8")
 
     def append(self, row: Row) -> None:
         """Add a row."""
         if self._file is not None:
-            with self._writing():
+            with writing(self._path, "--out"):
                 self._file.write(json.dumps(row) + "\n")
                 self._file.flush()
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise not_writable(self._path, error, "--out") from None
 
     def __enter__(self) -> Kept:
         return self
