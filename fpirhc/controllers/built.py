@@ -45,7 +45,6 @@ class Built:
     rates: tuple[list[float], list[float]]  # the same of their changes, where these limits are hard
     before: Signal  # the last command; in the first cycle the input before it
     state: Signal  # with its first values
-    output: Signal  # of the outputs, with theirs
     pairs: Pairs  # state and command of a measured response
     own: tuple[Signal, ...]  # the reference's own signals
     given: tuple[Signal, ...]  # what is given from outside for it
@@ -55,7 +54,6 @@ class Built:
     error: Signal  # of the judged outputs
     judged: tuple[int, ...]  # their places among the outputs
     warm_up: float  # number of the first cycle whose response may be used
-    sample: tuple[Signal, ...]  # what a step is given
     planned: Problem | None  # the problem as plans have it, with their cost and limits
     follows: bool = False  # whether what the model has learned corrects the inputs of a plan in every cycle
 
@@ -81,7 +79,7 @@ class Built:
         Where nothing is estimated it is `compose_controller`. A loop and a stepper of the same values have the same one.
         """
         (blocks, delays), (seeing, seen) = _blocks_of(self), seeing_blocks(self.problem)
-        reads, own = _reads(self, *self.sample), [*seeing, *_measuring(self, blocks), *blocks]
+        reads, own = _reads(self, *self.problem.sample), [*seeing, *_measuring(self, blocks), *blocks]
         return _informed(self, reads, own, [*delays, *seen])
 
     def own_values(self, s: Signals) -> list[Expression]:
@@ -125,7 +123,6 @@ def _made(problem: Problem, ready: Controller) -> Built:
         rates=tuple(one.tolist() for one in problem.limits.rate_bounds(plant)),
         before=replace(plant.input, name="_command_before", start=before),
         state=replace(plant.state, start=tuple(map(float, problem.start_state))),
-        output=replace(plant.output, start=tuple(map(float, problem.start_output))),
         pairs=Pairs(problem, problem.dead_time),
         own=own,
         given=problem.given_signals,
@@ -135,7 +132,6 @@ def _made(problem: Problem, ready: Controller) -> Built:
         error=vector("error", problem.judged_names, [units[name] for name in problem.judged_names]),
         judged=tuple(plant.output.elements.index(name) for name in problem.judged_names),
         warm_up=problem.warm_up_cycles,
-        sample=problem.sample,
         planned=planned,
     )
 

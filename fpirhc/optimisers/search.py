@@ -79,7 +79,6 @@ class Search:
     """Builds the expressions of the iteration."""
 
     def __init__(self, ocp: OptimalControl, hessian: HessianModel, map: Deformation, damping: float) -> None:
-        self._ocp = ocp
         self._expand, self._try = _expansion(ocp), _trial(ocp)
         self._judge = _judgement(ocp)
         self._direct = _direction(ocp, hessian, map, damping)
