@@ -177,7 +177,7 @@ def _near(name: str, names: Sequence[str]) -> list[str]:
             meant = [(of or one.rstrip("'")) + primes for one in names]
             elsewhere += [one for one, own in zip(names, meant, strict=True) if one == own or one.endswith(f".{own}")]
     same = [one for one in names if one.casefold() == name.casefold()]
-    inside = [one for one in names if len(name) > _LETTER and name.casefold() in one.casefold()]
+    inside = [one for one in names if name[1:] and name.casefold() in one.casefold()]  # a letter is a part of too many
     return [*elsewhere, *same, *get_close_matches(name, names, n=1, cutoff=0.5), *inside]
 
 
@@ -192,7 +192,6 @@ _DERIVATIVES = {  # how others write them
     "''": r"(.+?)_?ddot|(.+)_acc\w*|(?:dd_?|d2_?|acc\w*_)(.+)|acc\w*",
     "'": r"(.+?)_?dot|(.+)_(?:rate|vel\w*|speed)|(?:d_?|vel\w*_|speed_|rate_|v_)(.+)|vel\w*|speed|rate",
 }
-_LETTER = 1  # character, which is a part of too many names to mean one
 
 _OF_OTHER_TOOLS = """
 RecedingHorizon: MPC NMPC OptimalControlProblem AcadosOcp

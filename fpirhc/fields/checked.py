@@ -225,7 +225,7 @@ def replaced(value: Value, field: str, content: object) -> Value | None:
 
 
 class ByName(dict[str, Value]):
-    """A dictionary with names as keys that stays as it is; dictionaries in it are such ones too."""
+    """A dictionary with names as keys; dictionaries in it are such ones too."""
 
     def __init__(self, entries: Mapping[str, Value] | Iterable[tuple[str, Value]], where: str = "the mapping") -> None:
         """Copy the entries; `where` is the subject of the error: "Task.controllers"."""
@@ -233,7 +233,7 @@ class ByName(dict[str, Value]):
         self._where = where
         for name, value in self.items():
             if type(value) is dict:  # not a subclass, which may have an order or a default of its own
-                super().__setitem__(name, cast(Value, ByName(cast(Any, value), f"{where}[{name!r}]")))
+                super().__setitem__(name, cast(Value, type(self)(cast(Any, value), f"{where}[{name!r}]")))
 
     def __getitem__(self, name: str) -> Value:
         try:
@@ -245,7 +245,11 @@ class ByName(dict[str, Value]):
         raise InvalidName(f"{self._where} has no '{name}'.{nearest(name, self)}")
 
     def __reduce__(self) -> tuple[object, ...]:
-        return ByName, (dict(self), self._where)
+        return type(self), (dict(self), self._where)
+
+
+class Fixed(ByName[Value]):
+    """A dictionary in a field of a frozen value, from which more was computed: a change in place would have no effect."""
 
     def _stays(self, *_: object, **__: object) -> NoReturn:
         raise NotSupported(
@@ -269,4 +273,4 @@ def find_by_name(value: object) -> None:
     frozen = is_dataclass(value) and getattr(value, "__dataclass_params__").frozen  # noqa: B009
     for name, content in list(vars(value).items()) if frozen else ():
         if type(content) is dict and not name.startswith("_") and all(isinstance(key, str) for key in content):
-            object.__setattr__(value, name, ByName(content, f"{type(value).__name__}.{name}"))
+            object.__setattr__(value, name, Fixed(content, f"{type(value).__name__}.{name}"))

@@ -46,12 +46,9 @@ def described(value: object) -> str:
 def call_of(one: type | Callable[..., object]) -> str:
     """Return how a value of the class, or a call of the function, is written: "Sigmoid(gain=...)"."""
     signature = _signature(one)
-    needed = [
-        name
-        for name, p in (signature.parameters.items() if signature else ())
-        if p.default is p.empty and p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)
-    ]
-    return f"{one.__name__}({', '.join(f'{name}=...' for name in needed)})"
+    needed = [p for p in (signature.parameters.values() if signature else ()) if p.default is p.empty]
+    named = [f"{p.name}=..." for p in needed if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
+    return f"{one.__name__}({', '.join(named)})"
 
 
 def _signature(function: Callable[..., object]) -> inspect.Signature | None:
