@@ -112,8 +112,8 @@ def _largest_response(problem: Problem) -> tuple[float, ...]:
     lower, upper = problem.limits.input_bounds(problem.plant)
     if not np.isfinite(upper - lower).all():
         return (float("inf"),) * len(problem.plant.controlled_names)
-    states, middle = _states(problem), (lower + upper) / 2
-    inputs = np.arange(middle.size)
+    states = np.hstack([reference_states(problem, _SAMPLES), np.asarray(problem.start_state)[:, None]])
+    middle, inputs = (lower + upper) / 2, np.arange(lower.size)
     corners = [middle, *(np.where(inputs == k, end[k], middle) for k in inputs for end in (lower, upper))]
     at_middle, *at_limits = (_responses(problem, states, corner) for corner in corners)
     with np.errstate(all="ignore"):
@@ -124,12 +124,6 @@ def _largest_response(problem: Problem) -> tuple[float, ...]:
         sizes = abs(at_middle) + sum(reach)
     finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
     return tuple(float(v) if v > 0 else float("inf") for v in finite)
-
-
-def _states(task: Problem) -> np.ndarray:
-    """States along the reference, and the start, shape (nx, number)."""
-    states = reference_states(task, _SAMPLES)
-    return np.hstack([states, np.asarray(task.start_state)[:, None]])
 
 
 def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:
@@ -143,14 +137,17 @@ _INSTANTS = 2000
 
 def request_along_reference(problem: Problem, law: Tracking | None = None) -> RequestChange:
     """Return the change period max|d/dt r^N| of the nominal response r^N, or its largest jump, with the recovery for `law`."""
-    t = ca.MX.sym("t")
-    responses = nominal_motion(problem)(t)[1]
-    response_of, steps = ca.Function("r", [t], [responses]), problem.reference.set_points.items()
-    change = problem.period * _slew(response_of, problem.duration)
-    if jumps := sorted(
-        {time for name, one in steps for time, _ in pairs(name, one) if time > 0}
-    ):  # no derivative shows them
-        change = _largest_change(response_of, problem, np.array(jumps) - problem.period)
+    motion, period = nominal_motion(problem), problem.period
+
+    def responses(times: np.ndarray) -> np.ndarray:
+        return np.asarray(motion.map(times.size)(times[None, :])[1].full())
+
+    times, steps = np.linspace(0.0, problem.duration, _INSTANTS), problem.reference.set_points.items()
+    change = period * _steepest(responses(times), times)
+    if jumps := sorted({time for name, one in steps for time, _ in pairs(name, one) if time > 0}):
+        # No derivative shows them.
+        begins = np.append(np.linspace(0.0, problem.duration - period, _INSTANTS), np.array(jumps) - period)
+        change = float(np.linalg.norm(responses(begins + period) - responses(begins), axis=0).max())
     return RequestChange(change, sudden=False, recovery=_recovery(problem, law))
 
 
@@ -198,19 +195,6 @@ def _largest_error(problem: Problem) -> float:
     free = np.asarray(plant.equations.controlled_response.map(_INSTANTS)(states, still, model).full())
     sizes = np.linalg.norm(wanted - free, axis=0)
     return float(sizes[np.isfinite(sizes)].max(initial=0.0))
-
-
-def _largest_change(function: ca.Function, problem: Problem, begins: np.ndarray) -> float:
-    """Largest change of a Function of time over one cycle of the run, sampled, and in cycles that begin at some times."""
-    times = np.concatenate([np.linspace(0.0, problem.duration - problem.period, _INSTANTS), begins])
-    before, after = (np.asarray(function.map(times.size)(t[None, :]).full()) for t in (times, times + problem.period))
-    return float(np.max(np.linalg.norm(after - before, axis=0)))
-
-
-def _slew(function: ca.Function, duration: float) -> float:
-    """Largest |d/dt| of a Function of time over the run, sampled."""
-    times = np.linspace(0.0, duration, _INSTANTS)
-    return _steepest(np.asarray(function.map(_INSTANTS)(times[None, :]).full()), times)
 
 
 def _steepest(values: np.ndarray, times: np.ndarray) -> float:

@@ -173,7 +173,10 @@ def _stage(plant: Plant, reference: Reference, horizon: Horizon, cost: Cost, lim
         used = ca.vertcat(*terms.values(), *(w.expression for w in written))
         keeps_input = bool(horizon.blocks) or ca.depends_on(used, before)
         before = before if keeps_input else ca.SX(0, 1)
-        end = _end_view(plant, view, x, before if keeps_input else ca.SX.nan(plant.input.size))
+        none = ca.SX.nan(plant.input.size)  # the end has no input; the one before is that of the last stage
+        output = view.output.of(outputs_of(plant, x, none, view.parameters.vector))
+        end = replace(view, output=output, input=view.input.of(none))
+        end = replace(end, input_before=view.input.of(before if keeps_input else none))
         linearise = lambda: _linearise(plant, reference, horizon, advance)  # noqa: E731
         terminal = cost.terminal_cost(end, plant, linearise, horizon.last)
     except InvalidName as error:
@@ -267,13 +270,6 @@ def _seen(plant: Plant, horizon: Horizon, x: Expression, data: Mapping[str, Expr
     """The state as it will be measured: that of the plan, plus the distance of the measured state from the plan's start."""
     offset = dict(zip(horizon.measured, ca.vertsplit(data["offset"]), strict=True)) if horizon.measured else {}
     return ca.vertcat(*(x[k] + offset[e] if e in offset else x[k] for k, e in enumerate(plant.state.elements)))
-
-
-def _end_view(plant: Plant, view: View, x: Expression, before: Expression) -> View:
-    """The view of the end of the horizon, whose input is NaN, because there is none; the one before is that of the last stage."""
-    none = ca.SX.nan(plant.input.size)
-    output = view.output.of(outputs_of(plant, x, none, view.parameters.vector))
-    return replace(view, output=output, input=view.input.of(none), input_before=view.input.of(before))
 
 
 def _hastened(view: View, factor: Expression) -> View:

@@ -5,7 +5,7 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import casadi as ca
@@ -246,7 +246,10 @@ class DisturbanceKalman(ParameterEstimator):
         used, pattern = (c != 0).any(axis=0), a != 0
         while (grown := used | pattern[used].any(axis=0)).sum() > used.sum():
             used = grown
-        judged = [*_shown_by(problem.plant, problem.judged_names), *range(problem.plant.state.size, len(a))]
+        plant, (x, u, p) = problem.plant, problem.plant.symbols()
+        values = plant.equations.output(x, u, p, ca.DM.zeros(len(plant.names)))
+        shown = values[[plant.output.elements.index(n) for n in problem.judged_names]]
+        judged = [*set(ca.jacobian_sparsity(shown, x).get_triplet()[1]), *range(plant.state.size, len(a))]
         rest = a[np.ix_(~used, ~used)]
         harmless = used[judged].all() and np.abs(np.linalg.eigvals(rest)).max(initial=0.0) < 1 + _SLOWEST
         return used if harmless else everything
@@ -270,14 +273,6 @@ def _balanced(matrix: np.ndarray) -> np.ndarray:
     belongs[entries, rows] = belongs[entries, height + columns] = 1.0
     sizes = np.linalg.lstsq(belongs, np.log(np.abs(matrix[rows, columns])), rcond=None)[0]
     return np.asarray(matrix * np.exp(-sizes[:height, None] - sizes[None, height:]))
-
-
-def _shown_by(plant: Plant, names: Sequence[str]) -> list[int]:
-    """Places of the states on which these coordinates or outputs depend."""
-    x, u, p = plant.symbols()
-    values = plant.equations.output(x, u, p, ca.DM.zeros(len(plant.names)))
-    shown = values[[plant.output.elements.index(n) for n in names]]
-    return sorted(set(ca.jacobian_sparsity(shown, x).get_triplet()[1]))
 
 
 def _operating_point(problem: Problem) -> tuple[ca.DM, ca.DM, np.ndarray]:

@@ -204,7 +204,10 @@ def _by_newton(response: ca.Function, x: ca.SX, u: ca.SX, p: ca.SX, r: ca.SX) ->
     gain_at_zero = ca.sparsify(ca.substitute(ca.jacobian(response(x, u, p), u), u, none))
     blind = ca.sprank(gain_at_zero.sparsity()) < u.numel()
     there, unit = response(x, none, p), ca.SX(one)
-    size = _size(x, r, p, there)
+    # How large each response is: what is asked, what there is without inputs, and a share of the terms that cancel there.
+    known = ca.vertcat(x, p)
+    terms = ca.mtimes(ca.fabs(ca.jacobian(there, known)), ca.fabs(known))
+    size = ca.fabs(r) + ca.fabs(there) + NEGLIGIBLE * _finite(terms, 0)
     if blind:  # as much as nearly no input does, whose effect is a square at least
         size += NEGLIGIBLE**2 * _finite(ca.fabs(response(x, one, p)), 0)
     else:  # of the first step, at most 1
@@ -217,13 +220,6 @@ def _by_newton(response: ca.Function, x: ca.SX, u: ca.SX, p: ca.SX, r: ca.SX) ->
     lost = ca.logic_not(residual <= INVERSE_TOLERANCE)
     column = sizes[1] * root + graph(nan_where(expression(lost)))
     return ca.Function("fpirhc_inverse", [xm, rm, pm], [column], ["x", "r", "p"], ["u"])
-
-
-def _size(x: ca.SX, r: ca.SX, p: ca.SX, there: ca.SX) -> ca.SX:
-    """How large each response is: what is asked, what there is without inputs, and a share of the terms that cancel there."""
-    known = ca.vertcat(x, p)
-    terms = ca.mtimes(ca.fabs(ca.jacobian(there, known)), ca.fabs(known))
-    return ca.fabs(r) + ca.fabs(there) + NEGLIGIBLE * _finite(terms, 0)
 
 
 def _finite(values: Expression, other: float) -> Expression:

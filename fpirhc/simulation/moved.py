@@ -298,7 +298,8 @@ def outside_blocks(mover: Mover, known: PlantModel) -> list[Block]:
         ends = Mover.parameters, _REAL_NOW
         blocks.append(_block("outside", problem, real, values, "signals", ends, problem.signal_steps))
     if outside_names(model):
-        believed = model_values(model, known.signals) or _unchanged(model)
+        t, p = ca.SX.sym("t"), ca.SX.sym("p", model.parameter.size)
+        believed = model_values(model, known.signals) or ca.Function("fpirhc_signals", [t, p], [p])
         blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
     return blocks
 
@@ -322,8 +323,3 @@ def _block(
 
     reads = Layout((plant.time, like(plant.parameter, source)))
     return Block(name, reads, Layout(writes), step, opaque=not values.is_a("SXFunction"))
-
-
-def _unchanged(plant: Plant) -> ca.Function:
-    t, p = ca.SX.sym("t"), ca.SX.sym("p", plant.parameter.size)
-    return ca.Function("fpirhc_signals", [t, p], [p])

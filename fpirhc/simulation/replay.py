@@ -96,13 +96,6 @@ def known_samples(problem: Problem) -> int:
     return max(1, *problem.plant.chains.values())
 
 
-def usually_bridged(problem: Problem) -> int:
-    """Return the longest gap that is replayed where nobody states another."""
-    plant, estimator = problem.plant, problem.sensing.estimator
-    shortest = all(estimator.fills(plant.chains[name]) == plant.chains[name] for name in plant.controlled_names)
-    return BY_DIFFERENCES if problem.sensing.estimates and shortest else BRIDGED
-
-
 def shares(first: int, missing: int, known: int) -> np.ndarray:
     """Return the weights of the new sample and of the good ones, newest first: a row for every missing one from `first` on."""
     places = [float(missing + 1), *(float(-j) for j in range(known))]
@@ -160,6 +153,9 @@ class Replay:
         memory = Layout(
             tuple(s for one in step.memory.signals for s in (inner.memory.signals if one.name == INNER else (one,)))
         )
+        plant, estimator = problem.plant, problem.sensing.estimator
+        shortest = all(estimator.fills(plant.chains[name]) == plant.chains[name] for name in plant.controlled_names)
+        usual = BY_DIFFERENCES if problem.sensing.estimates and shortest else BRIDGED
         windows = {s.name for block in seeing_blocks(problem)[0] for s in block.memory.signals}
         acted = {delay.now.name for delay in inner.delays if delay.source == "command"}
         own = set(inner.memory.names)
@@ -185,7 +181,7 @@ class Replay:
             places(stays),
             good,
             float(problem.period),
-            usually_bridged(problem) if bridged is None else bridged,
+            usual if bridged is None else bridged,
             max(_forgets(problem) if windows else 0, _SETTLES if observed else 0),
         )
 

@@ -198,7 +198,9 @@ def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
     corners = _corners(ends, int(entering.sum()))
     for at in coefficients:
         masses = at[0] + np.einsum("cj,jab->cab", corners, at[1:])
-        values = np.linalg.eigvalsh(_without_units(masses))
+        sizes = np.sqrt(np.abs(np.diagonal(masses, axis1=1, axis2=2)))  # coordinates have units of their own
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        values = np.linalg.eigvalsh(masses / (sizes[:, :, None] * sizes[:, None, :]))
         worst = int(np.argmin(values[:, 0]))
         if not values[worst, 0] > _DEFINITE * values[worst, -1]:
             corner = ", ".join(f"{n} = {v:g}" for n, v, e in zip(bounds, corners[worst], entering, strict=True) if e)
@@ -206,13 +208,6 @@ def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
                 f"the bounds admit a mass matrix that is not positive definite (smallest eigenvalue {values[worst, 0]:.3g}) at "
                 f"{corner}; narrow them, or learn parameters for which every positive value is possible (masses and inertias)"
             )
-
-
-def _without_units(masses: np.ndarray) -> np.ndarray:
-    """Mass matrices with a diagonal of 1, which is no smaller where it is not positive: coordinates have units of their own."""
-    sizes = np.sqrt(np.abs(np.diagonal(masses, axis1=1, axis2=2)))
-    sizes = np.where(sizes > 0, sizes, 1.0)
-    return np.asarray(masses / (sizes[:, :, None] * sizes[:, None, :]))
 
 
 def _corners(ends: np.ndarray, free: int) -> np.ndarray:
