@@ -226,7 +226,9 @@ class Sweep:
                 )
             follows = self._follow(bounds)
             if follows.within(bounds):
-                return self._proved(follows, bounds)
+                commands = self.functions.command.over(self._at_cycles(bounds))
+                drift = self.functions.drift.over(self._within(bounds)).distance(0.0).max(axis=1)
+                return Tube(follows, commands, np.abs(self.errors) + follows.error, self._factor(bounds), drift)
             if not all(
                 np.max(v) < largest for v in (follows.deviation, follows.error, follows.responses.distance(0.0))
             ):
@@ -351,12 +353,6 @@ class Sweep:
                 ends = (free + np.outer(pushes, v[row, own, k]) for v in (low, high))
                 turned = np.maximum.reduce([np.abs(end) for end in ends]) @ deviation[own, k]
                 deviation[own, k + 1] = _SAFE * (turned + pushes * (sizes[row, :, k] @ outer) + pushed[own, k])
-
-    def _proved(self, follows: Bounds, assumed: Bounds) -> Tube:
-        commands = self.functions.command.over(self._at_cycles(assumed))
-        drift = self.functions.drift.over(self._within(assumed)).distance(0.0).max(axis=1)
-        errors = np.abs(self.errors) + follows.error
-        return Tube(follows, commands, errors, self._factor(assumed), drift)
 
 
 def _values(function: ca.Function, states: np.ndarray, commands: np.ndarray, parameters: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ from fpirhc.controllers.built import Built
 from fpirhc.controllers.gate import Gate, was_skipped
 from fpirhc.controllers.seeing import sensor_ranges
 from fpirhc.describe import describe
-from fpirhc.errors import require
 from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.replay import CLOCK, clock_block, clock_status_block, known_samples
 from fpirhc.status import Status
@@ -96,10 +95,3 @@ def composed_step(
 
     composite = composed(compose)
     return composite, gates[-1].named(composite.memory)
-
-
-def refuse_unbounded(controller: Controller) -> None:
-    """Refuse a controller whose optimiser may take any time."""
-    planner = controller.planner
-    why = planner.optimiser.unbounded if planner is not None else ""
-    require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a machine")

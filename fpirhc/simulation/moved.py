@@ -20,7 +20,7 @@ from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.motion import forcing_units, outside_names
 from fpirhc.plant.plant import Plant
-from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal, logged_signal
+from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
@@ -156,7 +156,7 @@ class Equations(Mover):
         shown = {one.name: truth.function(one.elements) for one in motion}
         shifts = bool(problem.disturbed_outputs)
         if shifts:
-            reads, writes = (*reads, disturbance_signal(problem)), (*writes, logged_signal(problem))
+            reads, writes = (*reads, disturbance_signal(problem)), (*writes, like(problem.plant.output, LOGGED))
 
         def step(s: Signals) -> dict[str, Expression]:
             now = (s._state_before, s._acting_before, s._exact, s._forcing_before)

@@ -28,7 +28,6 @@ from fpirhc.simulation.step_arguments import Setpoints, set_point_record
 from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator, Latest
-from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import Native, native
 from fpirhc.symbolic.program import chained
 from fpirhc.task.problem import Problem
@@ -280,7 +279,9 @@ def run_cycles(
             bad = dropped.first_bad(rows, log[at - 1] if at else None)
             if bad is not None:
                 row, column = bad
-                return log[: at + row].copy(), _why(trace, at + row, column, problem)
+                return log[: at + row].copy(), stopped(
+                    problem, at + row, f"signal '{trace.columns[column]}' is not finite"
+                )
             outside = ranges.first_outside(rows)
             if outside is not None:
                 row, what = outside
@@ -319,10 +320,6 @@ def _failed(at: int, count: int, problem: Problem, why: str) -> str:
         f"a solver failed within {count} cycles after t = {at * problem.period:g} {problem.time_unit}: {why}; the run keeps the "
         "cycles before them"
     )
-
-
-def _why(trace: Layout, cycle: int, column: int, problem: Problem) -> str:
-    return stopped(problem, cycle, f"signal '{trace.columns[column]}' is not finite")
 
 
 def stopped(problem: Problem, cycle: int, what: str) -> str:

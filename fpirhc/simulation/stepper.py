@@ -14,10 +14,10 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
-from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue
+from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue, require
 from fpirhc.fields.checked import ByName, Checked
 from fpirhc.fields.kinds import named_entries
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, composed_step, refuse_unbounded
+from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, composed_step
 from fpirhc.simulation.replay import CLOCK_MEMORY, Bound, Replay, missed_cycles
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
@@ -68,8 +68,9 @@ class ComposedStep:
     ) -> Self:
         """Return the step of a controller; arguments as of `Stepper`."""
         settings = live_settings(problem, controller, live)
-        if bounded:
-            refuse_unbounded(settings.controller)
+        planner = settings.controller.planner
+        why = planner.optimiser.unbounded if bounded and planner is not None else ""
+        require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a machine")
         composite, memory = composed_step(settings.composed, problem, settings.controller, saturated_after)
         return cls(settings, composite, memory, Replay.of(problem, composite, bridged))
 

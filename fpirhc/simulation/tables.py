@@ -54,12 +54,6 @@ def disturbance_values(problem: Problem, times: np.ndarray, seed: int) -> np.nda
     return np.column_stack(values) if values else np.zeros((len(times), 0))
 
 
-def logged_signal(problem: Problem) -> Signal:
-    """Return the signal of what disturbances add to y, y', ... below the responses."""
-    output = problem.plant.output
-    return Signal(LOGGED, output.elements, output.units)
-
-
 def by_place(problem: Problem, disturbance: Expression) -> dict[str, Expression]:
     """Return what disturbances add by name."""
     return dict(zip(problem.disturbances, ca.vertsplit(disturbance), strict=False))

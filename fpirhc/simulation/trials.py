@@ -19,7 +19,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task, without_deformation
-from fpirhc.deformation.base import Deformation, Form
+from fpirhc.deformation.base import Deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.user_code import users_level
@@ -45,18 +45,15 @@ def with_believed_way(problem: Problem, deformation: Deformation) -> Problem:
     A lag or a dead time that a deformation believes is a part of its model, so a plant without it is no right model. A dead time
     that the problem states is a fact, and stays. A lag before a map is left out.
     """
-    form = deformation.form
-    lags = _each(form.lag, len(problem.plant.inputs))
-    return _behind(_with_dead_time(problem, form), lags) if form.modelled else problem
-
-
-def _with_dead_time(problem: Problem, form: Form) -> Problem:
-    cycles = _each(form.cycles, len(problem.plant.inputs))
-    stated = problem.dead_time.measurement or any(problem.dead_time.inputs.values())
-    if stated or not (any(cycles) or form.measurement):
+    form, stated = deformation.form, problem.dead_time
+    if not form.modelled:
         return problem
-    inputs = {name: c * problem.period for name, c in zip(problem.plant.inputs, cycles, strict=True)}
-    return replace(problem, dead_time=DeadTime(inputs=inputs, measurement=form.measurement * problem.period))
+    lags, cycles = (_each(one, len(problem.plant.inputs)) for one in (form.lag, form.cycles))
+    if not (stated.measurement or any(stated.inputs.values())) and (any(cycles) or form.measurement):
+        inputs = {name: c * problem.period for name, c in zip(problem.plant.inputs, cycles, strict=True)}
+        late = DeadTime(inputs=inputs, measurement=form.measurement * problem.period)
+        problem = replace(problem, dead_time=late)
+    return _behind(problem, lags)
 
 
 def behind_stated_lag(problem: Problem) -> Problem:

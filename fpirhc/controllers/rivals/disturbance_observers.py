@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import casadi as ca
@@ -48,8 +47,17 @@ class ADRC(OfDerivatives):
         return blocks, [*delays, Delay(_states(plant, "_predicted"), "_predicted_later")]
 
     def corrections(self, plant: Plant, order: int, period: float) -> list[float]:
-        """Return l_1 ... l_{n+1} of z += l (y - z_1), for a coordinate of that relative order; all poles at ca.exp(-w_o T)."""
-        return list(_corrections(plant, order, period, ca.exp(-self.observer * period)))
+        """Return l_1 ... l_{n+1} of z += l (y - z_1), for a coordinate of that relative order; all poles at ca.exp(-w_o T).
+
+        The correction of the newest sample places all poles of (1 - l c) Phi, whose polynomial is affine in l.
+        """
+        size, pole = order + 1, ca.exp(-self.observer * period)
+        chain = step_of(plant, np.eye(size, k=1), period)
+        free = np.poly(chain)[1:]
+        effect = np.column_stack([np.poly(chain - np.outer(one, chain[0]))[1:] - free for one in np.eye(size)])
+        wanted = [math.comb(size, k) * power(-pole, k) - float(free[k - 1]) for k in range(1, size + 1)]
+        rows = np.linalg.inv(effect)
+        return [sum(float(share) * value for share, value in zip(row, wanted, strict=True)) for row in rows]
 
     def _observer_block(self, built: Built) -> Block:
         """Block (outputs, prediction, reference) -> (command, extended state)."""
@@ -111,17 +119,6 @@ def _prediction_block(built: Built) -> Block:
     reads = Layout((plant.state, plant.input, plant.parameter, _states(plant, "extended_state"), predicted))
     writes = Layout((_states(plant, "_predicted_later"),))
     return Block("prediction", reads, writes, step, Layout((acting,)))
-
-
-def _corrections(plant: Plant, order: int, period: float, pole: float) -> Iterator[float]:
-    """The correction of the newest sample that places all poles of (1 - l c) Phi, whose polynomial is affine in l."""
-    size = order + 1
-    chain = step_of(plant, np.eye(size, k=1), period)
-    free = np.poly(chain)[1:]
-    effect = np.column_stack([np.poly(chain - np.outer(one, chain[0]))[1:] - free for one in np.eye(size)])
-    wanted = [math.comb(size, k) * power(-pole, k) - float(free[k - 1]) for k in range(1, size + 1)]
-    for row in np.linalg.inv(effect):
-        yield sum(float(share) * value for share, value in zip(row, wanted, strict=True))
 
 
 def _states(plant: Plant, name: str) -> Signal:

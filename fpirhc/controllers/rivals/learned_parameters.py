@@ -195,7 +195,11 @@ def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
     if not np.isfinite(ends).all():
         name = list(bounds)[int(np.argmin(np.isfinite(ends).all(axis=1)))]
         raise InvalidValue(f"'{name}' enters the mass matrix, which must stay positive definite: give it finite bounds")
-    corners = _corners(ends, int(entering.sum()))
+    if 2 ** int(entering.sum()) <= _CORNERS:
+        corners = np.array(list(itertools.product(*(sorted(set(pair)) for pair in ends.tolist()))))
+    else:  # a random sample of them
+        sides = np.random.default_rng(0).integers(2, size=(_CORNERS, len(ends)))
+        corners = ends[np.arange(len(ends)), sides]
     for at in coefficients:
         masses = at[0] + np.einsum("cj,jab->cab", corners, at[1:])
         sizes = np.sqrt(np.abs(np.diagonal(masses, axis1=1, axis2=2)))  # coordinates have units of their own
@@ -208,11 +212,3 @@ def _check_definite(bounds: Bounds, coefficients: np.ndarray) -> None:
                 f"the bounds admit a mass matrix that is not positive definite (smallest eigenvalue {values[worst, 0]:.3g}) at "
                 f"{corner}; narrow them, or learn parameters for which every positive value is possible (masses and inertias)"
             )
-
-
-def _corners(ends: np.ndarray, free: int) -> np.ndarray:
-    """Corners of the box: all of them, or a random sample where there are more than `_CORNERS`."""
-    if 2**free <= _CORNERS:
-        return np.array(list(itertools.product(*(sorted(set(pair)) for pair in ends.tolist()))))
-    sides = np.random.default_rng(0).integers(2, size=(_CORNERS, len(ends)))
-    return np.asarray(ends[np.arange(len(ends)), sides])
