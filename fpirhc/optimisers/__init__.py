@@ -81,7 +81,7 @@ _REMEDIES = {
 def refuse_limits(optimiser: Optimiser, ocp: OptimalControl, kind: Literal["inputs", "states", "prices"]) -> None:
     """Raise where there are limits of a kind that an optimiser cannot keep: of "inputs", of "states", of states with "prices"."""
     priced = [e for e, hard in zip(ocp.state.elements, ocp.hard, strict=True) if not hard]
-    inputs = np.isfinite(ocp.input_lower).any() or np.isfinite(ocp.input_upper).any()
+    inputs = np.isfinite([ocp.input_lower, ocp.input_upper]).any()
     limited = {"inputs": inputs or ocp.bounds_states, "states": ocp.bounds_states, "prices": priced}
     require(not limited[kind], f"{type(optimiser).__name__} {_REMEDIES[kind].format(', '.join(priced))}")
 
@@ -101,7 +101,7 @@ def shift(columns: ca.MX, ocp: OptimalControl, node: int = 0) -> ca.MX:
     of the first column: 1 for s_1 ... s_N.
     """
     shares = np.append(ocp.shares, ocp.shares[-1])[None, node : node + columns.shape[1]]
-    later = columns if columns.shape[1] == 1 else ca.horzcat(columns[:, 1:], columns[:, -1])  # the last one twice
+    later = ca.horzcat(columns[:, 1:], columns[:, -1])  # the last one twice
     return _moved(columns, later, shares)
 
 

@@ -53,7 +53,6 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import FINITE
 from fpirhc.symbolic.layout import Layout, Signal, scalar
 
-MU_WARM = 1e-4  # barrier parameter of a remembered plan, in units of the cost
 _TEXTS = ("kernels", "state_limits_sweep", "state_limits")
 
 
@@ -323,20 +322,16 @@ EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, 
 def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Columns, first: Columns) -> Columns:
     """The better results of a call of the plain iteration and of the one with limits, in the memory of the plain one.
 
-    Where a plan was remembered, that of the plain iteration is the first guess of the other one, which else has its own.
+    Both begin with the same inputs.
     """
-    before, after, own, ns = call[4], first[2].ravel(), limited_memory(ocp), ocp.state.size
-    warm, begin = first[1][4, 0] < Status.INFEASIBLE and before[layout.slice("plan_step")][0] > 0, own.start()
-    begin[own.slice("plan_inputs")] = (after if warm else before)[layout.slice("plan_inputs")]
-    if warm:
-        states = after[layout.slice("plan_states")]
-        begin[own.slice("plan_states")] = np.append(states[ns:], states[-ns:])
-        begin[own.slice("plan_gains")] = after[layout.slice("plan_gains")]
-        begin[own.slice("plan_barrier")] = MU_WARM
+    own, ns = limited_memory(ocp), ocp.state.size
+    begin = own.start()
+    begin[own.slice("plan_inputs")] = call[4][layout.slice("plan_inputs")]
     inputs, numbers, remembered = (np.asarray(v.full()) for v in limited(*call[:4], begin))
-    if (numbers[4, 0], numbers[1, 0]) >= (first[1][4, 0], first[1][1, 0]):  # status, then stationarity
+    status_and_stationarity = [4, 1]
+    if tuple(numbers[status_and_stationarity, 0]) >= tuple(first[1][status_and_stationarity, 0]):
         return first
-    numbers[3, 0] += first[1][3, 0]
+    numbers[3] += first[1][3]
     memory = layout.start()
     memory[layout.slice("plan_inputs")] = inputs.ravel(order="F")
     memory[layout.slice("plan_states")] = np.append(call[0], remembered[own.slice("plan_states"), 0][:-ns])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
@@ -217,12 +218,12 @@ def first_anchor(ocp: OptimalControl, arguments: Arguments, memory: ca.MX) -> An
         gains=ca.reshape(remembered["plan_gains"], nu, ns * n),
         plain=clip(none, arguments.lower, arguments.upper),
         slope=none,
-        value=ca.MX(10 * line_search.UNTRIED),
-        envelope=ca.MX(10 * line_search.UNTRIED),
+        value=ca.MX(FINITE),
+        envelope=ca.MX(FINITE),
         step=ca.MX(1),
         gamma=gamma,
         resume=resume,
-        sent=ca.MX(10 * line_search.UNTRIED),
+        sent=ca.MX(FINITE),
         curved=ca.MX.zeros(nu, nu * n),
     )
 
@@ -252,14 +253,12 @@ def _converged(
     once = ca.Function(
         "fpirhc_iterated", given, list(ca.Function.if_else("fpirhc_if_needed", work, rest)(1 - ended, *given))
     )
-    few = ca.Function("fpirhc_few", once.mx_in(), _iterated([once] * _FEW, once.mx_in()))
-    times = divmod(settings.most + 1, _FEW)
+    count_of_few = math.isqrt(settings.most)  # a graph of all iterations side by side takes longer to build
+    few = ca.Function("fpirhc_few", once.mx_in(), _iterated([once] * count_of_few, once.mx_in()))
+    times = divmod(settings.most + 1, count_of_few)
     begin = [*arguments, *anchor, ca.MX(0), ca.MX(0), ca.MX(0)]
     *last, tries, _, _ = _iterated([few] * times[0] + [once] * times[1], begin)
     return Anchor(*last), tries
-
-
-_FEW = 15  # iterations in one Function: a graph of all of them takes longer to build
 
 
 def _iterated(functions: Sequence[ca.Function], values: Sequence[ca.MX]) -> list[ca.MX]:

@@ -16,6 +16,7 @@ from fpirhc.horizon.problem import OptimalControl, reduced_gradient, rollout
 from fpirhc.optimisers import Optimiser, feasible_to, first_plan, improved, judge, tolerated
 from fpirhc.status import Status
 from fpirhc.summary import line, number
+from fpirhc.symbolic.expression import TINY
 
 _WORST = 5  # violations in a text
 _AT_BOUND = 1e-6  # relative distance within which an input counts as at its bound
@@ -85,8 +86,8 @@ class Plan:
                 by = max(low - value, value - high)
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
                 if by > most[k] and means_something and ocp.hard[k]:
-                    side = "below" if value < low else "above"
-                    limit, beyond = (_apart(v, by) for v in (low if value < low else high, value))
+                    side, end = ("below", low) if value < low else ("above", high)
+                    limit, beyond = _apart(end, by), _apart(value, by)
                     violations.append(
                         (stage > 0, -by, f"'{name}' is {beyond} {unit}, {side} {limit}, at stage {stage}")
                     )
@@ -199,8 +200,9 @@ def _apart(value: float, by: float) -> str:
 
 
 def _stages(ocp: OptimalControl) -> str:
-    lengths = np.unique(np.round(np.diff(ocp.node_times), 12))
-    return f"{ocp.stages} of {' to '.join(f'{v:g}' for v in (lengths[0], lengths[-1])[: lengths.size])} {ocp.time_unit}"
+    lengths = np.diff(ocp.node_times)
+    ends = dict.fromkeys(f"{v:g}" for v in (lengths.min(), lengths.max()))
+    return f"{ocp.stages} of {' to '.join(ends)} {ocp.time_unit}"
 
 
 def _shown(value: float | None, text: Callable[[float], str]) -> str:
@@ -229,7 +231,7 @@ def _fit_multipliers(ocp: OptimalControl, inputs: np.ndarray, state: np.ndarray,
         return none  # no state at a bound, or no input that could leave it
     from scipy.optimize import nnls
 
-    size = np.maximum(np.linalg.norm(signed, axis=0), 1e-300)
+    size = np.maximum(np.linalg.norm(signed, axis=0), TINY)
     weights, _ = nnls(signed / size, -weight * slope.ravel(order="F")[free])
     fitted = np.zeros(upper.size)
     fitted[upper] += (weights / size)[: upper.sum()]

@@ -112,7 +112,7 @@ def _wanted(anchor: Anchor, most: ca.MX, fall: ca.MX) -> ca.MX:
     """The largest move that a sweep wants: none where the cost is flat, because a move there lowers the cost by nothing."""
     flat = FLAT * ca.fabs(anchor.value)
     # What is no number is no certificate.
-    return ca.if_else(fall > flat, most, ca.if_else(fall <= flat, 0, 10 * UNTRIED))
+    return ca.if_else(fall > flat, most, ca.if_else(fall <= flat, 0, FINITE))
 
 
 def _trial(ocp: OptimalControl) -> ca.Function:
@@ -229,7 +229,7 @@ def _judgement(ocp: OptimalControl) -> ca.Function:
     retreat = _retreat(metric, old, finite, excess, flags)
     step = ca.if_else(flags[0], old.resume, 1)
     here = {"inputs": inputs, "states": states[:, :n], "plain": plain, "slope": slope, "value": value}
-    advance = old._replace(**here, envelope=envelope, step=step, sent=ca.MX(10 * UNTRIED))
+    advance = old._replace(**here, envelope=envelope, step=step, sent=ca.MX(FINITE))
     next_anchor = [ca.if_else(accepted, new, back) for new, back in zip(advance, retreat, strict=True)]
     arguments = [inputs, states, value, slope, lower, upper, *old]
     return ca.Function("fpirhc_judgement", arguments, [*next_anchor, accepted])

@@ -135,8 +135,10 @@ def test_overflowing_models_are_told_and_survived():
     optimiser = fp.FixedPoint(iterations=6, tolerance=1e-6)
     plan = fp.solve(ocp, optimiser, np.array([30.0]), data, calls=3)
     assert (plan.cost, plan.stationarity, plan.feasibility) == (None, None, None)  # 0 would be the least cost of all
-    assert "'y' is" in plan.overflow()
-    assert "at stage" in plan.overflow()
+    said, _, stage = plan.overflow().rpartition(" at stage ")
+    assert said.startswith("'y' is ")
+    short, few = horizon_of(plant, reference, fp.Horizon(int(stage), 0.1), cost, fp.Limits(inputs={"u": (-1.0, 1.0)}))
+    assert fp.solve(short, optimiser, np.array([30.0]), few, calls=3).overflow() == plan.overflow()  # at the end too
     inputs, diagnostics, memory = call(optimiser, ocp, data, np.array([30.0]), ocp.input_lower, ocp.input_upper)
     assert int(diagnostics.ravel()[4]) == fp.Status.NON_FINITE
     assert np.isfinite(inputs).all()

@@ -253,12 +253,15 @@ def test_a_horizon_that_cannot_be_kept_ends_with_the_least_violation():
 
 @pytest.mark.parametrize("start", [3, 13])
 def test_horizons_with_limits_of_inputs_only_are_rescued(start):
-    """An unstable reactor, cold: the plain iteration ends at a hundred times the cost, the solve at IPOPT's."""
+    """An unstable reactor, cold: the plain iteration ends at a hundred times the cost, the solve at IPOPT's, and goes on there."""
     case = FOREIGN["reactor"]()
     ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, fp.Limits(inputs=case.limits.inputs))
     first, optimiser = case.first(ocp, first_states(case, 40, 3)[:, start]), fp.FixedPoint(1, tolerance_of(ocp))
-    plain = optimiser.converging(ocp)(first, data, ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start())
-    plan = fp.solve(ocp, optimiser, first, data)
+    call = first, data, ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start()
+    plain, plan = optimiser.converging(ocp)(*call), fp.solve(ocp, optimiser, first, data)
+    solved, numbers, memory = optimiser.improve(ocp, call)
+    assert plan.iterations == numbers[3, 0] > float(plain[1][3])
+    np.testing.assert_allclose(optimiser.step(ocp)(*call[:4], memory)[0].full(), solved, rtol=1e-9)
     other = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data, calls=2)
     assert int(plain[1][4]) != fp.Status.OK
     assert float(plain[1][0]) > 100 * known(plan.cost)
