@@ -95,7 +95,7 @@ def _case(family, told, goal):
 
 cases = fp.Cases(
     {
-        f"{family} {k}": {**_case(family, told, goal), "seed": k}
+        f"{family} {k}": _case(family, told, goal)
         for family in draws.FAMILIES
         for k, (told, goal) in enumerate(zip(*draws.trials(family), strict=True))
     }
