@@ -15,7 +15,7 @@ from typing import ClassVar, NoReturn, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, Mistakes, NotSupported, require
+from fpirhc.errors import FpirhcError, InvalidProblem, Mistakes, NotSupported, require
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Finite, NotNegative, Positive
 from fpirhc.plant.chain import quantities
@@ -76,17 +76,15 @@ class ExternalPlant(Checked):
     simulated: ClassVar[bool] = False  # no equations, no run again to answer a question, and a dead time of its own
 
     def __post_init__(self) -> None:
-        if (self.body is None) == (self.make is None):
-            raise InvalidValue("ExternalPlant: expected either a body or make=lambda parameters, seed: body")
-        if self.parameters and self.make is None:
-            raise InvalidValue(
-                "ExternalPlant: a body that stands cannot take parameters; write make=lambda parameters, seed: body"
-            )
         mistakes = Mistakes("ExternalPlant")
+        if (self.body is None) == (self.make is None):
+            mistakes.add("expected either a body or make=lambda parameters, seed: body")
+        elif self.make is None and (mistake := self._wrong(self.body)):
+            mistakes.add(f"its body is {mistake}")
+        elif self.make is None and self.parameters:
+            mistakes.add("a body that stands cannot take parameters; write make=lambda parameters, seed: body")
         check_parameters(self.parameters, mistakes)
         mistakes.raise_if_any()
-        if self.make is None and (mistake := self._wrong(self.body)):
-            raise InvalidValue(f"ExternalPlant: its body is {mistake}")
 
     @property
     def name(self) -> str:

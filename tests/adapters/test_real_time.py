@@ -14,7 +14,7 @@ import pytest
 from helpers.tank import PERIOD, TANK, Tank
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem, InvalidValue
+from fpirhc.errors import InvalidProblem
 
 LONG = 2.95  # s, for which a write hangs
 
@@ -135,7 +135,7 @@ def test_a_machine_is_left_with_what_rests_however_a_run_ends(bad, cycles, ends)
 
 def test_what_rests_is_stated():
     """A machine has no default that nobody chose; a body without `close` is not a machine, and {} sends nothing."""
-    with pytest.raises(InvalidValue, match=r"has close\(\), and would keep its last command .* rest={'u': 0.0}"):
+    with pytest.raises(InvalidProblem, match=r"has close\(\), and would keep its last command .* rest={'u': 0.0}"):
         fp.ExternalPlant(Machine(), {"h": "m"})
     with pytest.raises(InvalidProblem, match="input 'p' is unknown"):
         task(Machine(), rest={"p": 0.0})
