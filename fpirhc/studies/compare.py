@@ -34,7 +34,7 @@ from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, follows, objective
-from fpirhc.summary import Column, Table, written_out
+from fpirhc.summary import Column, Table, number, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compile_all
 from fpirhc.task.problem import Problem
@@ -102,7 +102,7 @@ class Entry:
     exact: bool  # whether its model is exact where the others' is not
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
-    cycle: tuple[float, ...] | None = None  # mean time of a cycle, that of 99 %, and the longest, us
+    cycle: tuple[float, ...] | None = None  # median time of a cycle, that of 99 %, and the longest, us
     left: tuple[Followed, ...] = ()  # hard limits that it leaves, the worst first
     noise: str = ""  # that its response has none, and how to see what it costs
     notes: tuple[str, ...] = ()
@@ -162,7 +162,7 @@ class Comparison(Study):
             status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
             cycle = " / ".join(f"{float(f'{one:.3g}'):g}" for one in e.cycle or ())
             table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
-        about = f"Errors from t = {self.measure_from:g} {self.time_unit} on, seed {self.seed}."
+        about = f"Errors from t = {number(self.measure_from)} {self.time_unit} on, seed {self.seed}."
         notes = [CLOCK] * any(e.cycle for e in self.entries)
         notes += [f"{e.name}: {note}" for e in self.entries for note in e.notes]
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
@@ -325,11 +325,11 @@ def _without_noise(problem: Problem, controller: Controller, name: str) -> str:
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
-CLOCK = "A cycle is a call of the controller, from measurement to command: the mean, what 99 % take at most, and the longest."
+CLOCK = "A cycle is a call of the controller, from measurement to command: the median, what 99 % take at most, and the longest."
 
 
 def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float, ...]:
-    """Mean, 99 % and longest wall time of a call of the controller, us: few calls may hold all plans."""
+    """Median, 99 % and longest wall time of a call of the controller, us: where plans are rare, the median has none."""
     stepper, count = Stepper.of(composed, compiled=compiled), min(run.cycles, REPLAYED)
     if not count:
         return ()
@@ -345,4 +345,4 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
         begin = time.perf_counter_ns()
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
-    return float(taken.mean()) / 1e3, *(np.percentile(taken, (99, 100)) / 1e3).tolist()
+    return tuple((np.percentile(taken, (50, 99, 100)) / 1e3).tolist())

@@ -169,18 +169,21 @@ class Limits(Study):
         heads = ("controller", "what grows", "holds at", "error there", "fails at", "why")
         shown = Table(f"{self.problem}: where controllers fail", [Column(c, left=c == "why") for c in heads], names=2)
         rows: Iterator[Any] = self.table.itertuples()
+        borne: dict[str, list[str]] = {}
         for row in rows:
             share = row.unit.startswith("of ")  # of the range, of the samples
             holds, fails = (number(100 * value if share else value) for value in (row.holds, row.fails))
-            holds = "none" if math.isnan(row.holds) else holds
-            fails = (
-                "as it stands" if math.isnan(row.holds) and row.unit else "none tried" if row.fails > 1e300 else fails
-            )
-            what = f"{row.quantity} [{'% ' if share else ''}{row.unit}]" if row.unit else row.quantity
+            unit = f"{'% ' if share else ''}{row.unit}"
+            where = f"at {fails} {unit}"
+            if math.isnan(row.holds):
+                holds, fails, where = "none", "as it stands" if row.unit else fails, "as it stands"
+            elif row.fails > 1e300:
+                fails, where = "none tried", "nowhere that is tried"
+            what = f"{row.quantity} [{unit}]" if row.unit else row.quantity
             there = "" if math.isnan(row.error) else in_percent(row.error)
             shown.add([row.controller, what, holds, there, fails, row.why])
-        tried = self.table.loc[self.table.unit != ""]
-        said = [_most(str(name), some) for name, some in tried.groupby("quantity", sort=False)]
+            if row.unit:
+                borne.setdefault(f"{row.quantity}".capitalize(), []).append(f"{row.controller} fails {where}")
         grows = " ".join(f"{name.capitalize()}: {_GROWS[name]}." for name in dict.fromkeys(self.table.quantity))
         about = (
             f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
@@ -188,13 +191,7 @@ class Limits(Study):
             "reference's range. What holds may have a large error."
         )
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
-        return View(self, [(text, None) for text in said if text], about, (shown,), facts)
-
-
-def _most(quantity: str, rows: pd.DataFrame) -> str:
-    """Who bears most, where somebody bears more than the others."""
-    best = rows.loc[rows.fails == rows.fails.max(), "controller"]
-    return f"{', '.join(best)} bear{'s' * (len(best) == 1)} most ({quantity})." if 0 < len(best) < len(rows) else ""
+        return View(self, [(f"{q}: {', '.join(some)}.", None) for q, some in borne.items()], about, (shown,), facts)
 
 
 @checked_call

@@ -40,6 +40,7 @@ class VariantStudy(Study):
         groups: the same of every group of cases.
         figure: the number that is judged.
         variants: of the study.
+        places: all controllers of the file, in its order, from which their colours follow.
         chatter: of every controller whose command chatters somewhere, by variant how many times its partner's movement it has.
     """
 
@@ -48,6 +49,7 @@ class VariantStudy(Study):
     groups: dict[str, pd.DataFrame]
     figure: Objective
     variants: Variants
+    places: tuple[str, ...]
     chatter: dict[str, dict[str, float]]
 
     @property
@@ -125,6 +127,7 @@ def study(
     also = tuple(one.name for one in task.metrics if one.main and one not in known)
     groups = {str(g): summarised(some, aim, also) for g, some in named.groupby("group", sort=False)}
     facts = {**circumstances(task, chosen, command, begin), "chatter": _chatter(table, task)}
+    facts["places"] = tuple(task.controllers)
     summary = summarised(table, aim, also)
     return VariantStudy(table=table, summary=summary, groups=groups, figure=aim, variants=variants, **facts)
 
@@ -290,10 +293,11 @@ def figure_of(result: VariantStudy) -> Any:
         return figure
     figure = new_figure(7, 4, f"{result.problem}: {column}")
     axis = figure.subplots()
-    for name, colour in zip(names, PALETTE * len(names), strict=False):
+    colours = dict(zip(result.places, PALETTE * len(result.places), strict=False))
+    for name in names:
         own = shown[shown.controller == name]
         across = own[next(iter(axes))] if axes else np.linspace(0, 100, len(own))
-        axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colour, label=literal(name))
+        axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colours[name], label=literal(name))
     axis.set_yscale("log" if shown.shown.min() > 0 else "linear")
     axis.set(xlabel="share of the variants [%]", ylabel=with_unit[column])
     for name, values in axes.items():

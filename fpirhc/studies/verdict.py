@@ -22,7 +22,7 @@ from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric
 from fpirhc.simulation.metrics.shipped import rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
-from fpirhc.summary import in_percent, in_words
+from fpirhc.summary import in_percent, in_words, number
 from fpirhc.symbolic.expression import TINY
 from fpirhc.task.problem import Problem
 
@@ -193,7 +193,7 @@ class Yardstick:
         """Return the yardstick of a problem."""
         (scales, sizes), alone = ranges(problem), left_alone(problem, seed)
         resting = {n: max(s, alone.get(n, s)) if problem.disturbances or not s else s for n, s in sizes.items()}
-        span = f"t = {problem.measure_from:.4g} to {problem.duration:.4g}{with_space(problem.time_unit)}"
+        span = f"t = {number(problem.measure_from)} to {number(problem.duration)}{with_space(problem.time_unit)}"
         return Yardstick(scales, alone, resting, span)
 
     def beyond(self, entry: Entry, name: str) -> bool:
