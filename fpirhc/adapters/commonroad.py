@@ -82,16 +82,14 @@ class _Car:
         turn = np.clip((sent.get("steer", self._x[2]) - self._x[2]) / span, limits.v_min, limits.v_max)
         for _ in range(self._steps):
             pull = sent.get("acceleration", np.clip(_PULL * (self._speed - self._x[3]), -5.0, 5.0))
-            self._x = self._x + _STEP * self._mean_rate([turn, pull])
+            x, u = self._x, [turn, pull]
+            k1 = np.array(self._rate(list(x), u, self._car))
+            k2 = np.array(self._rate(list(x + _STEP / 2 * k1), u, self._car))
+            k3 = np.array(self._rate(list(x + _STEP / 2 * k2), u, self._car))
+            k4 = np.array(self._rate(list(x + _STEP * k3), u, self._car))
+            self._x = x + _STEP * ((k1 + 2 * k2 + 2 * k3 + k4) / 6)
         now = self._moved()
         return self._measured(now, (now - before) / span)
-
-    def _mean_rate(self, u: list[float]) -> np.ndarray:
-        rate = lambda x: np.array(self._rate(list(x), u, self._car))  # noqa: E731
-        k1 = rate(self._x)
-        k2 = rate(self._x + _STEP / 2 * k1)
-        k3 = rate(self._x + _STEP / 2 * k2)
-        return np.asarray(k1 + 2 * k2 + 2 * k3 + rate(self._x + _STEP * k3)) / 6
 
     def _moved(self) -> np.ndarray:
         """Rates of x, y and heading."""

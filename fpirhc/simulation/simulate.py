@@ -271,10 +271,10 @@ def run_cycles(
                 argument[:] = table[at : at + count]
             run[:] = end - at
             evaluator.redirect(1, log[at : at + count])
-            why = evaluator.failure()
-            why = why or again(memory, log[at])
+            why = evaluator.failure() or again(memory, log[at])
             if why:
-                return log[:at].copy(), _failed(at, count, problem, why)
+                words = f"a solver failed ({why})" + (f" within {count} cycles, at the earliest" if count > 1 else "")
+                return log[:at].copy(), stopped(problem, at, words)
             rows = log[at:end]
             bad = dropped.first_bad(rows, log[at - 1] if at else None)
             if bad is not None:
@@ -311,15 +311,6 @@ def pieces(cycles: int, most: int, cuts: Sequence[int]) -> list[tuple[int, int]]
             calls.append((at, min(at + most, end)))
             at = calls[-1][1]
     return calls
-
-
-def _failed(at: int, count: int, problem: Problem, why: str) -> str:
-    if count == 1:
-        return stopped(problem, at, f"a solver failed ({why})")
-    return (
-        f"a solver failed within {count} cycles after t = {at * problem.period:g} {problem.time_unit}: {why}; the run keeps the "
-        "cycles before them"
-    )
 
 
 def stopped(problem: Problem, cycle: int, what: str) -> str:
