@@ -104,11 +104,6 @@ class Simulator:
         """Whether the loop is compiled C."""
         return self.backend.compiled
 
-    @property
-    def why_not_compiled(self) -> str:
-        """Reason where it is not; empty where it is."""
-        return self.backend.reason
-
     def outdated_by(self, problem: Problem) -> bool:
         """Whether a variant needs a loop of its own: plans that know the exact parameters begin their line search with a step that
         was measured with those of the build, which a plan that is solved forgets, and one of so many iterations does not.
@@ -168,7 +163,7 @@ class Simulator:
             "controller": _DESCRIBED.of((controller,), (), lambda: describe(controller)),
             "problem": describe(problem),
             "backend": "compiled C" if own.compiled else "CasADi virtual machine",
-            "why not compiled": own.why_not_compiled,
+            "why not compiled": own.backend.reason,
         }
         if controller.deformation.form.weights is not None:
             facts["weights"] = [list(row) for row in controller.deformation.form.weights]

@@ -268,6 +268,8 @@ def _commands(result: VariantStudy) -> Iterator[str]:
 
 def figure_of(result: VariantStudy) -> Any:
     """Return the picture of a study: lines or maps over the settings of a grid, else the sorted values of every controller."""
+    from matplotlib.ticker import LogFormatter
+
     from fpirhc.simulation.drawing import PALETTE, draw_legend, literal, new_figure
 
     axes, table = getattr(result.variants, "axes", {}), result.table
@@ -298,7 +300,9 @@ def figure_of(result: VariantStudy) -> Any:
         own = shown[shown.controller == name]
         across = own[next(iter(axes))] if axes else np.linspace(0, 100, len(own))
         axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colours[name], label=literal(name))
-    axis.set_yscale("log" if shown.shown.min() > 0 else "linear")
+    if shown.shown.min() > 0:
+        axis.set_yscale("log")
+        axis.yaxis.set(major_formatter="{x:g}", minor_formatter=LogFormatter(minor_thresholds=(2, 1)))
     axis.set(xlabel="share of the variants [%]", ylabel=with_unit[column])
     for name, values in axes.items():
         axis.set_xlabel(literal(with_unit[name]))

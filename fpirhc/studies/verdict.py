@@ -412,7 +412,7 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
         if beaten:
-            yield f"{exact.name} is no bound here; smaller errors: {', '.join(beaten)}. A bound has their cost, rate, prediction."
+            yield f"{exact.name} is no bound here; smaller errors: {', '.join(beaten)}. A bound has their cost and prediction."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
             lost = [n for n in entry.errors if yard.beyond(entry, n)]

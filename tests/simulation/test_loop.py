@@ -110,7 +110,7 @@ def test_a_short_run_is_not_compiled_unless_it_is_asked_for():
     chosen = fp.simulate(swing(duration=0.02, measure_from=0.0), fp.ComputedTorque(TRACK), seed=0, compiled=None)
     assert chosen.settings["why not compiled"] == "the run is short, and a compiler would take longer"
     ready = fp.simulator(swing(duration=200.0), fp.ComputedTorque(TRACK), compiled=None)
-    assert ready.compiled or "short" not in ready.why_not_compiled
+    assert ready.compiled or "short" not in ready.backend.reason
 
 
 # Mistakes at the door

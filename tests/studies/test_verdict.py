@@ -292,7 +292,7 @@ def test_a_controller_that_has_the_exact_model_is_a_bound_and_wins_nothing():
     assert [e.name for e in found.entries if e.exact] == ["exact", "bound"]
     said, table = " ".join(found.verdict), found.view.tables[0]
     assert "Smallest rms error with the wrong model: fast," in said
-    assert "exact is no bound here; smaller errors: fast. A bound has their cost, rate, prediction." in said
+    assert "exact is no bound here; smaller errors: fast. A bound has their cost and prediction." in said
     assert {row.cells[0] for row in table.rows if row.best} == {"fast"}
     right = fp.compare(tasks.made(one.with_exact(one.plant.approximate), laws), seed=0, compiled=False)
     assert not any(e.exact for e in right.entries)
