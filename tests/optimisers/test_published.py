@@ -1,5 +1,7 @@
 """The published fixed-point optimiser and its reduced form: what they promise, and why the default is another one."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -35,6 +37,9 @@ def test_rate_of_the_reduced_form():
     predicted = np.abs(1 - gain * values).max()
     optimiser = fp.GradientFixedPoint(iterations=1, tolerance=1e-12, map=fp.Affine(gain=-2 * gain))
     assert rate(optimiser, ocp, data, first) == pytest.approx(predicted, abs=1e-3)
+    replace(optimiser, map=fp.Affine(gain=-3.6 / values.max())).check(ocp)
+    with pytest.raises(NotContractive):
+        replace(optimiser, map=fp.Affine(gain=-4.0 / values.max())).check(ocp)
 
 
 def rate(optimiser, ocp, data, first, iterations=25):

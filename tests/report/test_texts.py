@@ -1,4 +1,4 @@
-"""Whole reports as they are read: eight texts are kept in tests/data/reports, and a changed one is renewed by
+"""Whole reports as they are read: seven texts are kept in tests/data/reports, and a changed one is renewed by
 
     FPIRHC_RENEW=1 python -m pytest tests/report/test_texts.py
 
@@ -36,7 +36,6 @@ COMMANDS = {
     "plans": "compare line.py --plans",
     "review": "review line.py --verbose",
     "noisy": "review noisy.py --verbose -c CTC+FPI",
-    "tanks": "review leaking_tanks --verbose -c RHC+FPI",
     "study": "study line.py --draws 6 --mismatch 20% --no-compile -c CTC CTC+FPI",
     "limits": "study line.py --limits mismatch lost --no-compile -c CTC",
 }

@@ -76,14 +76,6 @@ def test_masses_that_do_not_drift_pass_until_a_dead_time_is_not_paired(late, ver
     assert alone(problem, controller).verdict == verdict
 
 
-def test_commands_at_a_limit_show_nothing():
-    """A wrong map asks for more than the light lets in."""
-    task = fp.load_problem("problems/gallery/freeway.py")
-    found = alone(task.problem, task.controllers["static map+FPI"])
-    assert found.verdict == "unknown"
-    assert "at a limit" in found.change
-
-
 def test_a_null_test_goes_on_until_errors_count():
     """The input is too weak for the start, so the first cycles show nothing; the plain form disturbs a right model later."""
     strong = {"b": fp.Parameter(1.0, 1.5, "1")}

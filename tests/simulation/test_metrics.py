@@ -75,20 +75,15 @@ def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
         assert fp.measure(slow, run(0.0, command=move * np.arange(CYCLES)))["at_limit"][""] == pytest.approx(stands)
 
 
-def test_total_variation_is_movement_per_second():
-    """2 N up and 2 N down in turn, every 0.1 s, from t = 5 s on: 20 N/s. The movement before does not count."""
+def test_total_variation_is_movement_per_second_and_effort_the_rms():
+    """2 N up and 2 N down in turn, every 0.1 s, from t = 5 s on: 20 N/s. What was sent before does not count."""
     command = np.where(np.arange(CYCLES) < 50, 100.0 * np.arange(CYCLES), np.arange(CYCLES) % 2 * 2.0)
     metrics = fp.measure(problem(), run(0.0, command=command))
     assert metrics.total_variation["u"] == pytest.approx(20.0)
+    assert metrics["effort"]["u"] == pytest.approx(np.sqrt(2.0))
     assert metrics.units["total_variation"]["u"] == "N/s"
     assert fp.measure(problem(measure_from=9.8), run(0.0, command=command)).total_variation["u"] == pytest.approx(20.0)
     assert fp.measure(problem(), run(0.0, command=3.0)).total_variation["u"] == 0.0
-
-
-def test_effort_is_of_the_measured_part():
-    """7 N before, and 3 N, -3 N in turn after t = 5 s."""
-    command = step(7.0, 3.0, 50) * (-1.0) ** np.arange(CYCLES)
-    assert fp.measure(problem(), run(0.0, command=command))["effort"]["u"] == pytest.approx(3.0)
 
 
 PRICED: dict[str, Any] = {
@@ -230,7 +225,6 @@ def test_end_of_a_run_counts_beside_other_cycles_that_were_not_finite():
 
 def test_plans_that_return_are_counted_once():
     assert of_solves(np.arange(CYCLES) // 10 % 2)["plans"][""] == 2
-    assert of_solves(np.zeros(CYCLES))["plans"][""] == 1
     assert of_solves(np.arange(CYCLES))["plans"][""] == CYCLES
 
 
