@@ -117,7 +117,6 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "run line.py", 2, "fpirhc: Missing argument 'CONTROLLER': one of CTC, CTC+FPI"),
         (None, "run lime.py", 2, "fpirhc: no file at 'lime.py'. Did you mean 'line.py'?"),
         (None, "run line.py CTC+FPI --draw 3 --mismatch 20% --no-compile", 0, ""),
-        (None, "run line.py CTC+FPI --no-compile", 0, f"{RUN} CTC+FPI: errors from t = 0.5 s on, seed 0.\nrms error y"),
         (DIVERGING, "run line.py CTC --no-compile", 4, ""),
         (None, "compare line.py --no-compile -c CTC CTC+FPI", 1, f"{MASS}\n- CTC does not finish: "),
     ],
