@@ -126,7 +126,7 @@ def _gains(problem: Problem, ready: Controller) -> dict[str, tuple[float, ...]]:
 def _against(problem: Problem, ready: Controller) -> Iterator[str]:
     """What the theorem does not cover."""
     plant, planner, deformation = problem.plant, ready.planner, ready.deformation
-    if plant.outputs or plant.step is not None or not plant.equations.affine:
+    if plant.beside or plant.response_age or not plant.equations.affine:
         yield "the plant is in discrete time, has outputs, or its response is not affine in the inputs"
     rated = problem.limits.rates.keys() - problem.limits.prices.keys()
     if problem.disturbances or problem.reality is not None or problem.signals or rated:

@@ -22,6 +22,7 @@ from fpirhc.controllers.seeing import against_believed, check_observed, seeing_b
 from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import InvalidProblem, refuse
 from fpirhc.fields.kinds import described
+from fpirhc.plant.maps import against_lags
 from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, fed, rename
@@ -184,8 +185,7 @@ def _against_form(problem: Problem, deformation: Deformation) -> Iterator[str]:
         if form.modelled and len(values) not in (1, len(plant.inputs)):
             own = f"{len(plant.inputs)} inputs ({', '.join(plant.inputs)})"
             yield f"ModelReferenced({setting}={values!r}): the plant has {own}; give one number for each, or one for all"
-    if plant.step is not None and any(every(form.lag)):
-        yield f"{type(deformation).__name__}: a discrete-time plant has no lag; write an actuator as a state of it"
+    yield from (f"{type(deformation).__name__}: {reason}" for reason in against_lags(plant, every(form.lag)))
 
 
 def _reads(built: Built, *seen: Signal) -> Layout:

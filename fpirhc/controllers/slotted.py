@@ -25,7 +25,7 @@ from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.motion import followed_units
-from fpirhc.plant.plant import Output, Plant
+from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, is_finite, left_after
@@ -164,15 +164,8 @@ _PROBLEMS: Latest[Problem] = Latest(16)
 
 def slot_problem(problem: Problem, name: str) -> Problem:
     """Return the problem of a slot alone: every coordinate is an output, and the slot's is controlled."""
-    return _PROBLEMS.of((problem,), (name,), lambda: _slot_problem(problem, name))
-
-
-def _slot_problem(problem: Problem, name: str) -> Problem:
-    plant = problem.plant
-    inverse = plant.inverse if plant.controlled_names == (name,) else None
-    shown = plant.outputs or {n: Output(unit, lambda *q, n=n: q[0][n]) for n, unit in plant.coordinates.items()}
-    light = replace(plant, outputs=shown, controlled=(name,), inverse=inverse)
-    return replace(problem, plant=light, judged=(name,), cost=None)
+    alone = lambda: replace(problem, plant=problem.plant.controlling(name), judged=(name,), cost=None)  # noqa: E731
+    return _PROBLEMS.of((problem,), (name,), alone)
 
 
 def _by_slot(plants: Sequence[Plant], name: str) -> Signal:

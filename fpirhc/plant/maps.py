@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -53,7 +53,15 @@ def unlike(plant: Plant, model: Plant) -> str:
     return "differential equations, and the model has steps" if plant.step is None else "steps, and the model has none"
 
 
-def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
+def against_lags(plant: Plant, lags: Iterable[float]) -> Iterator[str]:
+    """Why its inputs cannot act through lags: what lags in a map is a state, and moves by its steps alone."""
+    if plant.step is not None and any(lags):
+        yield "a discrete-time plant has no lag; write an actuator as a state of it"
+
+
+def check_maps(
+    model: Plant, real: Plant, lengths: Sequence[float], disturbed: Mapping[str, int], mistakes: Mistakes
+) -> None:
     """Add to `mistakes` where a response needs model and reality to step alike, and what is not covered on a map."""
     instant, later = model.at_once, [name for name, order in model.chains.items() if order > 1]
     others = {*(model.controlled or model.chains)} - {*instant}  # for which a derivative is looked for
@@ -61,6 +69,14 @@ def check_maps(model: Plant, real: Plant, mistakes: Mistakes) -> None:
         mistakes.add(
             f"outputs: {', '.join(instant)} of order 0 beside outputs that steps move: their responses belong to other "
             "cycles, which is not covered; control them by two problems"
+        )
+    if model.step is not None and any(length % 1 for length in lengths):
+        mistakes.add(f"horizon: stages in discrete time are whole steps, got lengths {lengths}")
+    ahead = [name for name, order in disturbed.items() if order > 1]
+    if model.step is not None and ahead:
+        mistakes.add(
+            f"disturbances: the output '{ahead[0]}' in discrete time has relative order {disturbed[ahead[0]]}, and its differences "
+            "look ahead to unknown disturbances; disturb a state or an input, or an output of order 1"
         )
     if not unlike(real, model):
         return

@@ -56,11 +56,6 @@ def words(plant: Plant) -> tuple[str, str]:
     return ("state", "rates") if plant.outputs and set(plant.orders) == {1} else ("coordinate", "response")
 
 
-def followed(plant: Plant) -> str:
-    """What a quantity is called that follows a reference: "output" or "coordinate"."""
-    return "output" if plant.outputs else "coordinate"
-
-
 def followed_units(plant: Plant) -> dict[str, str]:
     """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
     return {name: one.unit for name, one in plant.outputs.items()} if plant.outputs else dict(plant.coordinates)

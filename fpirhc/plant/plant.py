@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self
 
@@ -252,6 +252,12 @@ class Plant(Checked):
                 f"controlled ones, as many as there are inputs: Plant(..., controlled=({names[0]!r},))"
             )
         return names
+
+    def controlling(self, name: str) -> Self:
+        """Return the plant that controls one quantity; its coordinates are outputs, whose orders are found from the symbols."""
+        shown = self.outputs or {n: Output(unit, lambda *q, n=n: q[0][n]) for n, unit in self.coordinates.items()}
+        inverse = self.inverse if self.controlled_names == (name,) else None
+        return replace(self, outputs=shown, controlled=(name,), inverse=inverse)
 
     @cached_property
     def approximate(self) -> np.ndarray:

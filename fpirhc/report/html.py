@@ -216,7 +216,6 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
             for spans in [e.run.spans()]  # too many are not seen
         ],
         "timeUnit": comparison.time_unit,
-        "steps": comparison.steps,
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + np.outer(middles, (0, 1)).ravel()),
         "charts": charts,
     }

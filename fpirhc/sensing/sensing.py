@@ -144,7 +144,8 @@ class Sensing(Checked):
         """
         own, believes, measured = type(self.estimator).__name__, self.observer is not None, self.measures(plant)
         missing = [n for n in self.estimator.measures(plant) if n not in measured]
-        followed = [n for n in missing if n.rstrip("'") in plant.controlled_names]
+        beside = {e for signal in plant.beside for e in signal.elements}
+        followed = [n for n in missing if n.rstrip("'") in beside.intersection(plant.controlled_names)]
         states = [n for n in measured if n not in plant.output.elements and n in plant.state.elements]
         if self.measured is not None and not measured:
             yield "measured: name at least one quantity; Sensing() without it measures all that the estimator needs"
@@ -153,7 +154,7 @@ class Sensing(Checked):
                 f"measured: {own} also needs {', '.join(missing)}; measure it, or estimate it by "
                 "an observer: Sensing(measured=..., observer=KalmanFilter(...))"
             )
-        if plant.outputs and believes and followed:
+        if believes and followed:
             yield (
                 f"measured: {own} needs {', '.join(followed)}, and outputs that are controlled are measured or differentiated, "
                 "never observed; measure it, or choose an estimator of what is measured, such as PositionDifference()"

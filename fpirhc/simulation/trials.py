@@ -43,7 +43,7 @@ def with_believed_way(problem: Problem, deformation: Deformation) -> Problem:
     """Return the problem of a right model; itself where the deformation believes nothing beyond the problem.
 
     A lag or a dead time that a deformation believes is a part of its model, so a plant without it is no right model. A dead time
-    that the problem states is a fact, and stays. A lag before a map is left out.
+    that the problem states is a fact, and stays.
     """
     form, stated = deformation.form, problem.dead_time
     if not form.modelled:
@@ -66,7 +66,7 @@ def behind_stated_lag(problem: Problem) -> Problem:
 
 def _behind(problem: Problem, lags: Sequence[float]) -> Problem:
     plant = problem.plant
-    if not any(lags) or plant.step is not None:
+    if not any(lags):
         return problem
     finer = problem.integrator.finer(math.ceil(problem.period / min(t for t in lags if t)))
     before = zip(plant.inputs, lags, map(float, problem.inputs_before), strict=True)

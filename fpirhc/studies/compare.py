@@ -126,7 +126,6 @@ class Comparison(Study):
     findings: tuple[Finding, ...]
     pictures: tuple[Picture, ...]
     time_unit: str
-    steps: bool
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -235,7 +234,6 @@ def compare(
         findings=findings(entries, task.headline, yard, skipped, aim, _causes(problem, entries, yard)),
         pictures=task.pictures,
         time_unit=problem.time_unit,
-        steps=problem.real_plant.step is not None,
     )
 
 

@@ -21,7 +21,7 @@ from fpirhc.horizon.cost import Cost, Horizon, view_of_symbols
 from fpirhc.horizon.transcription import check_names
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.maps import check_maps, over
-from fpirhc.plant.motion import followed, followed_units, words
+from fpirhc.plant.motion import followed_units, words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
@@ -43,8 +43,8 @@ def settled(problem: Problem) -> dict[str, object]:
     mistakes, plant, reality = Mistakes("problem"), problem.plant, problem.reality
     with mistakes.caught():
         plant = over(plant, problem.period)
-        if isinstance(reality, Reality) and reality.plant.step is not None:
-            reality = replace(reality, plant=over(reality.plant, problem.period))
+        if isinstance(reality, Reality) and (moves := over(reality.plant, problem.period)) is not reality.plant:
+            reality = replace(reality, plant=moves)
     mistakes.raise_if_any()
     found: dict[str, object] = {"plant": plant, "reality": reality, "dead_time": problem.dead_time.over(problem.period)}
     if problem.sensing.estimator.measures_all and plant.response_age:
@@ -59,7 +59,7 @@ def check_problem(problem: Problem) -> None:
     plant, mistakes = problem.plant, Mistakes("problem")
     _check_times(problem, mistakes)
     _check_start(problem, mistakes)
-    mistakes.unknown(f"judged: {followed(plant)}", problem.judged or (), followed_units(plant))
+    mistakes.unknown("judged: quantity", problem.judged or (), followed_units(plant))
     times = np.linspace(0.0, problem.duration, _INSTANTS)
     check_signals(dict.fromkeys((plant, problem.real_plant)), problem.signals, times, mistakes)
     set_points = {n: one for n, one in problem.reference.set_points.items() if n in plant.chains}
@@ -79,7 +79,8 @@ def check_problem(problem: Problem) -> None:
         with mistakes.caught():
             check()
     mistakes.raise_if_any()
-    check_maps(plant, problem.real_plant, mistakes)
+    lengths = problem.horizon.lengths if problem.horizon else ()
+    check_maps(plant, problem.real_plant, lengths, problem.disturbed_outputs, mistakes)
     mistakes.raise_if_any()
     parts = plant, problem.cost, problem.limits  # which problems share
     mistakes.join(_STAGES.of(parts, (), lambda: _of_stage(*parts)))
@@ -107,8 +108,6 @@ def _check_times(problem: Problem, mistakes: Mistakes) -> None:
     if not 0 <= problem.measure_from < problem.duration:
         mistakes.add(f"measure_from must lie in [0, {problem.duration}), got {problem.measure_from}")
     if (horizon := problem.horizon) is not None:
-        if problem.plant.step is not None and any(length % 1 for length in horizon.lengths):
-            mistakes.add(f"horizon: stages in discrete time are whole steps, got lengths {horizon.lengths}")
         with mistakes.caught():
             cycles_per_plan(horizon, problem.period, unit)
 
@@ -221,14 +220,8 @@ def _check_disturbances(problem: Problem) -> None:
     for name, one in problem.disturbances.items():
         with mistakes.caught(f"'{name}': "):
             one.values(instants, np.random.default_rng(0))
-    for name, order in problem.disturbed_outputs.items():
-        if order > 1 and problem.plant.step is not None:
-            mistakes.add(
-                f"the output '{name}' in discrete time has relative order {order}, and its differences look ahead to unknown "
-                "disturbances; disturb a state or an input, or an output of order 1"
-            )
-        with mistakes.caught():
-            problem.disturbances[name].derivative(instants, 1)
+            if name in problem.disturbed_outputs:
+                one.derivative(instants, 1)
     mistakes.raise_if_any()
 
 
@@ -241,8 +234,9 @@ def needed_names(
     measured = tuple(dict.fromkeys((*states, *sensing.measures(plant))))
     if sensing.observer is None:
         return frozenset((*plant.coordinates, *followed_units(plant))), measured
-    shown = (name.rstrip("'") for name in measured)
-    return frozenset((*shown, *(judged or ()), *plant.controlled_names, *plant.outputs)), measured
+    outputs = (element for signal in plant.beside for element in signal.elements)
+    shown = (name.rstrip("'") for name in (*measured, *outputs))
+    return frozenset((*shown, *(judged or ()), *plant.controlled_names)), measured
 
 
 _STAGES: Latest[Mistakes] = Latest(8)

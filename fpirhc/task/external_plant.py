@@ -20,6 +20,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import CountOrZero, Finite, NotNegative, Positive
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.integrators import Integrator
+from fpirhc.plant.maps import against_lags
 from fpirhc.plant.parameter import check_parameters, with_exact_values
 from fpirhc.plant.plant import Parameter, Plant
 
@@ -124,6 +125,7 @@ class ExternalPlant(Checked):
         mistakes, units = Mistakes("reality"), quantities(model)
         mistakes.unknown("measures: quantity", self.measures, units)
         mistakes.unknown("lag: input", self.lag, model.inputs)
+        mistakes.join(f"lag: {reason}" for reason in against_lags(model, self.lag.values()))
         rest = self.rest or {}
         mistakes.unknown("rest: input", rest, model.inputs)
         for name in (n for n in model.inputs if rest and n not in rest):

@@ -156,7 +156,7 @@ class Problem(Checked):
         """The problem without its reality: the model's own plant moves, and disturbances of what it does not have are left out."""
         if self.reality is None:
             return self
-        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.outputs}
+        known = {*self.plant.inputs, *self.plant.coordinates, *self.plant.chains}
         disturbances = {name: one for name, one in self.disturbances.items() if name in known}
         signals = signals_of(self.plant, self.signals)
         return replace(self, reality=None, disturbances=disturbances, signals=signals)

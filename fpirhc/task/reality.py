@@ -15,7 +15,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidProblem, Mistakes, require
+from fpirhc.errors import InvalidProblem, Mistakes, refuse
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, output_order
@@ -82,11 +82,10 @@ class Reality(Checked):
     def _check_quantity(self, model: Plant, name: str, unit: str, mistakes: Mistakes, *, needed: bool) -> None:
         """Add what is wrong with what is measured or judged in the place of a coordinate or an output of the model."""
         plant, units, seen = self.plant, self._units, self.seen.get(name, name)
-        what = "output" if name in model.outputs else "coordinate"
         there = [one for one in dict.fromkeys((seen, name)) if one in units]
         if needed and not there:
             mistakes.add(
-                f"it has no {what} '{name}', which the model has; add it, or name what is measured in its place, "
+                f"it has no '{name}', which the model has; add it, or name what is measured in its place, "
                 f"Reality(seen={{'{name}': ...}}), or estimate it, Sensing(measured=..., observer=KalmanFilter(...)). "
                 f"It has {', '.join(units)}"
             )
@@ -95,7 +94,7 @@ class Reality(Checked):
                 mistakes.add(f"its '{one}' is in {units[one]}, the model's '{name}' in {unit}; write both in one unit")
         if not needed or seen not in units:
             return
-        order = model.equations.output_orders[name] if what == "output" else model.orders[model.names.index(name)]
+        order = {**dict(zip(model.names, model.orders, strict=True)), **model.equations.output_orders}[name]
         own = output_order(plant, seen)
         if own is not None and own < order:
             mistakes.add(
@@ -103,7 +102,7 @@ class Reality(Checked):
                 "give the model this order, or the reality an actuator or a coordinate of its own"
             )
         elif own is None and name in (model.controlled or model.chains):
-            mistakes.add(f"no input reaches its {what} '{seen}', however often it is differentiated")
+            mistakes.add(f"no input reaches its '{seen}', however often it is differentiated")
 
     def shown(self, quantities: Sequence[str]) -> tuple[str, ...]:
         """Return those of the model's states, outputs and their derivatives that it has."""
@@ -170,11 +169,10 @@ class Reality(Checked):
             "measured": (tuple(self.seen.values()), tuple(self.seen)),
         }
         differences = [
-            f"{what} {own}, and the controller's are {its}" for what, (own, its) in facts.items() if own != its
+            f"{what} {one}, and the controller's are {its}" for what, (one, its) in facts.items() if one != its
         ]
-        differences += filter(None, [unlike(plant, model)])
-        require(
-            not differences,
-            f"the reality has {'; '.join(differences[:1])}: it cannot be the exact model of this controller; leave ExactModel out",
+        refuse(
+            f"the reality has {one}: it cannot be the exact model of this controller; leave ExactModel out"
+            for one in filter(None, [*differences, unlike(plant, model)])
         )
         return plant if tuple(plant.outputs) == tuple(model.outputs) else replace(plant, outputs=model.outputs)

@@ -26,7 +26,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.maps import time_derivatives
-from fpirhc.plant.motion import followed, followed_units, sampling, unit_of
+from fpirhc.plant.motion import followed_units, sampling, unit_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
@@ -58,9 +58,9 @@ class Reference(Checked, ABC):
         return _FUNCTIONS.of((self, plant.equations), (), lambda: self._function(plant))
 
     def _function(self, plant: Plant) -> ca.Function:
-        what, t = followed(plant), ca.SX.sym("t")
+        t = ca.SX.sym("t")
         motion = {name: ca.SX(value) for name, value in self.coordinates(t).items()}
-        _check(plant, motion, what)
+        _check(plant, motion)
         chains = {c: time_derivatives(plant, motion[c], t, r) for c, r in plant.chains.items()}
         state, response = _arranged(plant, chains)
         return ca.Function("fpirhc_reference", [t], [state, response], ["t"], ["state", "response"])
@@ -156,7 +156,7 @@ class Setpoint(Reference):
             for n, r in plant.chains.items()
             if self.order is not None and self.order < r
         )
-        _check(plant, dict.fromkeys(self.values, ca.SX(0)), followed(plant), below)
+        _check(plant, dict.fromkeys(self.values, ca.SX(0)), below)
         t, chains = ca.SX.sym("t"), {}
         for name, order in self._orders(plant).items():
             rest = self._first(name)
@@ -258,19 +258,19 @@ def _arranged(plant: Plant, chains: Mapping[str, Sequence[Expression]]) -> tuple
     return ca.densify(ca.vertcat(*state)), ca.densify(ca.vertcat(*response))
 
 
-def _check(plant: Plant, motion: Mapping[str, Expression], what: str, own: Iterable[str] = ()) -> None:
+def _check(plant: Plant, motion: Mapping[str, Expression], own: Iterable[str] = ()) -> None:
     mistakes = Mistakes("reference")
     mistakes.join(own)
     known = followed_units(plant)
     slopes = [name for name in motion if name not in known and name.rstrip("'") in known]
     for name in slopes:
         mistakes.add(f"'{name}' is taken from '{name.rstrip(chr(39))}' by differentiation; leave it out")
-    mistakes.unknown(what, [name for name in motion if name not in slopes], known)
+    mistakes.unknown("quantity", [name for name in motion if name not in slopes], known)
     for c in plant.chains:
         if c not in motion:
-            mistakes.add(f"{what} '{c}' has no nominal motion; add '{c}' to the reference")
+            mistakes.add(f"'{c}' has no nominal motion; add '{c}' to the reference")
         elif motion[c].numel() != 1:
-            mistakes.add(f"{what} '{c}' must be one scalar, got shape {motion[c].shape}")
+            mistakes.add(f"'{c}' must be one scalar, got shape {motion[c].shape}")
     mistakes.raise_if_any()
 
 

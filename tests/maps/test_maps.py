@@ -119,6 +119,7 @@ def test_the_order_is_counted_in_cycles(order: int) -> None:
     assert set(replace(plant, steps=order).chains.values()) == {1}
 
 
+LAGGING = fp.ExternalPlant(make=lambda p, seed: None, measures={"stock": "1"}, lag={"catch": 1.0})
 BAD: dict[str, tuple[Callable[[], object], str]] = {
     "period": (
         lambda: task(period=15.0),
@@ -128,10 +129,9 @@ BAD: dict[str, tuple[Callable[[], object], str]] = {
         lambda: task(sensing=fp.Sensing(estimator=fp.PositionDifference())),
         r"PositionDifference needs derivatives below the response, and discrete time has only differences; leave the estimator out",
     ),
-    "state": (
-        lambda: fishery(next=lambda x, u, p: {}),
-        r"next does not give the value of state 'stock' one step later",
-    ),
+    "next": (lambda: fishery(next=lambda x, u, p: {}), r"next does not give the value of state 'stock' one step later"),
+    "stages": (lambda: task(horizon=fp.Horizon(2, 2 * T, lengths=(1.0, 1.5))), r"are whole steps, got lengths"),
+    "lag": (lambda: task(reality=LAGGING), r"a discrete-time plant has no lag"),
     "no input": (
         lambda: fishery(next=lambda x, u, p: {"stock": x.stock}, outputs={"y": fp.Output("1", lambda x, p: x.stock)}),
         r"no input reaches 'y'",

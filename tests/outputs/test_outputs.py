@@ -82,18 +82,18 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "another expression": (lambda: double({"a": fp.Output("m", lambda x, p: 2 * x.a)}), "rename the output"),
     "arguments": (lambda: double({"y": fp.Output("m", lambda x: x.a)}), r"called as function\(x, p\)"),
     "name in it": (lambda: double({"y": fp.Output("m", lambda x, p: x.c)}), "state 'c' is unknown"),
-    "controlled": (lambda: double(SQUARE, controlled=("z",)), "output 'z' is unknown. Valid: y"),
+    "controlled": (lambda: double(SQUARE, controlled=("z",)), "quantity 'z' is unknown. Valid: y"),
     "name of a state": (lambda: double(SQUARE, states={"a'": "m", "b": "m"}), "'a'' is not an identifier"),
     "name of an input": (lambda: double({"u": fp.Output("m", lambda x, p: x.a)}), "both an input and an output"),
     "no rate": (lambda: double(SQUARE, rates=lambda x, u, p: {"a": x.b}), "rates does not give the derivative b' of state 'b'"),
     "reference": (lambda: replace(squared(lambda t: 1 + 0 * t), reference=fp.Trajectory(lambda t: {"yy": t})), "mean 'y'"),
-    "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: output 'z' is unknown"),
+    "judged": (lambda: squared(lambda t: 1 + 0 * t, judged=("z",)), "judged: quantity 'z' is unknown"),
     "states in the cost": (lambda: squared(lambda t: 1 + 0 * t, cost=fp.Quadratic(states={"a": 1.0})), "have no reference"),
     "both in the cost": (
         lambda: replace(tasks.two_mass.problem, cost=fp.Quadratic(states={"q1": 1.0}, outputs={"q2": 1.0})),
         "states and outputs: both weigh errors",
     ),
-    "reality": (lambda: replace(squared(lambda t: 1 + 0 * t), reality=fp.Reality(double({}))), "it has no output 'y'"),
+    "reality": (lambda: replace(squared(lambda t: 1 + 0 * t), reality=fp.Reality(double({}))), "it has no 'y'"),
     "too few inputs": (
         lambda: double({**SQUARE, "b": fp.Output("m/s", lambda x, p: x.b)}).controlled_names, "cannot hold 2 outputs"
     ),

@@ -41,10 +41,10 @@ class Stepless:
 WRONG: dict[str, tuple[Any, str]] = {
     "no coordinate": (
         lambda: real(replace(Y, coordinates={"z": "m"}, response=lambda q, v, u, p: {"z": p.b * u.u})),
-        "no coordinate 'y', which the model has",
+        "has no 'y', which the model has",
     ),
     "no output": (lambda: task(plant=OUTPUT, reality=fp.Reality(Y), cost=None, horizon=None,
-                               reference=fp.Trajectory(lambda t: {"z": 0 * t})), "no output 'z'"),
+                               reference=fp.Trajectory(lambda t: {"z": 0 * t})), "has no 'z'"),
     "unit": (lambda: real(replace(Y, coordinates={"y": "mm"})), "in mm, the model's 'y' in m;"),
     "unit of an input": (lambda: real(replace(Y, inputs={"u": "kN"})), "its inputs are u in kN, the model's are u in N"),
     "unit of time": (lambda: real(replace(Y, time_unit="ms")), "time is in ms, the model's in s"),
@@ -58,7 +58,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "out of reach": (
         lambda: real(replace(lagged(), response=lambda q, v, u, p: {"y": -q.y, "F": (u.u - q.F) / p.tau})),
-        "no input reaches its coordinate 'y'",
+        "no input reaches its 'y'",
     ),
     "unknown start": (lambda: real(lagged(), start={"force": 1.0}), "start: state 'force' is unknown. Valid: y, F, y'"),
     "unknown sensor": (

@@ -81,8 +81,6 @@ function draw({ box, spec }) {
         width,
         dash,
         points: { show: s.values.filter((v) => v !== null).length === 1, size: 9, fill: colors[s.name] }, // a value alone is a dot
-        // A map has no motion between two cycles: its signals hold from one to the next.
-        ...(DATA.steps && !spec.across ? { paths: uPlot.paths.stepped({ align: 1 }) } : {}),
         value: (_, v) => (v === null || v === undefined ? "" : v.toPrecision(4)),
       };
     })
