@@ -63,7 +63,8 @@ def certify(plan: Plan) -> Certificate:
     _, stationarity, feasibility = plan.verify()
     slope, hessian = _second_order(plan, plan.inputs)
     free, held = _free(plan, plan.inputs, slope), _active_limits(plan)
-    about = held.count, held.complementarity, plan.violations()
+    active = len(held.rows)
+    about = active, held.complementarity, plan.violations()
     basis = _directions(free, held)
     if not basis.shape[1]:
         return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
@@ -81,7 +82,7 @@ def certify(plan: Plan) -> Certificate:
     length = float(np.sqrt(max(pull @ move, 0.0)))
     error = length / (1 - factor) if factor < 1 else float("nan")
     spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
-    suboptimality = length**2 / (2 * (1 - factor)) + held.complementarity * held.count if factor < 1 else float("nan")
+    suboptimality = length**2 / (2 * (1 - factor)) + held.complementarity * active if factor < 1 else float("nan")
     least, back = float(values.min()), _largest_return(held, free)
     return Certificate(
         *(stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least), *about
@@ -165,11 +166,6 @@ class _Active:
     distances: np.ndarray  # of the states beyond their limits, positive where violated, shape (count,)
     complementarity: float  # largest product of a multiplier and the distance of its limit
 
-    @property
-    def count(self) -> int:
-        """Number of active limits."""
-        return self.rows.shape[0]
-
 
 def _active_limits(plan: Plan) -> _Active:
     ocp, multipliers = plan.problem, plan.state_multipliers
@@ -177,11 +173,9 @@ def _active_limits(plan: Plan) -> _Active:
     if not has_multiplier.any():
         return _Active(np.zeros((0, plan.inputs.size)), np.zeros(0), 0.0)
     _, _, sensitivity = sensitivity_of(ocp)(plan.states[:, 0], plan.inputs, plan.data)
-    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")[
-        has_multiplier
-    ]
+    limits = np.where(multipliers > 0, ocp.state_upper[:, None], ocp.state_lower[:, None]).ravel(order="F")
     active = multipliers.ravel(order="F")[has_multiplier]
-    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F")[has_multiplier] - limits)
+    beyond = np.sign(active) * (plan.states[:, 1:].ravel(order="F") - limits)[has_multiplier]
     products = np.abs(beyond * active)
     return _Active(np.asarray(sensitivity.full())[has_multiplier], beyond, float(products.max()))
 
@@ -189,7 +183,7 @@ def _active_limits(plan: Plan) -> _Active:
 def _directions(free: np.ndarray, active: _Active) -> np.ndarray:
     """Return an orthonormal basis (N nu, k) of the moves of free inputs along which no active limit changes."""
     selected = np.eye(free.size)[:, free]
-    if not active.count or not free.any():
+    if not len(active.rows) or not free.any():
         return selected
     _, sizes, turned = np.linalg.svd(active.rows[:, free])
     rank = int((sizes > _RANK * sizes.max()).sum())
@@ -198,7 +192,7 @@ def _directions(free: np.ndarray, active: _Active) -> np.ndarray:
 
 def _largest_return(active: _Active, free: np.ndarray) -> float:
     """Return the largest entry of the shortest move of free inputs that puts the active limits right, to first order."""
-    if not active.count or not free.any():
+    if not len(active.rows) or not free.any():
         return 0.0
     return float(np.abs(np.linalg.pinv(active.rows[:, free], rcond=_RANK) @ active.distances).max())
 

@@ -91,14 +91,11 @@ class Runner:
 
     def _loop(self, one: Variant, own: Mapping[str, float]) -> tuple[Simulator, bool]:
         """The loop of a variant, and whether its settings are live in it; where they cannot be it is built with them."""
-        found = self._built(one, own, live=True)
-        if isinstance(found, FpirhcError) and own:
-            found = self._built(one, own, live=False)
+        for live in (True, False) if own else (True,):
+            found = self._built(one, own, live=live)
             if isinstance(found, Simulator):
-                return found, False
-        if isinstance(found, FpirhcError):
-            raise found
-        return found, True
+                return found, live
+        raise found
 
     def _built(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:
         key = one.build, tuple(own) if live else tuple(own.items())
@@ -212,11 +209,12 @@ def _answers(
     path, told, names = str(task.path.resolve()), _told(task), {one.name for one in metrics}
     _require_same(load_problem(path), told)
     work = joblib.Parallel(n_jobs=processes, return_as="generator_unordered", batch_size=1)
+    killed = getattr(sys.modules.get("distributed.scheduler"), "KilledWorker", BrokenProcessPool)  # where Dask is used
     answers = work(joblib.delayed(_remote)(path, told, variants, n, some, compiled, names) for n, some in jobs)
     try:
         for rows in answers:
             yield from rows
-    except _deaths() as error:
+    except (BrokenProcessPool, killed) as error:
         raise WorkerDied(
             "a process of the study was killed, perhaps for want of memory; finished runs are kept: the same call goes on with the "
             f"others ({type(error).__name__})"
@@ -224,13 +222,6 @@ def _answers(
     finally:
         with contextlib.suppress(Exception):
             answers.close()
-
-
-def _deaths() -> tuple[type[BaseException], ...]:
-    """What joblib and Dask raise where a worker was killed."""
-    scheduler = sys.modules.get("distributed.scheduler")
-    known = () if scheduler is None else (scheduler.KilledWorker,)
-    return (BrokenProcessPool, *known)
 
 
 def _told(task: Task) -> str:

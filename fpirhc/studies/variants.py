@@ -20,7 +20,6 @@ from fpirhc.problem_files.settings import number_of_case, of_problem, with_numbe
 from fpirhc.task.problem import Problem
 
 _WHOLE_CYCLE = 1e-9  # cycles by which a dead time of whole ones may be off
-_MOST_AXES = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +205,7 @@ class Grid(Variants):
                 raise InvalidValue(f"--over {text}: {wrong}")
             values = (np.geomspace if rest else np.linspace)(*ends, points)
             axes[path] = tuple(float(f"{v:.10g}") for v in values)
-        if not 1 <= len(axes) <= _MOST_AXES:
+        if not 1 <= len(axes) <= 2:
             raise InvalidValue(f"--over: {len(axes)} settings; expected one or two")
         return cls(axes, seed)
 

@@ -11,15 +11,16 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, derivative_of, nearest
-from fpirhc.plant.motion import followed_units, with_space
+from fpirhc.plant.motion import derivative_unit, followed_units, with_space
 from fpirhc.simulation.loop import HeldInput
-from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric
-from fpirhc.simulation.metrics.shipped import rms_error
+from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, measured_cycles
+from fpirhc.simulation.metrics.shipped import at_limits, rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
 from fpirhc.summary import in_percent, in_words, number
@@ -143,7 +144,8 @@ class Finding:
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
 STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
-WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own size: chatter
+WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own span: chatter
+SWING = 0.05  # of the limits' range: as a sine from end to end in 11 cycles, or jumps between the ends every 10
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
 _SAMPLES = 2000
 
@@ -183,6 +185,7 @@ def ranges(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
 class Yardstick:
     """What errors are measured against, by judged coordinate."""
 
+    problem: Problem
     scales: Mapping[str, float]  # the ranges
     alone: Mapping[str, float]  # rms error of the plant left alone; empty where it is not known
     resting: Mapping[str, float]  # the set-point's size of what rests; under disturbances, of the movement left alone
@@ -194,7 +197,7 @@ class Yardstick:
         (scales, sizes), alone = ranges(problem), left_alone(problem, seed)
         resting = {n: max(s, alone.get(n, s)) if problem.disturbances or not s else s for n, s in sizes.items()}
         span = f"t = {number(problem.measure_from)} to {number(problem.duration)}{with_space(problem.time_unit)}"
-        return Yardstick(scales, alone, resting, span)
+        return Yardstick(problem, scales, alone, resting, span)
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
@@ -227,30 +230,35 @@ def _growth(pair: Pair) -> float:
     return max((largest[-1] / np.maximum(largest[0], TINY))[exponential], default=math.nan)
 
 
-def _unsolved(pair: Pair) -> float:
-    return pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles
-
-
-def _moved(pair: Pair) -> dict[str, float]:
-    """How many times as much each input moves; what stands still counts as moving by a millionth of its size."""
+def _moves(pair: Pair, ways: float = 0.0) -> float:
+    """How many times as much an input moves, of those that move `ways` times their span; what stands still moves by STILL."""
     before, after = (e.metrics.total_variation for e in (pair.plain, pair.adaptive))
-    size = pair.adaptive.metrics["effort"]
-    return {n: v / max(before[n], STILL * size[n]) for n, v in after.items() if v > 0}
+    size, run = pair.adaptive.metrics["effort"], pair.adaptive.run
+    moved = [n for n in after if after[n] > 0 and np.abs(np.diff(c := run[f"command.{n}"])).sum() >= ways * np.ptp(c)]
+    return max((after[n] / max(before[n], STILL * size[n]) for n in moved), default=math.nan)
 
 
-def _moves(pair: Pair) -> float:
-    return max(_moved(pair).values(), default=math.nan)
+_chatters = partial(_moves, ways=TO_AND_FRO)
 
 
-def _chatters(pair: Pair) -> float:
-    """The same of inputs that move many times their own span: a command that settles once moves by its span."""
-    moved, run = _moved(pair), pair.adaptive.run
-    back_and_forth = {n for n in moved if np.abs(np.diff(c := run[f"command.{n}"])).sum() >= TO_AND_FRO * np.ptp(c)}
-    return max((moved[n] for n in back_and_forth), default=math.nan)
+def _swing(pair: Pair) -> float:
+    """How far both commands are from the mean of those before and after, as a share of the limits' range."""
+    problem, runs = pair.yard.problem, (pair.plain.run, pair.adaptive.run)
+    low, high = problem.limits.input_bounds(problem.plant)
+    bends = [np.abs(np.diff(run["command"][measured_cycles(problem, run)], 2, axis=0)) / 2 for run in runs]
+    far = np.min([one.sum(axis=0) / max(len(one), 1) for one in bends], axis=0)
+    return float((far / np.maximum(high - low, TINY)).max(initial=0.0))
 
 
-def _grows(pair: Pair) -> float:
-    return math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing
+def _at(pair: Pair) -> str:
+    """The limit at which a command stands most."""
+    problem, run = pair.yard.problem, pair.adaptive.run
+    every, values = (at_limits(problem, run, rates=one).mean(axis=0) for one in (True, False))
+    k = int(every.argmax())
+    rate, (name, unit) = bool(values[k] < every[k] / 2), [*problem.plant.inputs.items()][k]
+    ends = (problem.limits.rate_bounds if rate else problem.limits.input_bounds)(problem.plant)
+    unit = with_space(derivative_unit(unit, int(rate), problem.time_unit))
+    return f"its {'rate' if rate else 'value'} ({name}: {ends[0][k]:.4g} to {ends[1][k]:.4g}{unit})"
 
 
 def _null(pair: Pair) -> float:
@@ -273,12 +281,16 @@ NULL = "its own model as the plant, the problem's sensors and no disturbances"
 FLAGS = (
     Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
-    Flag(_unsolved, 0.05, "{value:%} of its plans did not converge: give the optimiser more iterations", True),
+    Flag(lambda pair: pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles, 0.05,
+         "{value:%} of its plans did not converge: give the optimiser more iterations", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], 0.2,
-         "its command is at a limit, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
+         "its command is at a limit of {at}, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
+    Flag(_swing, SWING, "both commands swing: on average each is {value:%} of its limits' range off the mean of the one before and "
+         "the one after", True),
     Flag(_chatters, WILD, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
-    Flag(_grows, 0.05, "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
+    Flag(lambda pair: math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing, 0.05,
+         "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),
 )  # fmt: skip
 
@@ -286,7 +298,7 @@ FLAGS = (
 def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
     every, before = [(flag, flag.measure(pair)) for flag in FLAGS], pair.plain.metrics["at_limit"][""]
-    raised = [(f, in_words(f.text, {"value": v, "before": before}, {})) for f, v in every if v > f.least]
+    raised = [(f, in_words(f.text, {"value": v, "before": before}, {}, at=_at(pair))) for f, v in every if v > f.least]
     chatter = any(flag.measure is _chatters for flag, _ in raised)
     return [one for one in raised if not (chatter and one[0].measure is _moves)]
 
@@ -324,6 +336,7 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
         outcome, said = Outcome.NOT_COMPARABLE, [*said, "neither follows the reference"]
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
+    outcome = Outcome.LIMIT_LEFT if adaptive.left else outcome
     errors = ", ".join(f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(run.unit(f'error.{n}'))}" for n in ratios)
     text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'}, {yard.span})."
     return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
@@ -345,6 +358,7 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
         outcome = Outcome.NO_DIFFERENCE
     else:
         outcome = Outcome.BETTER if aim.sign * after < aim.sign * before else Outcome.WORSE
+    outcome = Outcome.LIMIT_LEFT if adaptive.left else outcome
     text = f"{names[1]} against {names[0]} by {aim.column}: {outcome} ({aim.text(before)} -> {aim.text(after)})."
     return Finding(text, outcome, names, {aim.column: ratio})
 

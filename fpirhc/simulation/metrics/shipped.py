@@ -80,8 +80,8 @@ def at_limit(problem: Problem, run: Run) -> float:
     return float(_mean(np.asarray(at_limits(problem, run).any(axis=1))))
 
 
-def at_limits(problem: Problem, run: Run) -> np.ndarray:
-    """Return whether every command, or its change, stands at a limit in every measured cycle, shape (cycles, inputs)."""
+def at_limits(problem: Problem, run: Run, *, rates: bool = True) -> np.ndarray:
+    """Return whether every command, or with `rates` its change, is at a limit in a measured cycle, shape (cycles, inputs)."""
     given = cast(Mapping[str, float], run.settings.get("live", {}))  # limits that the run was given
     ends = enumerate(problem.limits.input_bounds(problem.plant))
     lower, upper = (
@@ -93,7 +93,7 @@ def at_limits(problem: Problem, run: Run) -> np.ndarray:
     stands = (commands <= lower + near) | (commands >= upper - near)
     slowest, fastest = _AT_RATE * problem.period * np.array(problem.limits.rate_bounds(problem.plant))
     moves = np.diff(commands, axis=0, prepend=commands[:1])
-    stands |= (moves <= slowest) | (moves >= fastest)
+    stands |= ((moves <= slowest) | (moves >= fastest)) & rates
     return np.asarray(stands)
 
 
