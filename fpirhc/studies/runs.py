@@ -95,6 +95,7 @@ class Runner:
             found = self._built(one, own, live=live)
             if isinstance(found, Simulator):
                 return found, live
+        assert isinstance(found, FpirhcError)
         raise found
 
     def _built(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:

@@ -91,10 +91,8 @@ def test_an_exact_map_of_a_minute_has_no_error() -> None:
 @pytest.mark.parametrize("which", ["shipped", "one start"])
 def test_an_economic_plan_is_the_published_run(which: str) -> None:
     """The rates of 17 minutes and the time spent after 96 steps of sym-metanet's metering; one start ends in another minimum."""
-    shipped, rates = (
-        task("freeway_economic"),
-        np.loadtxt(DATA.with_name("metering.csv"), delimiter=",", skiprows=1)[:, 1],
-    )
+    shipped = task("freeway_economic")
+    rates = np.loadtxt(DATA.with_name("metering.csv"), delimiter=",", skiprows=1)[:, 1]
     plans: Any = shipped.controllers["RHC"]
     own = plans.optimiser
     optimiser = {"shipped": own, "one start": replace(own, second_start=False)}[which]

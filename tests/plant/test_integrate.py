@@ -66,10 +66,8 @@ def test_a_stiff_plant_is_sent_to_collocation_which_follows_it():
     for _ in range(20):
         x = step(x, [0.1], STIFF.exact, [0.0, 0.0]).full().ravel()
     np.testing.assert_allclose(x, _truth(STIFF, [0.5, 0.0], [0.1], 1.0, "Radau"), atol=1e-4, equal_nan=False)
-    reference, limits = (
-        fp.Trajectory(lambda t: {"slow": 0.5 + 0 * t, "fast": 1.0 + 0 * t}),
-        fp.Limits(inputs={"u": (-2.0, 2.0)}),
-    )
+    reference = fp.Trajectory(lambda t: {"slow": 0.5 + 0 * t, "fast": 1.0 + 0 * t})
+    limits = fp.Limits(inputs={"u": (-2.0, 2.0)})
     asked = {
         "duration": 1.0,
         "plant": STIFF,

@@ -44,11 +44,8 @@ def test_the_derivative_is_rotorpys(beside):
         "rotor_speed_max": vehicle.FASTEST,
     }
     multirotor = import_module("rotorpy.vehicles.multirotor")
-    theirs, rate, random = (
-        multirotor.Multirotor(parameters, aero=True),
-        vehicle.derivative(told),
-        np.random.default_rng(0),
-    )
+    theirs, rate = multirotor.Multirotor(parameters, aero=True), vehicle.derivative(told)
+    random = np.random.default_rng(0)
     inertia = np.diag([told[name] for name in ("Ixx", "Iyy", "Izz")])
     for _ in range(20):
         q = random.normal(size=4)

@@ -76,10 +76,8 @@ def test_errors_of_a_body_outside_are_those_of_now():
             self.state = np.array([q + PERIOD * v + PERIOD**2 / 2 * command[0], v + PERIOD * command[0]])
             return self.state
 
-    body, seen = (
-        fp.ExternalPlant(Body(), measures={"q": "m", "q'": "m/s"}),
-        fp.Sensing(estimator=fp.VelocityDifference()),
-    )
+    body = fp.ExternalPlant(Body(), measures={"q": "m", "q'": "m/s"})
+    seen = fp.Sensing(estimator=fp.VelocityDifference())
     motion = {"reference": fp.Trajectory(lambda t: {"q": ca.sin(t)}), "start": {"q": 0.0, "q'": 1.0}}
     problem = replace(mass(0.0).with_exact(np.zeros(1)), reality=body, sensing=seen, **motion)
     run = fp.simulate(problem, law(0.08, by="desired"), seed=0, compiled=False)
