@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import eigh
 
 from fpirhc.describe import identity
 from fpirhc.errors import InvalidProblem
@@ -69,14 +70,14 @@ def certify(plan: Plan) -> Certificate:
     if not basis.shape[1]:
         return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
     model, pull = basis.T @ _model(plan) @ basis, basis.T @ slope
-    root = np.linalg.cholesky(model + _ROUNDING * np.trace(model) * np.eye(model.shape[0]))
+    norm = model + _ROUNDING * np.trace(model) * np.eye(model.shape[0])
     move = np.linalg.solve(model, pull)
-    values = _relative_eigenvalues(root, basis.T @ hessian @ basis)
+    values = eigh(basis.T @ hessian @ basis, norm, eigvals_only=True)
     further = (plan.inputs.ravel(order="F") - basis @ move).reshape(plan.inputs.shape, order="F")
     inputs = np.clip(further, *(b[:, None] for b in plan.bounds))
     slope_there, hessian_there = _second_order(plan, inputs)
     same = bool(np.all(_free(plan, inputs, slope_there) == free))
-    beyond = _relative_eigenvalues(root, basis.T @ hessian_there @ basis)
+    beyond = eigh(basis.T @ hessian_there @ basis, norm, eigvals_only=True)
     here, there = (float(np.abs(1 - v).max()) for v in (values, beyond))
     factor = max(here, there) + abs(here - there) if same else float("inf")
     length = float(np.sqrt(max(pull @ move, 0.0)))
@@ -84,16 +85,8 @@ def certify(plan: Plan) -> Certificate:
     spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
     suboptimality = length**2 / (2 * (1 - factor)) + held.complementarity * active if factor < 1 else float("nan")
     least, back = float(values.min()), _largest_return(held, free)
-    return Certificate(
-        *(stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least), *about
-    )
-
-
-def _relative_eigenvalues(root: np.ndarray, hessian: np.ndarray) -> np.ndarray:
-    """Eigenvalues of M^-1 H with M = root root'."""
-    half = np.linalg.solve(root, hessian)
-    whole = np.linalg.solve(root, half.T)
-    return np.asarray(np.linalg.eigvalsh(0.5 * (whole + whole.T)))
+    known = stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least
+    return Certificate(*known, *about)
 
 
 def _second_order(plan: Plan, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -116,10 +109,8 @@ def _derivatives(ocp: OptimalControl) -> tuple[ca.Function, ca.Function]:
     slope = gradient(*point)[1]
     along = ca.jtimes(slope, point[1], direction)
     product = ca.Function("fpirhc_hessian_times", [*point, direction], [ca.vec(along)])
-    return (
-        ca.Function("fpirhc_slope", point, [ca.vec(slope)]),
-        product.map("fpirhc_hessian_columns", "serial", nu * n, [0, 1, 2, 3], []),
-    )
+    columns = product.map("fpirhc_hessian_columns", "serial", nu * n, [0, 1, 2, 3], [])
+    return ca.Function("fpirhc_slope", point, [ca.vec(slope)]), columns
 
 
 @lru_cache(maxsize=_REMEMBERED)

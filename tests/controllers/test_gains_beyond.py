@@ -40,12 +40,8 @@ def test_a_gain_beyond_the_limit_is_refused_in_every_way(gain):
 
 @pytest.mark.parametrize("gain", [-0.99 * LARGEST, -0.1])
 def test_a_gain_below_the_limit_runs(gain):
-    assert (
-        fp.simulator(brief(), affine(-0.5), live=["deformation.gain"])
-        .run(seed=0, settings={"deformation.gain": gain})
-        .stop
-        is None
-    )
+    loop = fp.simulator(brief(), affine(-0.5), live=["deformation.gain"])
+    assert loop.run(seed=0, settings={"deformation.gain": gain}).stop is None
 
 
 def test_a_map_that_lowers_its_gain_begins_where_it_likes():

@@ -36,13 +36,8 @@ def test_affine():
 
 def test_filtered():
     """g+ = p g + (1 - p) (f - d) and r+ = r + A_c / 2 g+."""
-    memory, error, r, f, d = (
-        {"filter_error": ca.SX([4.0, -2.0])},
-        np.array([4.0, -2.0]),
-        [1.0, 2.0],
-        [3.0, 5.0],
-        [2.0, 1.0],
-    )
+    error, r, f, d = np.array([4.0, -2.0]), [1.0, 2.0], [3.0, 5.0], [2.0, 1.0]
+    memory = {"filter_error": ca.SX(error)}
     for _ in range(2):
         request, memory = fp.Filtered(fp.Affine(gain=-0.8), pole=0.7).step(ca.SX(r), ca.SX(f), ca.SX(d), memory)
         error = 0.7 * error + 0.3 * np.subtract(f, d)

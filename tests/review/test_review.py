@@ -3,7 +3,9 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -24,6 +26,18 @@ def test_a_limit_that_is_left_has_the_numbers_of_the_run():
     worst, most = int(speed.argmax()), speed.max() - 1
     wanted = {"excess": most, "beyond": most / 2, "time_of_it": worst * PERIOD, "share_of_cycles": np.mean(speed > 1)}
     assert answers(fast)["limits"].numbers == pytest.approx(wanted, rel=5e-3)
+
+
+def test_an_interrupted_review_tells_what_it_knows():
+    """That it was interrupted is a no, and its answers are those of the whole one, of which advice is told row by row."""
+    asked, seen = partial(fp.review, mass(), {"it": torque(gain=-40.0)}, mismatch=0.0, seed=0), Mock()
+    whole, told = asked(progress=seen).answers["it"], [call.args for call in seen.call_args_list]
+    bad = sum(a.verdict in ("no", "caution") for a in whole)
+    assert told[-1] == ("trying advice for it", bad, bad)
+    before = told.index(("trying advice for it", 0, bad))
+    part = asked(progress=Mock(side_effect=[None] * before + [KeyboardInterrupt])).answers
+    assert [a.key for a in part["problem"] if a.verdict == "no"] == ["finished"]
+    assert [(a.key, a.verdict) for a in part["it"]] == [(a.key, a.verdict) for a in whole]
 
 
 def test_a_start_and_a_reference_outside_hard_limits_are_named_first_and_as_the_cause():
@@ -110,9 +124,8 @@ def test_the_limit_cycle_of_an_encoder_is_no_answer_to_a_push():
 
 def test_a_set_point_is_judged_beside_the_plant_that_is_left_alone():
     """A room starts .1 K off, and the sun heats it by 2.5 K: laws leave 1.4, .94 and .2 K of that."""
-    room = fp.Plant(
-        {"T": "K"}, {"u": "K/s"}, {"a": fp.Parameter(1.0, 1.2, "1/s")}, lambda x, u, p: {"T": u.u - p.a * x.T}, order=1
-    )
+    loss = {"a": fp.Parameter(1.0, 1.2, "1/s")}
+    room = fp.Plant({"T": "K"}, {"u": "K/s"}, loss, lambda x, u, p: {"T": u.u - p.a * x.T}, order=1)
     usual = {"period": 0.01, "duration": 10.0, "measure_from": 5.0, "disturbances": {"u": fp.Step(at=1.0, size=3.0)}}
     problem = fp.Problem(room, fp.Trajectory(lambda t: {"T": 0 * t}), {"T": 0.1}, **usual)
     for rate, verdict in ((2.0, "no"), (3.0, "caution"), (15.0, "yes")):
