@@ -84,9 +84,8 @@ def _turns(case: Case) -> Fact | None:
 def _posed(case: Case) -> Fact | None:
     finite = np.isfinite(needed_commands(case.problem, case.bench.nominal["plant_state"])).all(axis=1)
     bad = Verdict.CAUTION if case.problem.plant.equations.hidden else Verdict.NO  # states that are taken from the run
-    return (
-        Fact(Verdict.YES if finite.all() else bad, {"share_finite": finite.mean()}, root=True) if len(finite) else None
-    )
+    verdict = Verdict.YES if finite.all() else bad
+    return Fact(verdict, {"share_finite": finite.mean()}, root=True) if len(finite) else None
 
 
 def misplaced(problem: Problem) -> list[str]:
@@ -134,20 +133,23 @@ def _saturates(case: Case) -> Fact | None:
     if not run.cycles or not np.isfinite(limits).any():
         return None
 
-    def of_limit(commands: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(commands == 0, 0.0, commands / np.where(commands < 0, *limits)).max(axis=0))
-
     stuck = max(bench.draws, key=bench.held) if bench.problem.sensing.drawn else run
-    sent, states = (run[name][bench.first(run.cycles) :] for name in ("command", "plant_state"))
-    largest, held = of_limit(sent), bench.held(stuck)
+    held, states, plain = bench.held(stuck), run["plant_state"][bench.first(run.cycles) :], case.plain
     stands = bench.at_limits(stuck)[bench.first(stuck.cycles) :].mean(axis=0)
-    at = int((stands if held > SATURATED else largest).argmax())
     wanted = [needed_commands(case.problem, states, exact=one) for one in (False, case.problem.reality is None)]
-    needed, plain = max(of_limit(one)[at] for one in wanted), case.plain
-    sizes = {"largest": np.abs(sent[:, at]).max(), "share_of_the_limit": largest[at]}
-    numbers = {"at_a_limit": held} | (sizes if largest[at] > ROUNDING else {})  # it may stand at a limit of zero
-    numbers |= {"needed": needed} if np.isfinite(needed) and not plant.equations.hidden else {}
+    asked = np.concatenate(wanted)
+    beyond = np.maximum(limits[0] - asked, asked - limits[1])  # a share is then of half of the range
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(asked == 0, 0.0, asked / np.where(asked < 0, *limits))
+        outside = beyond > ROUNDING * np.abs(asked).max(axis=0)
+        needs = np.where(outside, 1 + 2 * beyond / (limits[1] - limits[0]), shares).max(axis=0)
+    at = int((stands if held > SATURATED else np.nan_to_num(needs)).argmax())
+    numbers = {"at_a_limit": held}
+    if np.isfinite(needs[at]) and not plant.equations.hidden:
+        least, most, ends = asked[:, at].min(), asked[:, at].max(), limits[:, at]
+        numbers |= {"needed": needs[at]}
+        numbers |= {"needed_least": least, "needed_most": most} if most > least else {"needed_always": most}
+        numbers |= {"lower": ends[0], "upper": ends[1]} if np.isfinite(ends).all() else {}
     once = max(np.abs(np.diff(one[:, at])).mean() for one in wanted) / case.problem.period
     moves, room = plain.moves(plain.nominal)[at], numbers.get("needed", math.inf) <= ROOM
     swings = plain.controller.planner is not None and room and moves > 4 * once
@@ -221,16 +223,16 @@ def _box(case: Case) -> Fact | None:
         found.append((bench.pushed(base=base, exact=exact)[0].left, bench.share(base)))
     good, most = float(np.mean([left <= 1 and share <= 1 for left, share in found])), np.max(found, axis=0)
     verdict = Verdict.YES if good == 1 else Verdict.CAUTION if good else Verdict.NO
-    return Fact(verdict, {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]})
+    numbers = {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]}
+    return Fact(verdict, numbers, says="none of {plants} plants does" * (good == 0))
 
 
 def _gains(case: Case) -> Fact:
-    def bears(gain: float) -> bool:
-        run = case.bench.pushed(gain=gain)[0]
-        return run.left <= 1 and run.steps <= BUSY * max(CALM, case.bench.back.steps)
-
-    least, most = (gain if bears(gain) else 1.0 for gain in (0.7, 1.4))
-    return Fact(Verdict.YES if least < 1 < most else Verdict.CAUTION, {"most": most, "least": least})
+    runs = {gain: case.bench.pushed(gain=gain)[0] for gain in (0.7, 1.4)}
+    steps = BUSY * max(CALM, case.bench.back.steps)
+    least, most = (gain if run.left <= 1 and run.steps <= steps else 1.0 for gain, run in runs.items())
+    verdict, says = Verdict.YES if least < 1 < most else Verdict.CAUTION, "it bears neither" * (least == most)
+    return Fact(verdict, {"most": most, "least": least}, says=says)
 
 
 def _latency(case: Case) -> Fact:
@@ -399,11 +401,7 @@ def _model(case: Case) -> Fact:
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
     name, numbers, harms = _added(case, without, adapted, SLIGHT)
     spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
-    no = (
-        spoils
-        and not case.outside
-        and ((harms > 2 and numbers["added"] > 0.01) or (harms > 10 and numbers["added"] > SLIGHT))
-    )
+    no = spoils and not case.outside and harms > 2 and numbers["added"] > (SLIGHT if harms > 10 else 0.01)
     verdict = Verdict.NO if no else Verdict.CAUTION if spoils and harms > WORSE else Verdict.YES
     return Fact(verdict, numbers, name)
 
@@ -430,9 +428,10 @@ QUESTIONS = (
     Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of them did not converge| with 8 times the "
              "iterations the relative error is {error_with_more_iterations:%} in place of {error:%}", "Give the optimiser more "
              "iterations, or a smaller tolerance, before anything else."),
-    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change is at a limit in "
-             "{at_a_limit:%} of the cycles| and the reference needs {needed:%} of the limit| without adaptation it swings with a "
-             "period of {period} {time}", "", "gain rate weight window Predicted limits speed"),
+    Question("input_limits", "Do the input limits fit the task?", _saturates, "the loop swings with a period of {period} "
+             "{time} without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| and the reference "
+             "needs {needed_least} to {needed_most:u} of {of}| and the reference needs {needed_always:u} of {of}| whose limits are "
+             "{lower} to {upper:u}", "", "gain rate weight window Predicted limits speed"),
     Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}| {error_without:%} without "
              "adaptation| {error_recommended:%} at {recommended_gain:4}", "No gain that was run helps, is calm, and has reserve.",
              "filter form lag Predicted window sensors without", "adaptive"),

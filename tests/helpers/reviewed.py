@@ -58,6 +58,14 @@ def slow_room() -> fp.Problem:
     return fp.Problem(room, path, {"T": 0.9}, period=0.1, duration=400.0, measure_from=100.0, **plan)
 
 
+def heater() -> fp.Problem:
+    """It heats a room with 0 to 20 K/s, and its reference asks for a +- sqrt(a^2 + 4), of the model and of the plant."""
+    lost = {"a": fp.Parameter(1.0, 1.2, "1/s")}
+    room = fp.Plant({"T": "K"}, {"u": "K/s"}, lost, lambda x, u, p: {"T": u.u - p.a * x.T}, order=1)
+    wave, ends = fp.Trajectory(lambda t: {"T": 1 + ca.sin(2 * t)}), fp.Limits({"u": (0.0, 20.0)})
+    return fp.Problem(room, wave, {"T": 1.0}, period=0.01, duration=10.0, limits=ends)
+
+
 def limited_rate() -> fp.Problem:
     """A force that may change by 20 N/s: an own loop with such an actuator has .637 m without adaptation, and metres with it."""
     return cart(

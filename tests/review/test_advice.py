@@ -115,17 +115,31 @@ def test_a_window_is_looked_for_up_to_eight_times_the_own():
     assert "to 41." in answers(motor(1.0, sensing=seen), fp.ComputedTorque(fp.Exponential(8.0)))["noise"].change
 
 
+def pushed_away(force: float, **settings: Any) -> fp.Problem:
+    """A mass that a spring pushes away, which at most this force holds."""
+    known = {name: fp.Parameter(value, value, "1") for name, value in (("k", 4.0), ("b", 1.0))}
+    plant = fp.Plant({"q": "m"}, {"u": "N"}, known, lambda q, v, u, p: {"q": p.k * q.q + p.b * u.u})
+    wave, ends = fp.Trajectory(lambda t: {"q": 0.05 * ca.sin(t)}), fp.Limits(inputs={"u": (-force, force)})
+    return fp.Problem(plant, wave, {"q": 0.0, "q'": 0.05}, period=1e-2, duration=10.0, limits=ends, **settings)
+
+
 def test_limits_are_named_where_a_push_is_lost_at_them():
-    """A mass that a spring pushes away comes back from a tenth of its range alone with a larger force."""
-    plant = fp.Plant({"q": "m"}, {"u": "N"}, {}, lambda q, v, u, p: {"q": 4 * q.q + u.u})
-    wave = fp.Trajectory(lambda t: {"q": 0.05 * ca.sin(t)})
-    usual: dict[str, Any] = {"start": {"q": 0.0, "q'": 0.05}, "period": 1e-2, "duration": 10.0}
-    far = fp.Problem(plant, wave, limits=fp.Limits(inputs={"u": (-0.2505, 0.2505)}), **usual)
-    found = answers(far, fp.ComputedTorque(fp.Exponential(rate=3.0)))
+    """It comes back from a tenth of its range alone with a larger force."""
+    found = answers(pushed_away(0.2505), fp.ComputedTorque(fp.Exponential(rate=3.0)))
     assert found["returns"].numbers["at_a_limit"] > 0.2 > found["input_limits"].numbers["at_a_limit"]
-    assert found["returns"].change.startswith("Widen the limits of the inputs: it passes")
-    wide = replace(far, limits=fp.Limits(inputs={"u": (-0.501, 0.501)}))
-    assert answers(wide, fp.ComputedTorque(fp.Exponential(rate=3.0)))["returns"].verdict == "yes"
+    assert found["returns"].change.endswith(': it passes with Limits(inputs={"u": (-0.501, 0.501)}).')
+    assert answers(pushed_away(0.501), fp.ComputedTorque(fp.Exponential(rate=3.0)))["returns"].verdict == "yes"
+
+
+@pytest.mark.parametrize(
+    ("force", "late", "rate", "key", "words"),
+    [(1e3, 0.31, 1.2, "input_gain", "It bears neither."), (0.252, 0.17, 3.0, "box", "None of 4 plants does")],
+)
+def test_what_bears_nothing_is_said_so(force, late, rate, key, words):
+    """By a late command it swings with more gain, and falls with less; a little force holds no other plant."""
+    problem = pushed_away(force, dead_time=fp.DeadTime({"u": late}))
+    own = fp.ComputedTorque(fp.Exponential(rate, integral=False))
+    assert answers(problem, own, mismatch=40.0)[key].evidence.startswith(words)
 
 
 def test_the_worked_review_of_the_page_is_what_the_command_prints(tmp_path: Path, monkeypatch, capsys):

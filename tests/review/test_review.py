@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers import tasks
 from helpers.line import line_text
-from helpers.reviewed import PERIOD, answers, biased, heavy, mass, plans, torque
+from helpers.reviewed import PERIOD, answers, biased, heater, heavy, mass, plans, torque
 
 import fpirhc as fp
 from fpirhc.__main__ import main
@@ -110,9 +110,9 @@ def test_limits_of_inputs_that_do_not_fit_are_told(limit, rate, verdict):
     limits = fp.Limits(inputs={"u": (-limit, limit)}, rates={"u": (-rate, rate)})
     problem = mass(plant=heavy(1.0, 1.5, (10.0, 6.0)), limits=limits)
     told, run = answers(problem)["input_limits"], fp.simulate(problem, torque(), seed=0, compiled=False)
-    shares = fp.measure(problem, run)["at_limit"][""], np.abs(run["command.u"]).max() / limit, 3.75 / limit
-    names = "at_a_limit", "share_of_the_limit", "needed"
-    assert (told.verdict, *map(told.numbers.get, names)) == (verdict, *map(pytest.approx, shares))
+    wanted = fp.measure(problem, run)["at_limit"][""], 3.75 / limit, -limit, limit
+    names = "at_a_limit", "needed", "lower", "upper"
+    assert (told.verdict, *map(told.numbers.get, names)) == (verdict, *map(pytest.approx, wanted))
 
 
 def test_the_limit_cycle_of_an_encoder_is_no_answer_to_a_push():
@@ -124,10 +124,8 @@ def test_the_limit_cycle_of_an_encoder_is_no_answer_to_a_push():
 
 def test_a_set_point_is_judged_beside_the_plant_that_is_left_alone():
     """A room starts .1 K off, and the sun heats it by 2.5 K: laws leave 1.4, .94 and .2 K of that."""
-    loss = {"a": fp.Parameter(1.0, 1.2, "1/s")}
-    room = fp.Plant({"T": "K"}, {"u": "K/s"}, loss, lambda x, u, p: {"T": u.u - p.a * x.T}, order=1)
-    usual = {"period": 0.01, "duration": 10.0, "measure_from": 5.0, "disturbances": {"u": fp.Step(at=1.0, size=3.0)}}
-    problem = fp.Problem(room, fp.Trajectory(lambda t: {"T": 0 * t}), {"T": 0.1}, **usual)
+    still = {"reference": fp.Trajectory(lambda t: {"T": 0 * t}), "start": {"T": 0.1}, "limits": fp.Limits()}
+    problem = replace(heater(), **still, measure_from=5.0, disturbances={"u": fp.Step(at=1.0, size=3.0)})
     for rate, verdict in ((2.0, "no"), (3.0, "caution"), (15.0, "yes")):
         told = answers(problem, fp.ComputedTorque(fp.Exponential(rate, integral=False)))["follows"]
         sizes = {"size": pytest.approx(3 / 1.2, rel=0.01), "rms_error": pytest.approx(3 / (rate + 0.2), rel=0.02)}

@@ -91,17 +91,19 @@ CASES: dict[str, Case] = {
     ),
     "a servo and its recommended gain": Case(
         lambda: (reviewed.servo(), {str(g): plans(iterations=None, tolerance=None, gain=g)["RHC+FPI"] for g in SERVO}),
-        {
-            (g, key): said
-            for g, said in (("-1.0", "no"), ("-1.97", "yes"), ("-2.12", "yes"))
-            for key in ("gain", "returns", "pays")
-        },
+        {("-1.0", key): "no" for key in ("gain", "returns", "pays")},
         {
             (g, "pays", "error_with"): (e, 0.05 * e)
             for g, e in zip(map(str, SERVO), (0.0130, 2.28e-4, 2.27e-4), strict=True)
         },
         never=("problem", "-1.97", "-2.12"),
         changes={("-1.0", "returns"): "Set deformation.gain to -2."},
+    ),
+    "a heater that would have to cool": Case(
+        lambda: (reviewed.heater(), {"it": fp.ComputedTorque(fp.Exponential(3.0, integral=False))}),
+        {("it", "input_limits"): "caution"},
+        {("it", "input_limits", f"needed_{end}"): (u, 1e-3) for end, u in (("least", 1 - 5**0.5), ("most", 3.5324))},
+        changes={("it", "input_limits"): "Slow the reference to a quarter of its speed."},
     ),
     "a map that swings while plans converge": Case(
         lambda: (reviewed.lift(), {"it": sigmoid(-1.0)}),
@@ -249,6 +251,7 @@ def test_a_weight_on_changes_stills_what_swings_without_adaptation():
     problem = replace(biased(0.0), duration=3.0, sensing=late, horizon=fp.Horizon(10, 0.03), cost=light)
     both = fp.review(problem, plans(iterations=10), mismatch=0.0, seed=0).answers
     told = [{a.key: a for a in both[name]} for name in plans()]
+    assert told[0]["input_limits"].evidence.startswith("The loop swings with a period of ")
     wrong = [{a.change for a in some.values() if a.verdict in ("no", "caution")} for some in told]
     assert wrong == [{some["input_limits"].change} for some in told]
     words = told[0]["input_limits"].change.partition('rate={"F": ')[2]
