@@ -151,14 +151,14 @@ def _saturates(case: Case) -> Fact | None:
         numbers |= {"needed_least": least, "needed_most": most} if most > least else {"needed_always": most}
         numbers |= {"lower": ends[0], "upper": ends[1]} if np.isfinite(ends).all() else {}
     once = max(np.abs(np.diff(one[:, at])).mean() for one in wanted) / case.problem.period
-    moves, room = plain.moves(plain.nominal)[at], numbers.get("needed", math.inf) <= ROOM
+    moves, short = plain.moves(plain.nominal)[at], numbers.get("needed", 0.0) > ROOM
+    room = "needed" in numbers and np.abs(asked[:, at]).max() <= ROOM * np.abs(limits[:, at]).max()  # by its size alone
     swings = plain.controller.planner is not None and room and moves > 4 * once
     swings = swings and min(held, plain.held(plain.nominal)) > SATURATED  # by itself
     numbers |= {"period": 2 * plain.span[at] / moves} if swings else {}  # of a square wave
-    short = not room and "needed" in numbers
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
     verdict = Verdict.NO if lost or swings else Verdict.CAUTION if held > SATURATED else Verdict.YES
-    ways = "model Predicted weight" if swings else "model speed limits" * short
+    ways = "model Predicted weight" if swings else "model speed limits" * bool(short)
     return Fact(verdict, numbers, names[at], ways=ways, root=bool(swings or short))
 
 
