@@ -141,9 +141,8 @@ class Predicted(ControllerWrapper):
                 values |= {"residual_next": error, **later}
             state = s.state
             if cycles:
-                held = (ca.repmat(v, 1, cycles) for v in (s.parameters, error))
                 sent = ca.horzcat(*(queued[before.size * k : before.size * (k + 1)] for k in reversed(range(cycles))))
-                state = advance.mapaccum("fpirhc_driven", cycles)(s.state, sent, *held)[:, -1]
+                state = advance.mapaccum("fpirhc_driven", cycles)(s.state, sent, s.parameters, error)[:, -1]
             for name, function in outputs_ahead.items():
                 values[f"{name}_ahead"] = function(getattr(s, name), s.state, state, s.parameters, cycles * period)
             return {"time_ahead": s.time + self.inputs, "state_ahead": state, **values}

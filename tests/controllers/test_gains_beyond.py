@@ -11,9 +11,7 @@ from fpirhc.errors import NotContractive
 
 brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
 LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
-LARGEST = (
-    4 / 1.5
-)  # of an affine map, whose effective gain is half of its gain: |1 - a lambda| < 1, lambda = 1.5 and 1.3
+LARGEST = 4 / 1.5  # of an affine map: |1 - a lambda| < 1 with a half of its gain, lambda = 1.5 and 1.3
 
 
 def affine(gain, around=lambda m: m):

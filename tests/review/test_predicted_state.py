@@ -59,6 +59,8 @@ def test_what_the_model_lacks_is_lacking_in_the_prediction(late, form, by, remov
     assert run["true_error.q"][-1] == pytest.approx(expected[int(removed)], rel=0.01, abs=1e-6)
     told = {a.key: a for a in fp.review(problem, {"it": law(late, form, **by)}, mismatch=0.0, seed=0).answers["it"]}
     assert (f"residual_time={late:g})" in told["follows"].change) == (form is not None and not by)
+    free = replace(problem, plant=replace(problem.plant, parameters={}, response=lambda q, v, u, p: {"q": u.u}))
+    assert abs(fp.simulate(free, law(late, form, **by), seed=0, compiled=False)["true_error.q"][-1]) < 1e-6
     said = " ".join(a.change for a in told.values())
     assert not [words for words in ("state it", "state the dead", "predict it") if words in said]
 
