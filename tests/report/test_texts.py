@@ -1,4 +1,4 @@
-"""Whole reports as they are read: seven texts are kept in tests/data/reports, and a changed one is renewed by
+"""Whole reports as they are read: six texts are kept in tests/data/reports, and a changed one is renewed by
 
     FPIRHC_RENEW=1 python -m pytest tests/report/test_texts.py
 
@@ -33,7 +33,6 @@ controllers["RHC+FPI"] = fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Aff
 COMMANDS = {
     "compare": "compare line.py --verbose --no-compile",
     "page": "compare line.py --no-compile",
-    "plans": "compare line.py --plans",
     "review": "review line.py --verbose",
     "noisy": "review noisy.py --verbose -c CTC+FPI",
     "study": "study line.py --draws 6 --mismatch 20% --no-compile -c CTC CTC+FPI",
