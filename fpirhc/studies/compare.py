@@ -319,7 +319,7 @@ def _without_noise(problem: Problem, controller: Controller, name: str) -> str:
         or not {*response_names(problem.plant)} <= shown
     ):
         return ""
-    return f"{name} measures its response without noise; what noise costs: fpirhc study --limits noise."
+    return f"{name} measures its response without noise; what noise costs: fpirhc study PROBLEM --limits noise."
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
