@@ -1,10 +1,10 @@
 """The van der Pol-Duffing oscillator, planned by four optimisers: fixed-point iteration in place of the reduced gradient.
 
 The optimum of a horizon is a zero of the gradient of its auxiliary function. The rows find it in different ways, to the same
-tolerance: by the reduced gradient with a line search; by fixed-point iteration on the scaled gradient, as J. K. Tar's group
-published it; by `FixedPoint`, the same iteration with a Riccati sweep before each step; and by IPOPT. The plans agree, so do the
-errors. What differs is the number of steps and the time of a cycle. The iteration around the plan (FPI) is another one: it
-corrects the model, whoever plans. Plant and parameters are those of `van_der_pol`; `--plans` certifies the first plan of each.
+tolerance: by the reduced gradient with a line search; by fixed-point iteration on the scaled gradient; by `FixedPoint`, the
+same iteration with a Riccati sweep before each step; and by IPOPT. The plans agree, so do the errors. What differs is the
+number of steps and the time of a cycle. The iteration around the plan (FPI) is another one: it corrects the model, whoever
+plans. Plant and parameters are those of `van_der_pol`; `--plans` certifies the first plan of each.
 
     rms error, seed 0            q [m]
     RHC                         0.0105
