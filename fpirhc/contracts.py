@@ -9,7 +9,6 @@ from fpirhc.controllers.built import Built as Built
 from fpirhc.controllers.built import build as build
 from fpirhc.controllers.contract import Controller as Controller
 from fpirhc.controllers.contract import ControllerWrapper as ControllerWrapper
-from fpirhc.controllers.contract import PlantModel as PlantModel
 from fpirhc.controllers.contract import Undeformed as Undeformed
 from fpirhc.deformation.base import Deformation as Deformation
 from fpirhc.deformation.base import Form as Form

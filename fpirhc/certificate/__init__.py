@@ -14,7 +14,7 @@ import numpy as np
 
 from fpirhc.certificate.tube import Centre, Chains, Expressions, Sweep, Tube
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved, tracking_law
+from fpirhc.controllers.contract import plant_model, resolved, tracking_law
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Form
 from fpirhc.deformation.model_referenced import ModelReferenced
@@ -90,7 +90,7 @@ def certify_limits(
     ready = resolved(problem, controller)
     refuse(f"no certificate for {type(ready).__name__}: {reason}" for reason in _against(problem, ready))
     box, plant = exact_ranges(problem.plant.parameters, mismatch), problem.plant
-    believed = ready.plant_model(problem).parameters(plant)
+    believed = plant_model(problem, ready).parameters(plant)
     functions, chains = Expressions(plant, believed), Chains(plant, problem.period, _gains(problem, ready))
     plans, margins = ready.planner is not None, dict.fromkeys(_hard(problem), 0.0)
     own = dict(problem.horizon.margins) if problem.horizon is not None else {}
@@ -133,7 +133,7 @@ def _against(problem: Problem, ready: Controller) -> Iterator[str]:
         yield "there are disturbances, signals from outside, hard limits of rates, or a reality that is not the plant"
     if not problem.sensing.ideal or problem.dead_time.measurement or any(problem.dead_time.inputs.values()):
         yield "state or response are estimated, noisy or late"
-    if ready.plant_model(problem).exact:
+    if ready.exact_model:
         yield "its model has the exact parameters of every plant, so there are no other plants to be certified"
     if ready.learns or ready.inner is not None or ready.deforms != "response":
         yield "its model, state or command is changed beside the deformation"

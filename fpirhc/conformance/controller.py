@@ -108,9 +108,9 @@ class _Trial:
 
 
 def exact_parameters_are_unknown(trial: _Trial, draw: Draw) -> Broken:
-    """The command does not depend on the exact parameters, which nobody knows of a real plant, unless `plant_model` says so."""
+    """The command does not depend on the exact parameters, which nobody knows of a real plant, unless `exact_model` says so."""
     plant = trial.problem.plant
-    if trial.controller.plant_model(trial.problem).exact or not plant.parameters:
+    if trial.controller.exact_model or not plant.parameters:
         return
     other = replace(trial.problem, plant=with_exact_parameters(plant, plant.exact * _OTHER))
     one, its = trial.replay.commands, Replay(other, trial.controller, trial.run).commands
@@ -119,7 +119,7 @@ def exact_parameters_are_unknown(trial: _Trial, draw: Draw) -> Broken:
     if differ[k]:
         yield (
             f"with exact parameters {_OTHER - 1:.0%} larger, and the same approximate ones and measurements, its command of cycle "
-            f"{k} is {its[k]} in place of {one[k]}; use plant.approximate, or say PlantModel(..., exact=True) where this is meant"
+            f"{k} is {its[k]} in place of {one[k]}; use plant.approximate, or say exact_model = True where this is meant"
         )
 
 
@@ -163,16 +163,6 @@ def learning_remembers(trial: _Trial, draw: Draw) -> Broken:
             f"learns is true, but after {len(replay.cycles)} cycles with a wrong model its command for the measurement of cycle "
             f"{trial.begun} is still {late}: reviews would take its convergence for unknown"
         )
-
-
-def model_is_of_the_plant(trial: _Trial, draw: Draw) -> Broken:
-    """The parameters of its `plant_model` have the exact values of the plant that a run moves, or of the problem's."""
-    plants = (trial.problem.plant, trial.problem.real_plant)
-    for name, one in trial.controller.plant_model(trial.problem).plant.parameters.items():
-        known = [plant.parameters[name].exact for plant in plants if name in plant.parameters]
-        if len(known) == len(plants) and one.exact not in known:
-            words = f"plant_model() says that the exact '{name}' is {one.exact:.6g}, the plant has {known[0]:.6g}"
-            yield f"{words}: results would be compared with a plant that is not there"
 
 
 def law_is_what_it_does(trial: _Trial, draw: Draw) -> Broken:

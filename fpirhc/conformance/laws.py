@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import build, compose_controller
+from fpirhc.controllers.contract import plant_model
 from fpirhc.deformation.base import with_inner
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
@@ -196,7 +197,7 @@ class Replay:
 
     def cycle(self, k: int, memory: Array, **instead: Array) -> Cycle:
         """The cycle k of the run from a memory, with other values of what is read where they are given by name."""
-        model = self.controller.plant_model(self.problem)
+        model = plant_model(self.problem, self.controller)
         seen = {"time": self.run.time[k], "parameters": model.parameters(model.plant), **instead}
         read = [seen[n] if n in seen else self.run[n][k] for n in self._composite.reads.names]
         after, trace, _ = self._evaluator(memory, *read)

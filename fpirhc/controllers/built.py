@@ -16,7 +16,7 @@ import casadi as ca
 
 from fpirhc.contraction.delayed import require_converging
 from fpirhc.controllers.believed import ACTED, NOW, Pairs, Path, Told, believed_path, measured
-from fpirhc.controllers.contract import Controller, PlantModel, resolved, tracking_law
+from fpirhc.controllers.contract import Controller, PlantModel, plant_model, resolved, tracking_law
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers
@@ -118,7 +118,7 @@ def _made(problem: Problem, ready: Controller) -> Built:
     return Built(
         problem=problem,
         controller=ready,
-        model=ready.plant_model(problem),
+        model=plant_model(problem, ready),
         largest=largest_response(problem),
         ends=problem.limits.input_ends(plant),
         rates=tuple(one.tolist() for one in problem.limits.rate_bounds(plant)),

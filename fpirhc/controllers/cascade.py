@@ -16,7 +16,6 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, reference_block
 from fpirhc.controllers.built import Built, compose_controller, embedded
-from fpirhc.controllers.contract import without_deformation
 from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import InvalidValue, NotContractive, require
 from fpirhc.fields.kinds import NotNegative
@@ -105,16 +104,8 @@ class Cascade(Controller):
 
     planner = None  # plans of the inner controller follow the target, and not the reference of the problem
 
-    @property
-    def inner(self) -> Controller:
-        """The inner controller."""
-        return self.controller
-
-    def inner_problem(self, problem: Problem) -> Problem:
+    def inner_problem(self, problem: Problem, name: str = "") -> Problem:  # noqa: ARG002
         return replace(problem, reference=Shifted(problem.reference))
-
-    def with_deformation(self, deformation: Deformation) -> Controller:  # type: ignore[override]
-        return replace(self, deformation=deformation) if deformation.adapts else without_deformation(self.controller)
 
     def check(self, problem: Problem) -> None:
         """Raise if the map or the pairing does not fit the problem."""

@@ -1,23 +1,23 @@
 """The contract of controllers: blocks for a problem, and facts for reviews, studies and reports.
 
-A controller that wraps another one has it as `inner`. It has the facts of the inner controller, on the problem that the inner
-controller is built for, unless it overrides them. So the facts pass through any number of wrappers.
+A controller that holds another one in a field is around it: that one is its `inner`. It has the facts of the inner controller, on
+the problem that the inner controller is built for, unless it overrides them. So the facts pass through any number of wrappers.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Literal, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, final
 
 import numpy as np
 
 from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, RequestChange, automatic, scaled_for, with_inner
 from fpirhc.errors import require
-from fpirhc.fields.checked import Checked, replaced, wrong_inner
+from fpirhc.fields.checked import Checked, Inner, replaced
 from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
@@ -25,7 +25,7 @@ from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
 from fpirhc.task.dead_time import whole
-from fpirhc.task.exogenous import Exogenous
+from fpirhc.task.exogenous import Exogenous, really_known
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -42,7 +42,7 @@ class PlantModel:
 
     plant: Plant  # equations of the model
     signals: Mapping[str, Exogenous]  # measured disturbances, with their preview
-    exact: bool = False  # whether its parameters are the exact ones; such a controller is a bound to compare with
+    exact: bool = False  # whether its parameters are the exact ones
 
     @property
     def parameter(self) -> Signal:
@@ -123,17 +123,14 @@ class Controller(Checked, ABC):
 
         @property
         def inner(self) -> Controller | None:
-            """The controller that this one wraps; None for one that stands alone."""
+            """The controller that this one is around, in whatever field it holds it; None for one that stands alone."""
 
-    else:  # plain attributes, so that dataclasses may have fields of these names
+    else:  # no properties, so that dataclasses may have fields of these names
         deformation: Deformation
-        inner = None
+        inner = Inner()
 
     def _lacks(self) -> Iterator[str]:
-        yield from wrong_inner(self, Controller)
-        if isinstance(self.inner, Controller | None) and not isinstance(
-            getattr(self, "deformation", None), Deformation
-        ):
+        if not isinstance(getattr(self, "deformation", None), Deformation):
             yield (
                 f"{type(self).__name__} has no `deformation`, which its contract Controller asks for: the map in use. Add the "
                 "field deformation: Deformation = field(default_factory=Identity); a wrapper has a property that returns "
@@ -144,13 +141,14 @@ class Controller(Checked, ABC):
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         """Return the blocks of one control cycle, from (time, state, realised, parameters) to 'command', and what they remember."""
 
-    def inner_problem(self, problem: Problem) -> Problem:
-        """Return the problem that the inner controller is built for."""
+    def inner_problem(self, problem: Problem, name: str = "") -> Problem:  # noqa: ARG002
+        """Return the problem that the inner controller is built for; `name`: of the one in a dictionary of several."""
         return problem
 
-    def plant_model(self, problem: Problem) -> PlantModel:
-        """Return what the controller knows of its plant: the problem's equations, approximate parameters and signals."""
-        return PlantModel(problem.plant, problem.signals) if self.inner is None else self.inner.plant_model(problem)
+    @property
+    def exact_model(self) -> bool:
+        """Whether it is given the exact parameters of the plant and its signals: a bound to compare with."""
+        return False if self.inner is None else self.inner.exact_model
 
     @property
     def learns(self) -> bool:
@@ -170,30 +168,18 @@ class Controller(Checked, ABC):
         """How the controller plans; None for a controller that does not plan over a horizon."""
         return None if self.inner is None else self.inner.planner
 
-    def with_deformation(self, deformation: Deformation) -> Self:
-        """Return the controller with another deformation, without adaptation where this one does not adapt.
+    @final
+    def with_deformation(self, deformation: Deformation) -> Controller:
+        """Return the controller with another deformation; a target that none adapts is the reference, for the inner one alone.
 
         Raises:
             NotSupported: neither it nor an inner controller has a field `deformation`.
         """
-        if self.inner is None or replaced(self, "deformation", deformation) is not None:
-            return with_field(self, "deformation", deformation)
-        return with_inner(self, self.inner.with_deformation(deformation))
-
-    def with_defaults(self, problem: Problem) -> Self:
-        """Return the controller with the numbers chosen that it leaves to the problem; what it wraps has its own already."""
-        own = self.deformation
-        deformation = late_deformation(own, problem)
-        if automatic(deformation) and self.deforms != "target":  # the reference says nothing of the size of its shifts
-            deformation = scaled_for(deformation, self._request(problem))
-        return self if deformation is own else self.with_deformation(deformation)
-
-    def _request(self, problem: Problem) -> RequestChange:
-        """How much what the deformation acts on changes."""
-        if self.deforms == "command":
-            return request_of_commands(problem)
-        plans = self.planner is not None
-        return request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(self))
+        if (changed := replaced(self, "deformation", deformation)) is None:
+            return _with_inside(self, lambda one, _: one.with_deformation(deformation), "deformation")
+        if self.inner is None or self.deforms != "target" or deformation.adapts:
+            return changed
+        return without_deformation(self.inner)
 
     def notes(self, problem: Problem) -> tuple[str, ...]:
         """Return sentences about the controller on this problem, for a reader of results."""
@@ -231,11 +217,6 @@ class ControllerWrapper(Controller, ABC):
     controller: Controller
 
     @property
-    def inner(self) -> Controller:
-        """The wrapped controller."""
-        return self.controller
-
-    @property
     def deformation(self) -> Deformation:
         """The deformation of the wrapped controller."""
         return self.controller.deformation
@@ -265,7 +246,7 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
 
 
 def resolved(problem: Problem, controller: Controller) -> Controller:
-    """Return the controller with every automatic setting replaced by its value for this problem."""
+    """Return the controller with every automatic setting replaced by its value for this problem, the inner ones first."""
     if controller.inner is not None:
         name = type(controller).__name__
         once = getattr(controller, "once", False) and type(controller) in map(type, _chain(controller.inner))
@@ -273,9 +254,26 @@ def resolved(problem: Problem, controller: Controller) -> Controller:
             not once,
             f"{name} stands around another {name}; one is enough: leave one out, and give the other the settings of both",
         )
-        inner = resolved(controller.inner_problem(problem), controller.inner)
-        controller = controller if inner is controller.inner else with_inner(controller, inner)
-    return controller.with_defaults(problem)
+    ready = _with_inside(controller, lambda one, name: resolved(controller.inner_problem(problem, name), one))
+    deformation = late_deformation(own := ready.deformation, problem)
+    if automatic(deformation) and ready.deforms != "target":  # the reference says nothing of the size of its shifts
+        deformation = scaled_for(deformation, _request(problem, ready))
+    return ready if deformation is own else ready.with_deformation(deformation)
+
+
+def _request(problem: Problem, controller: Controller) -> RequestChange:
+    """How much what the deformation acts on changes."""
+    if controller.deforms == "command":
+        return request_of_commands(problem)
+    plans = controller.planner is not None
+    return request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(controller))
+
+
+def plant_model(problem: Problem, controller: Controller) -> PlantModel:
+    """Return what the controller knows of its plant: the problem's equations, parameters and signals, or the real ones."""
+    if not controller.exact_model:
+        return PlantModel(problem.plant, problem.signals)
+    return PlantModel(problem.moves.as_model(problem.plant), really_known(problem.signals), exact=True)
 
 
 def tracking_law(controller: Controller) -> Tracking | None:
@@ -284,16 +282,30 @@ def tracking_law(controller: Controller) -> Tracking | None:
     return None if inner.planner is not None else getattr(inner, "tracking", None)
 
 
-_Own = TypeVar("_Own", bound=Controller)
-
-
-def with_field(controller: _Own, name: str, value: object) -> _Own:
-    """Return the controller with another content of a field, its own or that of an inner one."""
-    changed = replaced(controller, name, value)
-    if changed is not None:
+def with_field(controller: Controller, name: str, value: object) -> Controller:
+    """Return the controller with another content of a field, its own or that of inner ones."""
+    if (changed := replaced(controller, name, value)) is not None:
         return changed
-    require(controller.inner is not None, f"{type(controller).__name__} has no {name} that can be replaced")
-    return with_inner(controller, with_field(cast(Controller, controller.inner), name, value))
+    return _with_inside(controller, lambda one, _: with_field(one, name, value), name)
+
+
+def _with_inside(
+    controller: Controller, change: Callable[[Controller, str], Controller], needs: str = ""
+) -> Controller:
+    """Return the controller around changed ones: its inner one, or those in a dictionary, by name.
+
+    `needs`: the field that is changed inside; NotSupported where there is nothing inside.
+    """
+    if controller.inner is not None:
+        inner = change(controller.inner, "")
+        return controller if inner is controller.inner else with_inner(controller, inner)
+    for field, held in vars(controller).items():
+        if isinstance(held, Mapping) and held and all(isinstance(one, Controller) for one in held.values()):
+            changed = {name: change(one, name) for name, one in held.items()}
+            same = all(one is held[name] for name, one in changed.items())
+            return controller if same else replace(cast("Any", controller), **{field: changed})
+    require(not needs, f"{type(controller).__name__} has no {needs} that can be replaced")
+    return controller
 
 
 def _chain(controller: Controller | None) -> Iterator[Controller]:

@@ -14,7 +14,7 @@ import casadi as ca
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.believed import Pairs
 from fpirhc.controllers.built import Built, compose_controller, dependencies_of_command, embedded
-from fpirhc.controllers.contract import ControllerWrapper, PlantModel
+from fpirhc.controllers.contract import ControllerWrapper, plant_model
 from fpirhc.errors import require
 from fpirhc.learning.disturbance_kalman import DisturbanceKalman
 from fpirhc.learning.estimators import ParameterEstimator, Seen
@@ -24,7 +24,7 @@ from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, is_finite
 from fpirhc.symbolic.layout import Layout, Signal, like, scalar
 from fpirhc.task.dead_time import DeadTime
-from fpirhc.task.exogenous import really_known, signals_of
+from fpirhc.task.exogenous import signals_of
 from fpirhc.task.problem import Problem
 
 
@@ -39,14 +39,12 @@ class ExactModel(ControllerWrapper):
         NotSupported: an ExternalPlant, or a reality whose coordinates or orders are not the model's.
     """
 
-    def inner_problem(self, problem: Problem) -> Problem:
-        model = self.plant_model(problem)
+    exact_model = True
+
+    def inner_problem(self, problem: Problem, name: str = "") -> Problem:  # noqa: ARG002
+        model = plant_model(problem, self)
         plant, told = _EXACT.of((model.plant,), (), lambda: _known(model.plant)), signals_of(model.plant, model.signals)
         return _MODELLED.of((problem, plant), (), lambda: replace(problem, plant=plant, reality=None, signals=told))
-
-    def plant_model(self, problem: Problem) -> PlantModel:
-        plant = problem.moves.as_model(problem.plant)
-        return PlantModel(plant, really_known(problem.signals), exact=True)
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         return self.controller.blocks(built.inner(self))
@@ -85,7 +83,7 @@ class Estimating(ControllerWrapper):
     dead_time: DeadTime | None = field(default=None, kw_only=True)
     at_once: bool = field(default=False, kw_only=True)
 
-    def inner_problem(self, problem: Problem) -> Problem:
+    def inner_problem(self, problem: Problem, name: str = "") -> Problem:  # noqa: ARG002
         return _MODELLED.of((self.estimator, problem), (), lambda: self._modelled(problem))
 
     def _modelled(self, problem: Problem) -> Problem:

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.believed import believe_block, stated_path
-from fpirhc.controllers.contract import Controller
+from fpirhc.controllers.contract import Controller, plant_model
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
 from fpirhc.errors import NotSupported
 from fpirhc.plant.maps import growth_rates
@@ -132,7 +132,7 @@ def against_believed(problem: Problem, controller: Controller) -> Iterator[str]:
             "the model's own response is the request, from which nothing can be learned. Measure it, or choose an estimator of "
             f"what is measured ({', '.join(sensing.measures(plant))})"
         )
-    model = controller.plant_model(problem).plant
+    model = plant_model(problem, controller).plant
     if model.parameter.elements != plant.parameter.elements:
         yield (
             f"{type(controller).__name__} has a model with other parameters than the problem's, and the observer has the "

@@ -18,7 +18,6 @@ import casadi as ca
 from fpirhc.controllers.base import Controller, judge_block, reference_block, warm_up_block
 from fpirhc.controllers.believed import measured
 from fpirhc.controllers.built import Built, checked, made, with_aim
-from fpirhc.controllers.contract import resolved
 from fpirhc.deformation.base import Deformation, Form, Identity
 from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import Mistakes, NotSupported
@@ -65,14 +64,9 @@ class Slotted(Controller):
 
     deforms = "turns"
 
-    def with_deformation(self, deformation: Deformation) -> Slotted:
-        return replace(self, slots={n: slot.with_deformation(deformation) for n, slot in self.slots.items()})
-
-    def with_defaults(self, problem: Problem) -> Slotted:
+    def inner_problem(self, problem: Problem, name: str = "") -> Problem:
         self._check_names(problem)
-        slots = {n: resolved(slot_problem(problem, n), slot) for n, slot in self.slots.items()}
-        same = all(slot is self.slots[n] for n, slot in slots.items())
-        return self if same else replace(self, slots=slots)
+        return slot_problem(problem, name)
 
     def check(self, problem: Problem) -> None:
         """Raise if the slots or their durations do not fit the problem."""

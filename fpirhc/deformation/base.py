@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported, require
-from fpirhc.fields.checked import Checked, replaced, wrong_inner
+from fpirhc.fields.checked import Checked, Inner, replaced
 from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
@@ -104,13 +104,10 @@ class Deformation(Checked, ABC):
 
         @property
         def inner(self) -> Deformation | None:
-            """The map that this one is around; None for a map that stands alone."""
+            """The map that this one is around, in whatever field it holds it; None for a map that stands alone."""
 
     else:
-        inner = None  # a plain attribute, so that a dataclass may have a field of this name
-
-    def _lacks(self) -> Iterator[str]:
-        yield from wrong_inner(self, Deformation)
+        inner = Inner()
 
     @final
     @property
@@ -234,11 +231,6 @@ class Wrapper(Deformation, ABC):
     """
 
     map: Deformation
-
-    @property
-    def inner(self) -> Deformation:
-        """The wrapped map."""
-        return self.map
 
     def effective_gain(self) -> float:
         return self.map.effective_gain()

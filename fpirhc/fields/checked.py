@@ -60,17 +60,16 @@ def expects_whole_number(owner: type, name: str) -> bool:
     return _arguments_of(owner).expected.get(name, ANYTHING).whole
 
 
-def wrong_inner(value: object, contract: type) -> Iterator[str]:
-    """Yield a mistake for a wrapper whose `inner` is no value of its contract, or which holds one in a field and has no `inner`."""
-    kind, own, inner = type(value).__name__, contract.__name__, getattr(value, "inner", None)
-    if inner is not None and not isinstance(inner, contract):
-        yield f"{kind}: `inner` is the {own} that it wraps, or None, got {described(inner)}"
-    for name, content in getattr(value, "__dict__", {}).items():
-        if isinstance(content, contract) and inner is None:
-            yield (
-                f"{kind} holds a {own} in '{name}' and has no `inner`, by which its contract {own} finds it; "
-                f"add a property `inner` that returns self.{name}"
-            )
+class Inner:
+    """The first value of the same contract that a member holds in a field: what it is around; None for one that stands alone."""
+
+    def __set_name__(self, contract: type, name: str) -> None:
+        self._contract = contract
+
+    def __get__(self, value: object, owner: type) -> object:
+        if value is None:  # so that a dataclass may have a field of this name, without a default
+            raise AttributeError(f"{owner.__name__} is a class; its values have an `inner`")
+        return next((one for one in vars(value).values() if isinstance(one, self._contract)), None)
 
 
 def _abstract(cls: type) -> tuple[str, ...]:

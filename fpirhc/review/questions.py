@@ -215,7 +215,7 @@ def _horizon(case: Case) -> Fact | None:
 
 def _box(case: Case) -> Fact | None:
     bench, found = case.bench, list[tuple[float, float]]()
-    told = bench.built.controller.plant_model(case.problem).exact  # and is a bound that nobody can run
+    told = bench.built.controller.exact_model  # and is a bound that nobody can run
     if told or case.problem.reality is not None or not len(case.draws):
         return None
     for exact in case.draws:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built, build
-from fpirhc.controllers.contract import Undeformed
+from fpirhc.controllers.contract import Undeformed, plant_model
 from fpirhc.controllers.gate import INNER, LOST, Gate
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.chain import response_names
@@ -67,7 +67,7 @@ def start_memory(loop: Composite, problem: Problem, controller: Controller) -> n
     mover, whole = moving(problem), loop.memory.start()
     blocks = (*sensing_blocks(mover, predicts=False), *seeing_blocks(problem)[0])
     signals = [signal for block in blocks for signal in block.memory.signals]
-    signals += [*(delay.now for delay in mover.delays), controller.plant_model(problem).parameter]
+    signals += [*(delay.now for delay in mover.delays), plant_model(problem, controller).parameter]
     if INNER in loop.memory and plans_exactly(loop, problem, controller):
         whole[loop.memory.slice(INNER)] = build(problem, controller).step.memory.start()
     # A graph has the estimator's memory inside the controller's one signal.
@@ -79,7 +79,7 @@ def start_memory(loop: Composite, problem: Problem, controller: Controller) -> n
 
 def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
     """Return whether plans know the exact parameters, and those of this problem are not those of the build."""
-    model, of_build = controller.plant_model(problem), loop.memory["parameters"].start_vector()
+    model, of_build = plant_model(problem, controller), loop.memory["parameters"].start_vector()
     exact = controller.planner is not None and model.exact
     return exact and not np.array_equal(of_build, model.parameters(model.plant))
 

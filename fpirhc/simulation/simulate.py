@@ -14,7 +14,7 @@ from typing import Self, TypeAlias
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import innermost, name_in_task
+from fpirhc.controllers.contract import innermost, name_in_task, plant_model
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
@@ -155,7 +155,7 @@ class Simulator:
         logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, seed, progress)
         layout, log = with_common_columns(own.loop.trace, logged)
         log.setflags(write=False)
-        model, gain = controller.plant_model(problem), float(controller.deformation.effective_gain())
+        model, gain = plant_model(problem, controller), float(controller.deformation.effective_gain())
         facts: dict[str, object] = {
             "effective_gain": gain,
             "iterates": gain != 0 and controller.deforms in ("response", "command"),

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import name_in_task
+from fpirhc.controllers.contract import name_in_task, plant_model
 from fpirhc.controllers.gate import HELD
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue, require
@@ -164,7 +164,7 @@ class Stepper(Checked):
         self._title = f"{problem.name or 'problem'}, {name_in_task(step.settings.unresolved)}"
         self._may_fail = composite.opaque  # scalar code cannot fail
         function = backend.function if backend else self.function
-        model = step.settings.controller.plant_model(problem)
+        model = plant_model(problem, step.settings.controller)
         parameters = model.parameters(model.plant)
         arguments = StepArguments(function, composite, problem, parameters)
         self._live, self._composite, self._arguments = step.settings, composite, arguments

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import name_in_task, without_deformation
+from fpirhc.controllers.contract import name_in_task, plant_model, without_deformation
 from fpirhc.deformation.base import Deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
@@ -101,7 +101,7 @@ class ModelAsPlant:
 
         It is the same one for controllers that know the same. Signals are what the model believes of them.
         """
-        known, form = controller.plant_model(self._problem), controller.deformation.form
+        known, form = plant_model(self._problem, controller), controller.deformation.form
         parameters = known.parameters(self._problem.plant)
         name = parameters.tobytes(), identity(known.signals), form
         if name not in self._models:

@@ -304,10 +304,9 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
 
 def _has_exact_model(problem: Problem, controller: Controller) -> bool:
     """Whether it is the bound of a controller with a wrong model: parameters known as exact, nothing adapted, nothing learned."""
-    model, real = controller.plant_model(problem), problem.real_plant
-    wrong = problem.reality is not None or not np.array_equal(model.plant.approximate, model.plant.exact)
+    wrong = problem.reality is not None or not np.array_equal(problem.plant.approximate, problem.plant.exact)
     fixed = not controller.deformation.adapts and not controller.learns and problem.moves.simulated
-    return bool(wrong and fixed and model.plant is real and np.array_equal(model.parameters(model.plant), real.exact))
+    return wrong and fixed and controller.exact_model
 
 
 def _without_noise(problem: Problem, controller: Controller, name: str) -> str:

@@ -240,9 +240,9 @@ def held(target):
 class PerBasal(fp.PID):
     """A PID law with gains for a basal dose of 1 U/h, because who needs more insulin needs more for the same glucose."""
 
-    def with_defaults(self, problem):
-        basal = -problem.limits.inputs["extra"][0]
-        return fp.PID({name: basal * gain for name, gain in self.proportional.items()}, bumpless=False)
+    def blocks(self, built):
+        basal = -built.problem.limits.inputs["extra"][0]
+        return fp.PID({name: basal * gain for name, gain in self.proportional.items()}, bumpless=False).blocks(built)
 
 
 problem = fp.Problem(

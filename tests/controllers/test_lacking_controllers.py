@@ -1,6 +1,6 @@
 """A controller or a map of a user's own that lacks what its contract asks for is told so by name, in the line that makes it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, cast
 
@@ -17,7 +17,7 @@ LAW = fp.ComputedTorque(fp.Exponential(rate=6.0))
 
 @dataclass(frozen=True, eq=False)
 class Around(Controller):
-    """A wrapper that says neither what it wraps nor which map is in use."""
+    """A wrapper that does not say which map is in use."""
 
     other: Controller
 
@@ -41,56 +41,35 @@ class Whole(Around):
     """The wrapper with everything that its contract asks for."""
 
     @property
-    def inner(self):
-        """What it wraps."""
-        return self.other
-
-    @property
     def deformation(self):
-        return self.inner.deformation
+        return self.other.deformation
 
 
-@dataclass(frozen=True, eq=False)
-class Halfway(Controller):
-    """A wrapper of something that is no controller."""
+@dataclass(frozen=True)
+class Halved(Deformation):
+    """A map around another one, in a field that has the name of what it is."""
 
-    inner: Any
-    deformation: Deformation = field(default_factory=fp.Identity)
+    inner: Deformation
 
-    def blocks(self, built):
-        """Those of the inner one."""
-        return self.inner.blocks(built)
+    def step(self, request, response, desired, memory):
+        raise NotImplementedError
+
+    def effective_gain(self):
+        return self.inner.effective_gain() / 2
+
+    def with_effective_gain(self, gain):
+        return Halved(self.inner.with_effective_gain(2 * gain))
 
 
 class Nothing(Controller):
     """A controller that composes nothing."""
 
 
-@dataclass(frozen=True, eq=False)
-class Doubled(Deformation):
-    """A map around another one, which it does not name."""
-
-    map: Deformation
-
-    def step(self, request, response, desired, memory):
-        return self.map.step(request, response, desired, memory)
-
-    def effective_gain(self):
-        return 2 * self.map.effective_gain()
-
-    secant_gain = effective_gain
-
-    def with_effective_gain(self, gain):
-        return Doubled(self.map.with_effective_gain(gain / 2))
-
-
 LACKING = [
-    (lambda: Around(LAW), "Around holds a Controller in 'other' and has no `inner`.*returns self.other"),
     (lambda: Around(LAW), "Around has no `deformation`, which its contract Controller asks for"),
     (lambda: Alone(), "^test_lacking_controllers.py, line .*: Alone has no `deformation`"),
-    (lambda: Halfway(5), "Halfway: `inner` is the Controller that it wraps, or None, got 5"),
+    (lambda: Halved(cast(Any, 5)), "Halved.inner: expected a Deformation, got 5"),
     (cast(Any, Nothing), r"Nothing has no blocks\(...\), which its contract Controller asks for"),
-    (lambda: Doubled(fp.Affine(-0.5)), "Doubled holds a Deformation in 'map' and has no `inner`"),
 ]
 
 
@@ -99,6 +78,14 @@ def test_what_is_lacking_is_told_in_the_line_that_makes_it(make, words):
     """Not by an error inside the library, cycles later."""
     with pytest.raises(InvalidField, match=f"(?s){words}"):
         make()
+
+
+def test_what_a_member_holds_is_what_it_is_around():
+    """Whatever the name of the field; the facts that it does not tell are those of the inner one."""
+    assert Whole(fp.ExactModel(LAW)).inner.inner is LAW
+    assert Whole(fp.ExactModel(LAW)).exact_model
+    assert Halved(fp.Paired(fp.Affine(-0.5), cycles=3)).form.cycles == 3
+    assert Whole(LAW).with_deformation(fp.Affine(-0.5)).other.deformation.gain == -0.5
 
 
 def test_a_whole_wrapper_runs():

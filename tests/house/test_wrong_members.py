@@ -1,6 +1,5 @@
 """A wrong member of a family is caught by the public laws, with the law that it breaks; the right one beside it is not."""
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -8,7 +7,7 @@ from wrong import controllers, maps, observers, optimisers, tables
 from wrong.tables import CONTROLLER_MEMBERS, CONTROLLERS, MAP_MEMBERS, MAPS, OBSERVERS, OPTIMISERS
 
 import fpirhc as fp
-from fpirhc.conformance import check_controller, check_deformation, check_observer, check_optimiser, laws_of, two_masses
+from fpirhc.conformance import check_controller, check_deformation, check_observer, check_optimiser, laws_of
 from fpirhc.contracts import Controller, Deformation
 
 DEFORMATION = fp.Sigmoid(gain=-0.5)
@@ -64,10 +63,8 @@ def test_a_controller_that_knows_the_exact_parameters_may_say_so():
     """As the bound of a comparison: the same command, honestly named."""
 
     class Honest(controllers.KnowsThePlant):
-        def plant_model(self, problem):
-            return replace(super().plant_model(problem), exact=True)
+        exact_model = True
 
     check_controller(Honest(6.0, DEFORMATION), seed=1, compiled=False)
-    problem = two_masses()
-    assert fp.ExactModel(controllers.Gentle(6.0)).plant_model(problem).exact
-    assert not fp.ComputedTorque(fp.Exponential(rate=6.0)).plant_model(problem).exact
+    assert fp.Predicted(fp.ExactModel(controllers.Gentle(6.0)), inputs=0.0).exact_model
+    assert not fp.ComputedTorque(fp.Exponential(rate=6.0)).exact_model

@@ -26,12 +26,11 @@ from typing import Any
 import os, signal
 
 class Deadly(fp.ComputedTorque):
-    def with_defaults(self, problem):
+    def check(self, problem):
         here = Path(__file__).parent
         if (here / "armed").exists():
             (here / "armed").unlink()
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().with_defaults(problem)
 
 controllers["deadly"] = Deadly(tracking)
 """

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 import fpirhc as fp
-from fpirhc.contracts import Block, Controller, Deformation, Layout, PlantModel, closing_blocks, like, reference_block
+from fpirhc.contracts import Block, Controller, Deformation, Layout, closing_blocks, like, reference_block
 from fpirhc.errors import NotSupported
 
 
@@ -91,13 +91,6 @@ class DeformsAnotherResponse(Gentle):
             return step(s)
 
         return self.changed(built, "deform", louder)
-
-
-class TellsAnotherModel(Gentle):
-    """Names a plant as its model that is neither the problem's nor the real one."""
-
-    def plant_model(self, problem):
-        return PlantModel(problem.with_exact(problem.plant.exact * 1.1).plant, problem.signals)
 
 
 class AlwaysOk(Gentle):

@@ -8,7 +8,6 @@ CONTROLLERS = {
     controllers.SaysItLearns: ("learning remembers", "learns is true, but after 400 cycles"),
     controllers.SaysItDeformsNoResponse: ("deformation acts", "deforms is 'command', but"),
     controllers.DeformsAnotherResponse: ("deformation acts", r"'deformed' misses .* by the share 0\.00[34]"),
-    controllers.TellsAnotherModel: ("model is of the plant", r"the exact 'm' is 1\.1, the plant has 1:"),
     controllers.AlwaysOk: ("bad measurement never acts", "'a' measured as nan.*status of that cycle is OK"),
     controllers.TakesTheStateForTheOutput: ("what it takes it controls", "read plant.output and not plant.state"),
     controllers.IgnoresItsDeformation: ("deformation acts", "half of the effective gain 0.198"),
@@ -56,13 +55,12 @@ CONTROLLER_MEMBERS = {  # member of the contract -> the law that tests it
     "check": "what it takes it controls",
     "deformation": "deformation acts",
     "deforms": "deformation acts",
+    "exact_model": "exact parameters are unknown",
     "inner": "frozen value",
     "inner_problem": "same command everywhere",
     "learns": "learning remembers",
     "notes": "facts hold",
-    "plant_model": "model is of the plant",
     "planner": "facts hold",
-    "with_defaults": "facts hold",
     "with_deformation": "deformation acts",
 }
 MAP_MEMBERS = {
