@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     for one in (getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP")):
-        # A service that is stopped and a terminal that is closed end a run as Ctrl-C does: a machine is left at rest.
+        # A service that is stopped and a terminal that is closed end a run as Ctrl-C does: a real plant is left at rest.
         if one and signal.getsignal(one) == signal.SIG_DFL and threading.current_thread() is threading.main_thread():
             signal.signal(one, signal.default_int_handler)
     # Matrices of loops are small: threads of the linear algebra wait for one another. NumPy reads this when it is imported.

@@ -217,7 +217,7 @@ def study(
 
 @command(
     "probe my_arm.py                             excitation, candidates, trials, and a line to paste",
-    "probe my_arm.py --cycles 500 --no-trials    for a machine: nothing but the excitation is run",
+    "probe my_arm.py --cycles 500 --no-trials    for a plant at risk: nothing but the excitation is run",
     "probe my_arm.py --recording run.csv         from a record of a run",
 )
 def probe(

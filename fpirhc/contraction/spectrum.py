@@ -112,7 +112,7 @@ def _response(
     """
     counts, orders = problem.plant.differences, problem.plant.response_orders
     names = [name + "'" * (order - counts[name]) for name, order in orders.items()]
-    shown, state = problem.truth.function(names, seen=True), after
+    shown, state = problem.reality_or_model.function(names, seen=True), after
     values = {0: shown(after, command, *held[1:])}
     for count in range(1, max(counts.values()) + 1):
         values[count] = shown(state, *held) / problem.period**count

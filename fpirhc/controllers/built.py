@@ -2,8 +2,8 @@
 
     build(problem, controller) -> Built -> blocks(built) -> raw measurements -> [estimator -> controller] -> command
 
-Blocks are handed the result. They read facts from it, and look nothing up again. A machine gives the step what its sensors show; a
-skipped cycle leaves the estimator's memory as it was, like every other one.
+Blocks are handed the result. They read facts from it, and look nothing up again. A real plant gives the step what its sensors show;
+a skipped cycle leaves the estimator's memory as it was, like every other one.
 """
 
 from __future__ import annotations

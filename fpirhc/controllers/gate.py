@@ -67,7 +67,7 @@ def was_skipped(status: Expression) -> Expression:
 
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 REPLAYS = Signal("replays")  # in the memory of a loop: whether its sample is that of `replayed_...`
-LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a machine is one that is not finite
+LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a real plant is one that is not finite
 _SAMPLE = ("state", "output", "realised", "measured", "arrived", LOST.name)
 INNER = "controller_memory"  # in the memory: that of the controller as one signal
 

@@ -103,10 +103,10 @@ class LiveSettings:
 
     def bounds(self, path: str) -> Interval:
         """Return the interval around the number of the build in which a setting is accepted while the others stay."""
-        # A limit of an input is a fact of the machine: it ends at that of the build.
-        of_machine = path[-2:] if path.startswith("limits.inputs.") else ""
+        # A limit of an input is a fact of the plant: it ends at that of the build.
+        of_plant = path[-2:] if path.startswith("limits.inputs.") else ""
         ends = (("." + "01"[side > 0], side) for side in (-1, 1))
-        low, high = (self._content(path) if end == of_machine else self._end(path, side) for end, side in ends)
+        low, high = (self._content(path) if end == of_plant else self._end(path, side) for end, side in ends)
         return low, high
 
     def _end(self, path: str, side: int) -> float:

@@ -27,7 +27,7 @@ _SHARES = np.arange(-8, 3.1, 0.5)  # log10 of the drift's share
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate and what contains the truth 19 times of 20."""
+    """An estimate, and an interval that contains the right value 19 times of 20."""
 
     value: float
     low: float

@@ -85,7 +85,7 @@ def probe(
         recording: CSV file in place of runs, without `cycles` and `amplitude`: "time", what is measured then, every input after it.
         chatter: largest rms step of the command per cycle, in the input's unit, by input or one for all; None: 1.5 times that of
             the controller alone, or 2 % of the input's range.
-        trials: whether candidates are tried on the plant; False on a machine that must not be risked.
+        trials: whether candidates are tried on the plant; False on a plant that must not be risked.
         seed: of sequence and runs.
         progress: called with (what is done, how much of it, in all).
 
@@ -166,7 +166,7 @@ def _cautions(problem: Problem, record: Record, estimates: Estimates, chosen: De
     hidden = [name for name in record.shown if name not in problem.sensing.measures(problem.plant)]
     if hidden and problem.sensing.spreads(problem.plant):
         inside = f"no sensor shows {', '.join(hidden)}: dead time and lag contain those of the estimator, which colours the noise"
-        yield f"{inside}, so the truth may be outside the intervals; measure it, or record it without a filter"
+        yield f"{inside}, so the right values may be outside the intervals; measure it, or record it without a filter"
     elif own:
         yield f"the dead time is the plant's; {type(problem.sensing.estimator).__name__} delays the response by {own:g} cycles more"
     each = zip(problem.plant.controlled_names, problem.plant.inputs, record.limited, estimates.channels, strict=True)

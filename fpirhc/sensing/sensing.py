@@ -35,8 +35,8 @@ class Sensor(Checked):
         noise: signal that adds to the true value, in its unit: Noise, Step (bias), Formula (drift, hum);
             None: no noise.
         quantum: Q, the resolution (of an encoder, for example), in the quantity's unit; None: no quantisation.
-        dropout: probability that a cycle's sample is lost. A cycle in which one quantity is lost is skipped, as on a machine: the
-            command is held, with the status BAD_SAMPLE.
+        dropout: probability that a cycle's sample is lost. A cycle in which one quantity is lost is skipped, as on a real plant:
+            the command is held, with the status BAD_SAMPLE.
         range: (lower, upper), what a working sensor shows, in the quantity's unit; one side may be infinite. A sample outside
             skips the cycle, for as long as it is outside. None: every finite number is believed.
 

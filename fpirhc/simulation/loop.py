@@ -125,12 +125,12 @@ def sensing_blocks(mover: Mover, *, predicts: bool) -> list[Block]:
     problem, plant = mover.problem, mover.problem.plant
     response = plant.response_signal("realised")
     at_once = problem.sensing.ideal and not problem.dead_time.measurement
-    if at_once and not problem.truth.seen:
+    if at_once and not problem.reality_or_model.seen:
         sense = [mover.sense(plant.motion, response)]
-        return [*sense, _truth_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
+        return [*sense, _error_block(problem, plant.output)] if predicts or problem.dead_time.inputs else sense
     true, shown = _true_blocks(mover, response)
-    if predicts and not mover.shows_truth and all(map(problem.moves.shows, problem.judged_names)):
-        true = [*true, _truth_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
+    if predicts and not mover.shows_itself and all(map(problem.moves.shows, problem.judged_names)):
+        true = [*true, _error_block(problem, shown[0][-1])]  # the reference of the controller is that of a later time
     if at_once:
         return true  # with coordinates measured in place of others
     return [*true, *_late_blocks(problem, shown)]
@@ -140,13 +140,13 @@ def _true_blocks(mover: Mover, response: Signal) -> tuple[list[Block], Shown]:
     """Blocks of the true motion, response and error; and the signals that sensors see."""
     problem, motion = mover.problem, mover.motion
     hidden = tuple(like(s, f"_seen_{s.name}") for s in motion), like(response, "_seen")
-    if not mover.shows_truth:
+    if not mover.shows_itself:
         return [mover.sense(*hidden)], hidden
     true = tuple(like(s, f"plant_{s.name}") for s in motion), like(response, "plant_realised")
     sense = mover.sense(*true)
     sense = with_true_response(problem, sense, true[0][-1], true[1])
-    blocks = [sense, _truth_block(problem, true[0][-1])]
-    if not problem.truth.seen:
+    blocks = [sense, _error_block(problem, true[0][-1])]
+    if not problem.reality_or_model.seen:
         return blocks, true
     direct = problem.sensing.ideal and not problem.dead_time.measurement
     shown = (motion, response) if direct else hidden
@@ -214,7 +214,7 @@ def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Queu
     ]
 
 
-def _truth_block(problem: Problem, motion: Signal) -> Block:
+def _error_block(problem: Problem, motion: Signal) -> Block:
     """Block (time, true state or outputs) -> true error of the judged ones."""
     plant = problem.plant
     places = [plant.output.elements.index(c) for c in problem.judged_names]
@@ -225,7 +225,7 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
     if problem.given_signals:
         reads = Layout((like(plant.output, "reference"), motion))
         return Block(
-            "truth", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
+            "true_error", reads, writes, lambda s: {"true_error": s.reference[places] - getattr(s, motion.name)[own]}
         )
     function, reads = problem.reference.motion_now(plant), Layout((plant.time, motion, *problem.own_signals))
 
@@ -233,14 +233,14 @@ def _truth_block(problem: Problem, motion: Signal) -> Block:
         along = function(s.time, *(getattr(s, one.name) for one in problem.own_signals))[0]
         return {"true_error": along[places] - getattr(s, motion.name)[own]}
 
-    return Block("truth", reads, writes, step)
+    return Block("true_error", reads, writes, step)
 
 
 def _seen_block(problem: Problem, shown: Shown) -> Block:
     """Block -> the state, the outputs and the response that are measured in place of the true ones."""
     motion, response = shown
-    functions = {one.name: problem.truth.function(one.elements, seen=True) for one in motion}
-    functions[response.name] = problem.truth.function(response_names(problem.plant), seen=True)
+    functions = {one.name: problem.reality_or_model.function(one.elements, seen=True) for one in motion}
+    functions[response.name] = problem.reality_or_model.function(response_names(problem.plant), seen=True)
 
     def step(s: Signals) -> dict[str, Expression]:
         now = (s._state_before, s._acting_before, s._exact, s._forcing_before)

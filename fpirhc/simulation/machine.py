@@ -1,4 +1,4 @@
-"""A controller as it runs against a machine: behind its gate, with a fingerprint in its memory, and watched.
+"""A controller as it runs against a real plant: behind its gate, with a fingerprint in its memory, and watched.
 
 fingerprint, clock -> gate (controller) -> watch
 """

@@ -86,7 +86,7 @@ class Mover(ABC):
 
     @property
     @abstractmethod
-    def shows_truth(self) -> bool:
+    def shows_itself(self) -> bool:
         """Whether it shows everything that is judged: the model's whole state or outputs, and their responses."""
 
     @property
@@ -125,9 +125,9 @@ class Equations(Mover):
 
     @property
     def states(self) -> tuple[str, ...]:
-        return self.problem.truth.shown(self.problem.plant.state.elements)
+        return self.problem.reality_or_model.shown(self.problem.plant.state.elements)
 
-    shows_truth = True
+    shows_itself = True
 
     reads = ()
 
@@ -149,11 +149,11 @@ class Equations(Mover):
         The response is computed here and not at the end of the last cycle, because it shares its costly terms with the first
         Runge-Kutta evaluation of this cycle. Outputs are those of the moving plant, with its exact parameters.
         """
-        problem, truth = self.problem, self.problem.truth
-        answer = truth.function(response_names(problem.plant))
+        problem, moved = self.problem, self.problem.reality_or_model
+        answer = moved.function(response_names(problem.plant))
         reads, writes = real_signals(problem), (*motion, response)
-        own = () if problem.reality is None else (like(truth.plant.state, REALITY_STATE),)
-        shown = {one.name: truth.function(one.elements) for one in motion}
+        own = () if problem.reality is None else (like(moved.plant.state, REALITY_STATE),)
+        shown = {one.name: moved.function(one.elements) for one in motion}
         shifts = bool(problem.disturbed_outputs)
         if shifts:
             reads, writes = (*reads, disturbance_signal(problem)), (*writes, like(problem.plant.output, LOGGED))
@@ -230,7 +230,7 @@ class Body(Mover):
         return tuple(e for e in state.elements if e in self.measures) if outputs else state.elements
 
     @property
-    def shows_truth(self) -> bool:
+    def shows_itself(self) -> bool:
         plant = self.problem.plant
         return {*plant.output.elements, *response_names(plant)} <= set(self.measures)
 

@@ -70,7 +70,7 @@ class ComposedStep:
         settings = live_settings(problem, controller, live)
         planner = settings.controller.planner
         why = planner.optimiser.unbounded if bounded and planner is not None else ""
-        require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a machine")
+        require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a real plant")
         composite, memory = composed_step(settings.composed, problem, settings.controller, saturated_after)
         return cls(settings, composite, memory, Replay.of(problem, composite, bridged))
 

@@ -148,7 +148,7 @@ def run_variants(
     Args:
         controllers: names; None: all.
         metrics: None: those of the task that every run of a study has.
-        processes: number of processes, one for a machine; None: what a `joblib.parallel_config` around the call says, else 1.
+        processes: number of processes, one for a real plant; None: what a `joblib.parallel_config` around the call says, else 1.
             With `joblib.parallel_config(backend="dask")` and a Dask client the runs go to its cluster.
         compiled: whether loops are compiled; those that run once are so where the run is long.
         keep: file of JSON lines; rows that it holds are not run again, and new ones are added as they come.
@@ -164,7 +164,7 @@ def run_variants(
     metrics = [one for one in task.metrics if one.always] if metrics is None else metrics
     every = variants.of(chosen)
     if task.problem.moves.rest is not None:
-        processes = 1  # a machine would have two loops that command it
+        processes = 1  # a real plant would have two loops that command it
     with Kept(keep, header_of(chosen, variants.same, metrics)) as kept:
         titles = {one: k for k, one in enumerate(one.name for one in every)}
         rows = {(r["controller"], r["variant"]): r for r in kept.rows}

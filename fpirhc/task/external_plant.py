@@ -54,8 +54,8 @@ class ExternalPlant(Checked):
             A bad answer is an exception, another shape, or a number that is not finite: a body that has measured nothing in a
             cycle, or waited for it too long, returns NaN.
         rest: by input, what is sent when a run ends, however it ends: complete, stopped, by an exception or Ctrl-C. Every input of
-            the model; {}: nothing is sent. A body with a method `close` is a machine, which would keep its last command: it must
-            say, and is closed.
+            the model; {}: nothing is sent. A body with a method `close` is a real plant, which would keep its last command: it
+            must say, and is closed.
         lag: by input, in the model's unit of time: the time constant with which the body follows a command. `ModelReferenced` and
             reviews know it, and no other controller; it is not simulated.
         make: function (parameters, seed) -> body, called before every reset with the exact values of `parameters` by name.
@@ -179,8 +179,8 @@ class ExternalPlant(Checked):
             return f"the class {body.__name__}; write {body.__name__}() for an object of it"
         if self.rest is None and callable(getattr(body, "close", None)):
             return (
-                f"a machine, as {type(body).__name__} has close(), and would keep its last command when a run ends; state what it "
-                "is sent then, rest={'u': 0.0} with every input, or rest={} where nothing is to be sent"
+                f"a real plant, as {type(body).__name__} has close(), and would keep its last command when a run ends; state what "
+                "it is sent then, rest={'u': 0.0} with every input, or rest={} where nothing is to be sent"
             )
         lacking = [name for name in ("reset", "step") if not callable(getattr(body, name, None))]
         what = "None" if body is None else f"a value of the class {type(body).__name__} without {' and '.join(lacking)}"

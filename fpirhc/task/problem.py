@@ -116,10 +116,10 @@ class Problem(Checked):
     @property
     def moves(self) -> Reality | ExternalPlant:
         """What a run moves: the reality, or the model itself with its exact parameters."""
-        return self.reality or self.truth
+        return self.reality or self.reality_or_model
 
     @cached_property
-    def truth(self) -> Reality:
+    def reality_or_model(self) -> Reality:
         """What a run moves, where its equations are known; else the model itself."""
         return self.reality if isinstance(self.reality, Reality) else Reality(self.plant)
 
@@ -131,7 +131,7 @@ class Problem(Checked):
     @property
     def real_plant(self) -> Plant:
         """The plant that a run moves, with its exact parameters: the reality's, or the model's own."""
-        return self.truth.plant
+        return self.reality_or_model.plant
 
     @cached_property
     def disturbed_outputs(self) -> Mapping[str, int]:
@@ -169,12 +169,12 @@ class Problem(Checked):
     @property
     def real_integrator(self) -> Integrator:
         """Integrator of the plant that a run moves."""
-        return self.truth.integrator or self.integrator
+        return self.reality_or_model.integrator or self.integrator
 
     @cached_property
     def real_start(self) -> np.ndarray:
         """First state of the plant that a run moves."""
-        return self.truth.start_state(self.plant, self.start_state)
+        return self.reality_or_model.start_state(self.plant, self.start_state)
 
     @property
     def signal_steps(self) -> int:
@@ -209,7 +209,7 @@ class Problem(Checked):
     def _at_start(self, quantities: Sequence[str], *, seen: bool) -> np.ndarray:
         """Values of quantities of the model, of the plant that moves, as they are judged or measured at the start."""
         at = self.real_start, self.inputs_before, self.real_parameters, np.zeros(len(self.real_plant.names))
-        return np.asarray(self.truth.function(quantities, seen=seen)(*at).full()).ravel()
+        return np.asarray(self.reality_or_model.function(quantities, seen=seen)(*at).full()).ravel()
 
     @cached_property
     def start_output(self) -> np.ndarray:
@@ -221,7 +221,7 @@ class Problem(Checked):
     def first_shown(self) -> Mapping[str, float]:
         """What sensors without noise show at the start, by name; of states that what moves does not have, the model's value."""
         plant = self.plant
-        motion = self.truth.shown((*plant.state.elements, *plant.output.elements))
+        motion = self.reality_or_model.shown((*plant.state.elements, *plant.output.elements))
         names = tuple(dict.fromkeys((*motion, *response_names(plant))))
         believed = dict(zip(plant.state.elements, self.start_state.tolist(), strict=True))
         return believed | dict(zip(names, self._at_start(names, seen=True).tolist(), strict=True))

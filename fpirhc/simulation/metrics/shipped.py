@@ -32,7 +32,7 @@ _SMALLEST = 1e-12  # range of a reference
 SETTLED = 0.02  # half width of the band, as a share of the reference's range or of the first error, whichever is larger
 _AT = 1e-9  # of the range between the limits: nearer is at the limit
 _AT_RATE = 1 - 1e-6  # of the limit of a rate: faster is at the limit
-# A run of a simulated plant counts these even where they never occurred; the others are statuses of a machine.
+# A run of a simulated plant counts these even where they never occurred; the others are statuses of a real plant.
 _ALWAYS = (Status.OK, Status.NOT_CONVERGED, Status.INFEASIBLE, Status.HELD, Status.NON_FINITE)
 
 
