@@ -21,7 +21,7 @@ from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Delay, rename
 from fpirhc.symbolic.expression import Signals, is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
-from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.base import Tracking, bounded
 
 _REQUEST = Form().request
 _ABSURD = 1e4  # times the largest response that limits allow; a loop that diverges stays far below
@@ -213,7 +213,7 @@ def tracked_blocks(
     built: Built, tracking: Tracking, *law: Block, deformation: Deformation | None = None
 ) -> tuple[list[Block], list[Delay]]:
     """Return the blocks of a tracking law, those of another law on what it desires, the closing ones, and the law's update."""
-    plant, (closing, delays), tracks = built.plant, closing_blocks(built, deformation), tracking.within(built.largest)
+    plant, (closing, delays), tracks = built.plant, closing_blocks(built, deformation), bounded(tracking, built.largest)
     target = rename("target", like(plant.output, "reference"), like(plant.output, "_target"))
     blocks = [*nominal_blocks(built), target, tracks.law(plant, built.period), *law, *closing]
     return [*blocks, tracks.update(plant, built.period)], [*delays, *tracks.delays(plant)]

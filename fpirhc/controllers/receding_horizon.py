@@ -34,7 +34,7 @@ from fpirhc.symbolic.open import numbers
 from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
-from fpirhc.tracking.base import Tracking
+from fpirhc.tracking.base import Tracking, bounded
 
 _SOLVE = ("cost", "stationarity", "feasibility", "iterations", "status")
 
@@ -263,7 +263,7 @@ _FOLLOWED = "_followed_state"  # of the model on the planned motion
 
 def from_plan(built: Built, tracking: Tracking) -> Parts:
     """Plan from the model's own state, and keep the plant on the planned motion by a law."""
-    plant, law = built.plant, tracking.within(built.largest)
+    plant, law = built.plant, bounded(tracking, built.largest)
 
     def start(s: Signals) -> dict[str, Expression]:
         target = ca.if_else(s.warm_up < 0.5, s.state, s._target_before)

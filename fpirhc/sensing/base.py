@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from typing import TypeAlias, final
 
 import casadi as ca
 import numpy as np
@@ -27,9 +27,6 @@ Array: TypeAlias = np.ndarray
 
 class DerivativeEstimator(Checked, ABC):
     """Contract: a block from the measured quantities to the controller's 'state' and 'realised'."""
-
-    measures_all: ClassVar[bool] = False  # whether state and response are both measured, so that nothing is estimated
-    of_time: ClassVar[bool] = True  # whether a map has not what it estimates
 
     @abstractmethod
     def measures(self, plant: Plant) -> tuple[str, ...]:
@@ -51,12 +48,18 @@ class DerivativeEstimator(Checked, ABC):
         """Weights w_1, w_2, ... of past requests in the estimated response of a coordinate of that order."""
 
     def fills(self, order: int) -> int:  # noqa: ARG002
-        """Number of the first cycle (from 0) whose response depends on this run's samples alone; 1 by default."""
+        """Number of the first cycle (from 0) whose response is of this run's samples alone: 1, or 0 where all is measured."""
         return 1
+
+    @final
+    @property
+    def measures_all(self) -> bool:
+        """Whether state and response are both measured, so that nothing is estimated."""
+        return self.fills(1) == 0
 
     def check(self, plant: Plant) -> None:
         """Raise if the estimator cannot serve the plant; by default it estimates derivatives."""
-        require_derivatives(plant, type(self).__name__, of_time=self.of_time, instead="leave the estimator out")
+        require_derivatives(plant, type(self).__name__, of_time=True, instead="leave the estimator out")
 
 
 def values_of(plant: Plant, x: ca.SX, u: ca.SX, p: ca.SX) -> dict[str, ca.SX]:
@@ -91,10 +94,11 @@ def combine(coefficients: Array, samples: Sequence[Expression]) -> Expression:
 class Measured(DerivativeEstimator):
     """State and response as the sensors show them, without delay."""
 
-    measures_all = True
-
     def check(self, plant: Plant) -> None:
         """Serve every plant: nothing is estimated."""
+
+    def fills(self, order: int) -> int:  # noqa: ARG002
+        return 0
 
     def measures(self, plant: Plant) -> tuple[str, ...]:
         return tuple(dict.fromkeys(plant.output.elements + response_names(plant)))

@@ -19,6 +19,7 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue
 from fpirhc.fields.kinds import Count, Range, whole
+from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.motion import controlled_places
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.base import Array, DerivativeEstimator, backward_difference, combine, spline_weights
@@ -109,7 +110,8 @@ class StepDifference(PositionDifference):
     those of s cycles ago; `fpirhc.controllers.seeing` brings them to this cycle by the model.
     """
 
-    of_time = False
+    def check(self, plant: Plant) -> None:
+        require_derivatives(plant, "StepDifference", of_time=False, instead="leave the estimator out")
 
     def weights(self, order: int, period: float) -> Array:
         del period

@@ -154,7 +154,7 @@ class Replay:
             tuple(s for one in step.memory.signals for s in (inner.memory.signals if one.name == INNER else (one,)))
         )
         plant, estimator = problem.plant, problem.sensing.estimator
-        shortest = all(estimator.fills(plant.chains[name]) == plant.chains[name] for name in plant.controlled_names)
+        shortest = all(max(estimator.fills(plant.chains[n]), 1) == plant.chains[n] for n in plant.controlled_names)
         usual = BY_DIFFERENCES if problem.sensing.estimates and shortest else BRIDGED
         windows = {s.name for block in seeing_blocks(problem)[0] for s in block.memory.signals}
         acted = {delay.now.name for delay in inner.delays if delay.source == "command"}

@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Self
 
 import casadi as ca
 import numpy as np
@@ -24,7 +23,8 @@ class Tracking(Checked, ABC):
     """Contract: q^Des from the nominal motion and the measured state.
 
     A law is two blocks with its memory between them, because the memory may depend on the command, which comes later in the cycle
-    (an integral must not grow into a limit of the command).
+    (an integral must not grow into a limit of the command). A field `largest` that is empty is given what the limits of the inputs
+    allow, so that what the law remembers forgets a demand that no limits could meet.
     """
 
     def gains(self, order: int) -> tuple[float, ...] | None:  # noqa: ARG002
@@ -33,16 +33,6 @@ class Tracking(Checked, ABC):
         They are those of (e_int, e, e', ...) with the integral, of (e, e', ...) without; lowest derivative first.
         """
         return None
-
-    def within(self, largest: Sequence[float]) -> Self:  # noqa: ARG002
-        """Return the law for inputs with limits: what it remembers forgets a demand that no limits could meet.
-
-        By default the law itself.
-
-        Args:
-            largest: response of every controlled coordinate that the limits allow; infinite where they are not finite.
-        """
-        return self
 
     def check(self, plant: Plant, period: float) -> None:
         """Raise if the law cannot act on the plant in this control cycle; by default it acts on every plant."""
@@ -65,6 +55,15 @@ class Tracking(Checked, ABC):
     @abstractmethod
     def delays(self, plant: Plant) -> tuple[Delay, ...]:
         """Signals that the law carries to the next cycle."""
+
+
+def bounded(law: Tracking, largest: Sequence[float]) -> Tracking:
+    """Return the law with the largest response of every controlled coordinate in its field `largest`, where that is empty."""
+    if getattr(law, "largest", True):
+        return law
+    other = copy(law)  # not `replace`, which would check numbers that are open
+    object.__setattr__(other, "largest", tuple(largest))
+    return other
 
 
 def decay_gains(rate: float, order: int) -> tuple[float, ...]:
@@ -105,23 +104,6 @@ class Useful:
 
 class IntegralLaw(Tracking):
     """A law whose memory between cycles is the integral of the error, which does not grow into a limit of the command."""
-
-    if TYPE_CHECKING:
-
-        @property
-        def largest(self) -> Sequence[float]:
-            """Responses beyond ten times of which an error is not integrated; empty: not decided yet."""
-
-    else:  # a plain attribute, so that dataclasses may have a field of this name
-        largest: Sequence[float]
-
-    def within(self, largest: Sequence[float]) -> Self:
-        """Return the law with these largest responses, unless the user has set them."""
-        if self.largest:
-            return self
-        other = copy(self)  # not `replace`, which would check numbers that are open
-        object.__setattr__(other, "largest", tuple(largest))
-        return other
 
     def update(self, plant: Plant, period: float) -> Block:
         """Block that integrates the error, except further into a limit of the command, and within its bounds."""

@@ -39,9 +39,14 @@ class LinearLaw(IntegralLaw):
         def bumpless(self) -> bool:
             """Whether the integral starts so that the first desired response is the nominal one."""
 
+        @property
+        def largest(self) -> Sequence[float]:
+            """Responses beyond ten times of which an error is not integrated; empty: not decided yet."""
+
     else:  # plain attributes, so that dataclasses may have fields of these names
         integral: bool
         bumpless: bool
+        largest: Sequence[float]
 
     @abstractmethod
     def gains(self, order: int) -> tuple[float, ...]:
