@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 from wrong import controllers, maps, observers, optimisers, tables
-from wrong.tables import CONTROLLER_MEMBERS, CONTROLLERS, MAP_MEMBERS, MAPS, OBSERVERS, OPTIMISERS
+from wrong.tables import CONTROLLERS, MAPS, OBSERVERS, OPTIMISERS
 
 import fpirhc as fp
 from fpirhc.conformance import check_controller, check_deformation, check_observer, check_optimiser, laws_of
-from fpirhc.contracts import Controller, Deformation
+from fpirhc.contracts import Controller, Deformation, StateObserver, Tracking
 
 DEFORMATION = fp.Sigmoid(gain=-0.5)
 FAMILIES: dict[Any, tuple[Any, tuple[Any, ...], Any]] = {  # wrong members: their table, their settings, their laws
@@ -33,12 +33,21 @@ def test_a_wrong_member_is_caught(member, check, law, sentence):
         check(member)
 
 
-@pytest.mark.parametrize(("contract", "table"), [(Controller, CONTROLLER_MEMBERS), (Deformation, MAP_MEMBERS)])
-def test_every_member_of_a_contract_has_a_law(contract, table):
+MEMBERS = {
+    "controller": (Controller, tables.CONTROLLER_MEMBERS),
+    "deformation": (Deformation, tables.MAP_MEMBERS),
+    "observer": (StateObserver, tables.OBSERVER_MEMBERS),
+    "tracking": (Tracking, tables.TRACKING_MEMBERS),
+}
+
+
+@pytest.mark.parametrize("module", MEMBERS)
+def test_every_member_of_a_contract_has_a_law(module):
     """A fact that no law tests may be anything."""
+    contract, table = MEMBERS[module]
     own = {n for n in (*vars(contract), *contract.__annotations__) if not n.startswith("_")}
     assert own == {*table}
-    laws = laws_of(f"fpirhc.conformance.{contract.__name__.lower()}")
+    laws = laws_of(f"fpirhc.conformance.{module}")
     assert {*table.values()} <= {"frozen value", *(law.__name__.replace("_", " ") for law in laws)}
 
 

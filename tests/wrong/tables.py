@@ -73,3 +73,17 @@ MAP_MEMBERS = {
     "step": "step is bounded",
     "with_effective_gain": "gain can be set",
 }
+TRACKING_MEMBERS = {
+    "check": "error decays",
+    "delays": "clipping freezes",
+    "gains": "gains are what it does",
+    "law": "zero error asks for the nominal response",
+    "update": "clipping freezes",
+}
+OBSERVER_MEMBERS = {
+    "check": "wrong start is corrected",
+    "correct": "wrong start is corrected",
+    "memory": "old samples do nothing",
+    "predict": "right model believes what is",
+    "uses": "wrong start is corrected",
+}
