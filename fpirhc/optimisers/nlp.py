@@ -91,7 +91,7 @@ class MultipleShooting(Optimiser):
         """
         s0, data, lower, upper, _ = arguments = call_arguments(ocp, self.memory(ocp).size)
         start, states = self._guess(ocp)(*arguments)
-        begin = _program_values(ocp)(interleave(states, start), ca.vec(data))
+        begin = _program_values(ocp, by := units(ocp))(interleave(states, start) / by.variables, ca.vec(data))
         usable = ca.logic_and(sane(s0, data, lower, upper), is_finite(begin))
         run, skip = self._solve(ocp, "fpirhc_shooting"), self._skip(ocp)
         results = ca.Function.if_else("fpirhc_guarded_shooting", run, skip)(usable, *arguments)
@@ -158,9 +158,9 @@ def _usable(multipliers: ca.MX) -> ca.MX:
     return ca.if_else(ca.fabs(multipliers) <= _LARGEST_MULTIPLIER, multipliers, 0)
 
 
-def _program_values(ocp: OptimalControl) -> ca.Function:
+def _program_values(ocp: OptimalControl, by: Units) -> ca.Function:
     """Function (w, p) -> cost, constraints and their first derivatives in one column."""
-    nlp = program(ocp)
+    nlp = program(ocp, by)
     slopes = ca.gradient(nlp["f"], nlp["x"]), ca.jacobian(nlp["g"], nlp["x"])
     column = ca.vertcat(nlp["f"], nlp["g"], ca.densify(slopes[0]), ca.vec(slopes[1].nz[:]))
     return ca.Function("fpirhc_program_values", [nlp["x"], nlp["p"]], [column])
@@ -192,9 +192,9 @@ def _stage_bounds(ocp: OptimalControl, s0: ca.MX, bound: np.ndarray) -> ca.MX:
 class Units(NamedTuple):
     """What a program is divided by."""
 
-    variables: ca.DM | float = 1.0
-    constraints: ca.DM | float = 1.0
-    cost: float = 1.0
+    variables: ca.DM
+    constraints: ca.DM
+    cost: float
 
 
 def units(ocp: OptimalControl) -> Units:
@@ -220,12 +220,12 @@ def scaled_solver(name: str, plugin: str, ocp: OptimalControl, options: Options)
     scaled |= {key: given[key] / g for key in ("lbg", "ubg")}
     scaled |= {key: _usable(given[key] * unit / cost) for key, unit in (("lam_x0", w), ("lam_g0", g))}
     found = made(**scaled)
-    own = {"x": w, "g": g, "f": cost, "lam_x": cost / w, "lam_g": cost / g}
+    own: dict[str, ca.DM | float] = {"x": w, "g": g, "f": cost, "lam_x": cost / w, "lam_g": cost / g}
     results = [found[key] * own.get(key, 1.0) for key in made.name_out()]
     return ca.Function(name, list(given.values()), results, made.name_in(), made.name_out())
 
 
-def program(ocp: OptimalControl, by: Units = Units()) -> dict[str, ca.MX]:  # noqa: B008
+def program(ocp: OptimalControl, by: Units) -> dict[str, ca.MX]:
     """Return the program as CasADi's `nlpsol` takes it, divided by its units, with the data of all stages as its parameter."""
     n = ocp.stages
     w, flat = ca.MX.sym("w", sizes(ocp)[0]), ca.MX.sym("p", ocp.data.size * (n + 1))

@@ -1,5 +1,6 @@
 """Optimal control problems that are posed by hand, and plans rolled out stage by stage."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +47,17 @@ def rolled(ocp: Any, first: Any, inputs: Any, data: Any) -> Rolled:
 def called(function: Any, *arguments: Any) -> list[np.ndarray]:
     """What a Function gives, as arrays: of an optimiser's step the plan, its five numbers, and the memory."""
     return [np.asarray(v.full()) for v in function(*arguments)]
+
+
+def repeated(optimiser: Any, ocp: Any, data: Any, first: Any, calls: int, plan: Any = None) -> Iterator[Any]:
+    """Plan and five numbers of calls with the memory of the one before, from rest or from a remembered plan."""
+    step, layout = optimiser.step(ocp), optimiser.memory(ocp)
+    memory = layout.start()
+    if plan is not None:
+        memory[layout.slice("plan_inputs")] = np.ravel(plan, order="F")
+    for _ in range(calls):
+        inputs, numbers, memory = called(step, first, data, ocp.input_lower, ocp.input_upper, memory)
+        yield [inputs, numbers.ravel()]
 
 
 PENDULUM, SWINGING = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.horizons import SWING, linear_problem, pendulum_problem, rolled
+from helpers.horizons import SWING, linear_problem, pendulum_problem, repeated, rolled
 from helpers.kinds import slow_but
 
 import fpirhc as fp
@@ -16,11 +16,9 @@ PROBLEMS = ("two_mass", "van_der_pol", "cart_pole", "two_link_arm", "chain_of_ma
 def iterates(ocp, data, first, count):
     """Plans after 1, 2, ... iterations from rest."""
     optimiser = fp.FixedPoint(iterations=1, tolerance=1e-13)
-    bounds, memory, step = (ocp.input_lower, ocp.input_upper), optimiser.memory(ocp).start(), optimiser.step(ocp)
     best = fp.solve(ocp, replace(optimiser, tolerance=1e-9), first, data)
-    for _ in range(count):
-        inputs, diagnostics, memory = (v.full() for v in step(first, data, *bounds, memory))
-        yield replace(best, inputs=inputs, states=best.states, cost=float(diagnostics.ravel()[0])), best
+    for inputs, numbers in repeated(optimiser, ocp, data, first, count):
+        yield replace(best, inputs=inputs, states=best.states, cost=float(numbers[0])), best
 
 
 @pytest.mark.parametrize("name", slow_but(PROBLEMS, "two_mass", "cart_pole"))
@@ -57,12 +55,8 @@ def test_factor_is_the_rate_of_the_iteration():
     first = np.array([2.5, 0.0])
     optimiser = fp.FixedPoint(iterations=1, tolerance=1e-12)
     best = fp.solve(ocp, optimiser, first, data)
-    step, memory = optimiser.step(ocp), optimiser.memory(ocp).start()
-    memory[optimiser.memory(ocp).slice("plan_inputs")] = best.inputs.ravel(order="F") + 1e-3
-    distances = []
-    for _ in range(7):
-        inputs, _, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
-        distances.append(np.linalg.norm(inputs.full() - best.inputs))
+    plans = repeated(optimiser, ocp, data, first, 7, best.inputs + 1e-3)
+    distances = [np.linalg.norm(inputs - best.inputs) for inputs, _ in plans]
     assert distances[-1] / distances[-2] == pytest.approx(fp.certify(best).factor, abs=0.01)
 
 

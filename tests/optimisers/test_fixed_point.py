@@ -6,7 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.horizons import SWING, horizon_of, linear_problem, pendulum_problem
+from helpers.horizons import SWING, horizon_of, linear_problem, pendulum_problem, repeated
 from helpers.machine import needs_compiler
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -106,17 +106,12 @@ def test_single_iterations_get_out_of_a_bad_plan():
     cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, deviation={"thrust": 1e-2})
     horizon, limits = fp.Horizon(stages=20, step=2e-2), fp.Limits(inputs={"thrust": (0.0, 40.0)})
     ocp, data = horizon_of(plant, reference, horizon, cost, limits)
-    optimiser, memory = fp.FixedPoint(iterations=1, tolerance=1e-6), None
     first = np.array([2.0, 0.0])
     best = fp.solve(ocp, fp.Ipopt(), first, data)
     # As after a plan for another model: nearly all thrust at once.
-    memory = optimiser.memory(ocp).start()
-    memory[optimiser.memory(ocp).slice("plan_inputs")] = np.linspace(40.0, 0.0, horizon.stages)
-    statuses = []
-    for _ in range(40):
-        inputs, diagnostics, memory = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper, memory)
-        statuses.append(int(diagnostics.ravel()[4]))
-    assert statuses[-1] == fp.Status.OK
+    bad = np.linspace(40.0, 0.0, horizon.stages)
+    *_, (inputs, numbers) = repeated(fp.FixedPoint(iterations=1, tolerance=1e-6), ocp, data, first, 40, bad)
+    assert numbers[4] == fp.Status.OK
     np.testing.assert_allclose(inputs, best.inputs, atol=1e-4)
 
 

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.horizons import horizon_of
+from helpers.horizons import horizon_of, repeated
 from helpers.plants import known
 
 import fpirhc as fp
@@ -123,6 +123,9 @@ def test_multipliers_of_state_limits_are_verified_without_the_solver(optimiser, 
         values = wrong * plan.state_multipliers
         _, residual, _ = judge(ocp)(plan.inputs, plan.states[:, 0], data, ocp.input_lower, ocp.input_upper, values)
         assert float(residual) > 1.0
+    _, (again, _) = repeated(optimiser, ocp, data, plan.states[:, 0], 2)
+    left = 1e-9 if optimiser.plugin == "ipopt" else 1e-2  # fatrop takes no multipliers
+    np.testing.assert_allclose(again, plan.inputs, rtol=0, atol=left)
 
 
 def test_a_first_state_outside_its_limits_is_infeasible():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.horizons import linear_problem, pendulum_problem
+from helpers.horizons import linear_problem, pendulum_problem, repeated
 
 import fpirhc as fp
 from fpirhc.contracts import reduced_gradient
@@ -44,12 +44,16 @@ def test_rate_of_the_reduced_form():
 
 def rate(optimiser, ocp, data, first, iterations=25):
     best = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-11), first, data).inputs
-    step, memory = optimiser.step(ocp), optimiser.memory(ocp).start()
-    distances = []
-    for _ in range(iterations):
-        inputs, _, memory = step(first, data, ocp.input_lower, ocp.input_upper, memory)
-        distances.append(np.linalg.norm(inputs.full() - best))
+    distances = [np.linalg.norm(plan - best) for plan, _ in repeated(optimiser, ocp, data, first, iterations)]
     return (distances[-1] / distances[-11]) ** 0.1
+
+
+@pytest.mark.parametrize("kind", [fp.FullSpaceFixedPoint, fp.GradientFixedPoint])
+def test_a_call_goes_on_where_the_one_before_ended(kind):
+    """Two calls are one with twice the iterations, however small the states are."""
+    ocp, data = pendulum_problem()
+    (*_, twice), (once,) = (repeated(kind(k, tolerance=1e-6), ocp, data, FIRST / 10, 40 // k) for k in (20, 40))
+    np.testing.assert_array_equal(twice[0], once[0])
 
 
 def test_the_baseline_is_orders_of_magnitude_slower_and_scaling_helps():

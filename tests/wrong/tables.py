@@ -14,10 +14,7 @@ CONTROLLERS = {
     controllers.NamesAnotherLaw: ("law is what it does", "fed back with 36, its law Exponential says 3600"),
     controllers.PushesAway: ("exact model tracks", "with the exact model"),
     controllers.NotesAreOneText: ("facts hold", "its notes are 'It feeds"),
-    controllers.SaysItControlsMaps: (
-        "what it takes it controls",
-        "it says that it can control a map, but cannot be built",
-    ),
+    controllers.SaysItControlsMaps: ("what it takes it controls", "can control a map, but cannot be built"),
 }
 MAPS = {
     maps.HalfTheSecant: ("step is bounded", r"secant_gain\(\) 0.15 is below the effective gain 0.3"),
