@@ -150,14 +150,14 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     weighted = deformation.form.weighted(jacobian)
     if not np.isfinite(jacobian).all() or np.abs(np.linalg.eigvals(weighted)).max() <= _NOTHING:
         return
-    eigenvalues, delay, steady = np.linalg.eigvals(weighted), problem.response_delay, deformation.form.steady
+    eigenvalues, steady = np.linalg.eigvals(weighted), deformation.form.steady
     limit, seen = sum(linear_limit(eigenvalues)), _weights_of_estimators(problem)
     weights, wrong = seen or [delayed(np.ones(1), deformation.form.late)] * len(jacobian), limit * gain <= 0
     if not wrong and (
         not steady or (seen is None and abs(gain) < abs(limit)) or converges(deformation, jacobian, weights)
     ):
         return
-    what, (name, value) = with_its_gain(deformation), own_gain(deformation)
+    what, (name, value), delay = with_its_gain(deformation), own_gain(deformation), problem.response_delay
     pairs = not any(against_wrappers(Paired(deformation, cycles=1.0)))  # whether it may be paired
     remembers = deformation.memory(problem.plant.controlled_names).size > 0
     right = deformation.with_effective_gain(-gain) if wrong else deformation

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import repeat
 
 import casadi as ca
 
@@ -23,7 +24,6 @@ from fpirhc.deformation.base import Deformation, against_wrappers
 from fpirhc.errors import InvalidProblem, refuse
 from fpirhc.fields.kinds import described
 from fpirhc.plant.maps import against_lags
-from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, fed, rename
 from fpirhc.symbolic.driver import plans_are_compiled
@@ -114,7 +114,7 @@ def _made(problem: Problem, ready: Controller) -> Built:
     plant = problem.plant
     planned = ready.planner.planned(problem) if ready.planner is not None else None
     own, before = problem.own_signals, tuple(map(float, problem.inputs_before))
-    units = followed_units(plant)
+    units = plant.followed
     return Built(
         problem=problem,
         controller=ready,
@@ -231,7 +231,7 @@ def _blocks_of(built: Built) -> tuple[list[Block], list[Delay]]:
     pair = given if isinstance(given, tuple) and len(given) == 2 else None
     kinds = (Block, Delay)
     if pair is None or not all(
-        isinstance(part, list | tuple) and all(isinstance(one, kind) for one in part)
+        isinstance(part, list | tuple) and all(map(isinstance, part, repeat(kind)))
         for part, kind in zip(pair, kinds, strict=True)
     ):
         raise InvalidProblem(

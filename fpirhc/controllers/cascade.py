@@ -20,7 +20,6 @@ from fpirhc.deformation.base import Deformation, automatic
 from fpirhc.errors import InvalidValue, NotContractive, require
 from fpirhc.fields.kinds import NotNegative
 from fpirhc.members import Example
-from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.expression import Signals, is_finite
@@ -66,7 +65,7 @@ class Shifted(Reference):
 
 
 def _shift_signal(plant: Plant, name: str) -> Signal:
-    units = followed_units(plant)
+    units = plant.followed
     return Signal(name, plant.controlled_names, tuple(units[n] for n in plant.controlled_names))
 
 

@@ -232,17 +232,19 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
+    of_problem = (f.name for f in fields(deformation) if f.metadata.get("of_problem"))
+    left_open = [name for name in of_problem if getattr(deformation, name) is None]
+    if not left_open:
+        return deformation
     lags, inputs, times = problem.moves.lag, tuple(problem.plant.inputs), problem.dead_time.inputs
     known = {
         "cycles": [whole(times.get(name, 0.0) / problem.period) for name in inputs],
         "lag": [lags.get(name, 0.0) for name in inputs],
     }
-    of_problem = [f.name for f in fields(deformation) if f.metadata.get("of_problem")]
-    left_open = [name for name in of_problem if getattr(deformation, name) is None]
     square = len(inputs) == len(problem.plant.controlled_names)
     each = {n: square and len({*known[n]}) > 1 for n in left_open}
     values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in left_open}
-    return replace(deformation, **values) if values else deformation
+    return replace(deformation, **values)
 
 
 def resolved(problem: Problem, controller: Controller) -> Controller:

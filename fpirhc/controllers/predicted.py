@@ -18,7 +18,6 @@ from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
 from fpirhc.plant.chain import derivatives_function
 from fpirhc.plant.integrators import USUAL
-from fpirhc.plant.motion import forcing_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
@@ -123,7 +122,7 @@ class Predicted(ControllerWrapper):
         queue, calm = Queue(cycles), ca.MX.zeros(len(plant.names))
         advance = USUAL.step(plant, period) if self.by == "model" else _along_desired(plant, period)
         corrected = _residual(plant, self.residual_time, period) if self.residual_time else None
-        residual = Signal("residual", plant.names, forcing_units(plant))
+        residual = like(plant.forcing, "residual")
         answered = Queue(plant.response_age)  # of the state to which the measured response belongs
         past = answered.memory("state_answered", plant.state.elements, built.state.start)
         own = (residual, *past) if corrected else ()

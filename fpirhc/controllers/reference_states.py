@@ -115,7 +115,10 @@ def _largest_response(problem: Problem) -> tuple[float, ...]:
     states = np.hstack([reference_states(problem, _SAMPLES), np.asarray(problem.start_state)[:, None]])
     middle, inputs = (lower + upper) / 2, np.arange(lower.size)
     corners = [middle, *(np.where(inputs == k, end[k], middle) for k in inputs for end in (lower, upper))]
-    at_middle, *at_limits = (_responses(problem, states, corner) for corner in corners)
+    commands, every = np.repeat(corners, states.shape[1], axis=0).T, np.tile(states, len(corners))
+    model = np.repeat(problem.plant.approximate[:, None], every.shape[1], axis=1)
+    responses = problem.plant.equations.controlled_response.map(every.shape[1])(every, commands, model).full()
+    at_middle, *at_limits = np.split(np.asarray(responses), len(corners), axis=1)
     with np.errstate(all="ignore"):
         reach = [
             np.fmax(abs(low - at_middle), abs(high - at_middle))
@@ -124,12 +127,6 @@ def _largest_response(problem: Problem) -> tuple[float, ...]:
         sizes = abs(at_middle) + sum(reach)
     finite = np.where(np.isfinite(sizes), sizes, 0.0).max(axis=1)
     return tuple(float(v) if v > 0 else float("inf") for v in finite)
-
-
-def _responses(task: Problem, states: np.ndarray, command: np.ndarray) -> np.ndarray:
-    count = states.shape[1]
-    repeated = [np.repeat(v[:, None], count, axis=1) for v in (command, task.plant.approximate)]
-    return np.asarray(task.plant.equations.controlled_response.map(count)(states, *repeated).full())
 
 
 _INSTANTS = 2000
@@ -175,7 +172,7 @@ def request_of_commands(problem: Problem) -> RequestChange:
 
 def _recovery(problem: Problem, law: Tracking | None) -> float:
     """Step per cycle with which the plain form comes back from the largest expected error; 0 without a law of one rate."""
-    laws = [law.gains(order) for order in problem.plant.response_orders.values()] if law else []
+    laws = [law.gains(order) for order in {*problem.plant.response_orders.values()}] if law else []
     rates = [(len(gains), rate) for gains in laws if gains and (rate := one_rate(gains)) is not None]
     if not rates:
         return 0.0

@@ -23,7 +23,6 @@ from fpirhc.deformation.model_referenced import settled
 from fpirhc.errors import Mistakes, NotSupported
 from fpirhc.fields.kinds import NotNegative, Positive
 from fpirhc.members import Example
-from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay, under_names
 from fpirhc.symbolic.evaluate import Latest
@@ -97,7 +96,7 @@ class Slotted(Controller):
             mistakes.add(
                 f"slots take turns on one input, and the plant has {', '.join(plant.inputs)}; use RecedingHorizon"
             )
-        mistakes.unknown("slot", self.slots, followed_units(plant))
+        mistakes.unknown("slot", self.slots, plant.followed)
         mistakes.raise_if_any()
         for name in self.slots:
             if name not in problem.judged_names:

@@ -20,6 +20,7 @@ import numpy as np
 from fpirhc.errors import InvalidName, InvalidValue, NotSupported, require
 from fpirhc.fields.checked import Checked, Inner, replaced
 from fpirhc.fields.kinds import finite_number
+from fpirhc.symbolic.dotted import copied
 from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
 from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
@@ -182,7 +183,7 @@ def scaled_for(deformation: Deformation, request: RequestChange) -> Deformation:
     if deformation.inner is not None:
         return with_inner(deformation, scaled_for(deformation.inner, request))
     for name in automatic(deformation):
-        step = replace(cast("Any", deformation), **{name: 1.0}).largest_step()
+        step = copied(cast("Any", deformation), {name: 1.0}).largest_step()
         scale = request.change / step if request.sudden else 2 * request.change
         chosen = float(f"{max(1.0, scale, request.recovery / step):.3g}")
         deformation = replace(cast("Any", deformation), **{name: chosen})

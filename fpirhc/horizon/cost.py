@@ -19,7 +19,6 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import AtLeastOne, Count, Duration, NotNegative, described
 from fpirhc.fields.user_code import called
 from fpirhc.plant.integrators import USUAL, Integrator
-from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import stays, total
@@ -142,7 +141,7 @@ def view_of(
         named(plant.parameter, p, "parameter"),
     )
     shown = named(plant.output, outputs_of(plant, x, u, p) if output is None else output)
-    outside = Named(names := outside_names(plant), ca.vertcat(*(given[n] for n in names)), "signal from outside")
+    outside = Named(names := plant.outside, ca.vertcat(*(given[n] for n in names)), "signal from outside")
     return View(state, wanted, now, past, known, given, t, shown, outside)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from fpirhc.errors import Mistakes, refuse
 from fpirhc.fields.kinds import takes
 from fpirhc.fields.user_code import called, scalar_expression
-from fpirhc.plant.motion import arguments_of, believed_in, by_name, controlled_places, outside_names, sampling, unit_of
+from fpirhc.plant.motion import arguments_of, believed_in, by_name, controlled_places, sampling, unit_of
 from fpirhc.plant.parameter import Parameter
 from fpirhc.symbolic.expression import Matrix
 from fpirhc.symbolic.layout import Expression
@@ -138,8 +138,7 @@ def without_disturbances(plant: Plant) -> Plant:
 def derivatives_function(plant: Plant, wanted: tuple[tuple[str, int], ...]) -> ca.Function:
     """Return the Function (state, input, parameters, forcing) -> the wanted derivatives, in their order."""
     symbols = *plant.symbols(), ca.SX.sym("w", len(plant.names))
-    most = {name: max(k for one, k in wanted if one == name) for name, _ in wanted}
-    chains = derivatives(plant, most, symbols)
+    chains = derivatives(plant, dict(sorted(wanted)), symbols)  # of every name the highest
     column = ca.vertcat(*(chains[name][k] for name, k in wanted))
     return ca.Function("fpirhc_derivatives", list(symbols), [ca.densify(column)])
 
@@ -174,7 +173,7 @@ def differentiated_signals(plant: Plant) -> tuple[str, ...]:
     x, u, p = plant.symbols()
     motion = plant.equations.output(x, u, p, ca.SX.zeros(len(plant.names)))
     differentiated = [motion[k] for k, e in enumerate(plant.output.elements) if plant.equations.output_orders.get(e, 1)]
-    places = {name: plant.parameter.elements.index(name) for name in outside_names(plant)}
+    places = {name: plant.parameter.elements.index(name) for name in plant.outside}
     return tuple(name for name, place in places.items() if ca.depends_on(ca.vertcat(*differentiated), p[place]))
 
 

@@ -33,7 +33,7 @@ def derivative_unit(unit: str, derivative: int, time: str = "s") -> str:
 
 def unit_of(plant: Plant, quantity: str) -> str:
     """Return the unit of a coordinate, an output, or a derivative of one: q1''."""
-    units, primes = {**plant.coordinates, **followed_units(plant)}, quantity.count("'")
+    units, primes = {**plant.coordinates, **plant.followed}, quantity.count("'")
     return derivative_unit(units[quantity.rstrip("'")], primes, plant.time_unit)
 
 
@@ -56,17 +56,6 @@ def words(plant: Plant) -> tuple[str, str]:
     return ("state", "rates") if plant.outputs and set(plant.orders) == {1} else ("coordinate", "response")
 
 
-def followed_units(plant: Plant) -> dict[str, str]:
-    """Return name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
-    return {name: one.unit for name, one in plant.outputs.items()} if plant.outputs else dict(plant.coordinates)
-
-
-def forcing_units(plant: Plant) -> tuple[str, ...]:
-    """Return the units of the highest derivative of every coordinate, to which a forcing adds."""
-    units = zip(plant.coordinates.values(), plant.orders, strict=True)
-    return tuple(derivative_unit(unit, order, plant.time_unit) for unit, order in units)
-
-
 def sampling(plant: Plant) -> float:
     """Return the time from one state of a map to the next that a controller sees, its cycle; NaN for differential equations."""
     return math.nan if plant.step is None else plant.step * plant.steps
@@ -82,14 +71,9 @@ def with_exact_parameters(plant: Plant, exact: np.ndarray) -> Plant:
     return other
 
 
-def outside_names(plant: Plant) -> tuple[str, ...]:
-    """Return the names of the parameters that are signals from outside."""
-    return tuple(name for name, one in plant.parameters.items() if one.outside)
-
-
 def controlled_places(plant: Plant) -> list[int]:
     """Return the places of the controlled quantities among all outputs, or without any among all coordinates."""
-    names = list(followed_units(plant))
+    names = list(plant.followed)
     return [names.index(c) for c in plant.controlled_names]
 
 

@@ -15,7 +15,7 @@ from fpirhc.errors import InvalidProblem
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Few
 from fpirhc.plant.equations import Equations
-from fpirhc.plant.motion import derivative_unit, derivatives_signal, followed_units
+from fpirhc.plant.motion import derivative_unit, derivatives_signal
 from fpirhc.plant.parameter import Parameter
 from fpirhc.plant.plant_check import check_plant
 from fpirhc.summary import line
@@ -169,11 +169,16 @@ class Plant(Checked):
         return derivatives_signal("state", self.coordinates, orders, self.time_unit)
 
     @cached_property
+    def followed(self) -> dict[str, str]:
+        """Name -> unit of what may follow a reference: the outputs, or without any the coordinates."""
+        return {name: one.unit for name, one in self.outputs.items()} if self.outputs else dict(self.coordinates)
+
+    @cached_property
     def output(self) -> Signal:
         """The signal of what follows a reference: the state without outputs, else y, y', ... below each relative order."""
         if not self.outputs:
             return self.state
-        return derivatives_signal("output", followed_units(self), self.chains, self.time_unit)
+        return derivatives_signal("output", self.followed, self.chains, self.time_unit)
 
     @cached_property
     def beside(self) -> tuple[Signal, ...]:
@@ -199,6 +204,17 @@ class Plant(Checked):
     def parameter(self) -> Signal:
         """The parameters' signal."""
         return vector("parameters", tuple(self.parameters), tuple(p.unit for p in self.parameters.values()))
+
+    @cached_property
+    def outside(self) -> tuple[str, ...]:
+        """Names of the parameters that are signals from outside."""
+        return tuple(name for name, one in self.parameters.items() if one.outside)
+
+    @cached_property
+    def forcing(self) -> Signal:
+        """The signal of what adds to the highest derivative of every coordinate."""
+        units = zip(self.coordinates.values(), self.orders, strict=True)
+        return Signal("forcing", self.names, tuple(derivative_unit(u, order, self.time_unit) for u, order in units))
 
     @cached_property
     def chains(self) -> dict[str, int]:
@@ -231,7 +247,7 @@ class Plant(Checked):
 
     @cached_property
     def _response_units(self) -> tuple[str, ...]:
-        units, time = followed_units(self), self.time_unit
+        units, time = self.followed, self.time_unit
         return tuple(derivative_unit(units[n], order, time) for n, order in self.response_orders.items())
 
     @cached_property

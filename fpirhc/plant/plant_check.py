@@ -13,7 +13,7 @@ from fpirhc.fields.kinds import described, finite_number, takes
 from fpirhc.fields.user_code import called, named_results, place_of, scalar_expression
 from fpirhc.plant.chain import output_order, stated_expression
 from fpirhc.plant.equations import inverse_by_user
-from fpirhc.plant.motion import arguments_of, followed_units, words
+from fpirhc.plant.motion import arguments_of, words
 from fpirhc.plant.parameter import check_parameters
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
         mistakes.add(f"'{name}' names both an input and {what}; rename one")
     _check_order_numbers(plant, mistakes)
     if plant.controlled is not None:
-        mistakes.unknown("controlled: quantity", plant.controlled, followed_units(plant))
+        mistakes.unknown("controlled: quantity", plant.controlled, plant.followed)
         if len(plant.controlled) != len(plant.inputs):
             mistakes.add(
                 f"controlled names {len(plant.controlled)}, but {len(plant.inputs)} input(s) can prescribe exactly as many"

@@ -16,7 +16,7 @@ from fpirhc.describe import as_written
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import FoundByName, checked_call
 from fpirhc.fields.kinds import Count, Seed
-from fpirhc.plant.motion import derivative_unit, followed_units
+from fpirhc.plant.motion import derivative_unit
 from fpirhc.probing.choice import LONGEST, MARGIN, Choice, Progress, Trial
 from fpirhc.probing.identification import Channel, Estimates, Interval, identify
 from fpirhc.probing.recording import Record, excited, read_recording
@@ -144,7 +144,7 @@ def runs_made(problem: Problem, *, trials: bool, **settings: Any) -> str:
 
 
 def _facts(problem: Problem, record: Record, channels: Sequence[Channel]) -> Iterator[tuple[str, str]]:
-    plant, time, units = problem.plant, problem.time_unit, followed_units(problem.plant)
+    plant, time, units = problem.plant, problem.time_unit, problem.plant.followed
     names = plant.controlled_names
     for row, one in zip(names, channels, strict=True):
         for column, gain in zip(names, one.gains, strict=True):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -179,8 +180,7 @@ class Sensing(Checked):
     @property
     def drawn(self) -> tuple[Signal, ...]:
         """The signal of all random series; empty where there is none."""
-        columns = self._columns()
-        return (Signal("sensing", columns),) if columns else ()
+        return (Signal("sensing", self._columns),) if self._columns else ()
 
     def table(self, times: Array, seed: int) -> Array:
         """Noise and lost samples (1: lost) of every cycle, shape (cycles, size of `drawn`); each column has its own stream."""
@@ -234,9 +234,10 @@ class Sensing(Checked):
 
     def lost(self, column: Expression) -> Expression | None:
         """Return whether a sample of this row of `drawn` is lost; None where none can be."""
-        lost = [column[k] for k, name in enumerate(self._columns()) if name.endswith(" lost")]
+        lost = [column[k] for k, name in enumerate(self._columns) if name.endswith(" lost")]
         return ca.mmax(ca.vertcat(*lost)) if lost else None
 
+    @cached_property
     def _columns(self) -> tuple[str, ...]:
         noisy = [(n, "noise", s.noise is not None) for n, s in self.sensors.items()]
         lossy = [(n, "lost", s.dropout > 0) for n, s in self.sensors.items()]
@@ -246,7 +247,7 @@ class Sensing(Checked):
     def _sensor_block(self, plant: Plant, true: Sequence[Signal], measured: Signal, first: Array) -> Block:
         """Block (true motion, true response, random series) -> measured quantities."""
         every = [e for signal in true[:-1] for e in signal.elements] + list(response_names(plant))
-        columns, drawn = self._columns(), self.drawn
+        columns, drawn = self._columns, self.drawn
         lossy = [n for n in measured.elements if f"{n} lost" in columns]
         starts = [float(first[measured.elements.index(n)]) for n in lossy]
         memory = (Signal("sensor_last", tuple(lossy), start=tuple(starts)),) if lossy else ()

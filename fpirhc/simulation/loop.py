@@ -20,7 +20,6 @@ from fpirhc.controllers.contract import Undeformed, plant_model
 from fpirhc.controllers.gate import INNER, LOST, Gate
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.plant.chain import response_names
-from fpirhc.plant.motion import followed_units
 from fpirhc.sensing.base import backward_difference, combine
 from fpirhc.simulation.moved import HELD, Mover, acting_blocks, moving, outside_blocks, real_signals
 from fpirhc.simulation.replay import known_samples
@@ -52,7 +51,7 @@ def closed_loop(built: Built) -> Composite:
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(mover, disturbed)
     around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
-    constants = [Delay(signal, signal.name) for signal in open_settings(around).signals]
+    constants = [Delay(signal, signal.name) for signal in open_settings(around)]
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
     delays = [*mover.delays, Delay(built.model.parameter, "parameters"), *constants]
     return compose("loop", reads, around, delays, outputs=mover.sent)
@@ -219,9 +218,7 @@ def _error_block(problem: Problem, motion: Signal) -> Block:
     plant = problem.plant
     places = [plant.output.elements.index(c) for c in problem.judged_names]
     own = [motion.elements.index(c) for c in problem.judged_names]  # what moves may not have every state of the model
-    writes = Layout(
-        (vector("true_error", problem.judged_names, [followed_units(plant)[c] for c in problem.judged_names]),)
-    )
+    writes = Layout((vector("true_error", problem.judged_names, [plant.followed[c] for c in problem.judged_names]),))
     if problem.given_signals:
         reads = Layout((like(plant.output, "reference"), motion))
         return Block(

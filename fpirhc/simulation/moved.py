@@ -18,7 +18,6 @@ import numpy as np
 from fpirhc.controllers.contract import PlantModel
 from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.integrators import own_step
-from fpirhc.plant.motion import forcing_units, outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal
 from fpirhc.symbolic.block import Block, Delay
@@ -139,7 +138,7 @@ class Equations(Mover):
         return [
             Delay(Signal("_state_before", plant.state.elements, plant.state.units, start), "_state_after"),
             Delay(Signal("_acting_before", plant.input.elements, plant.input.units, acting), "_acting"),
-            Delay(_forcing(plant, "_forcing_before"), "_forcing"),
+            Delay(like(plant.forcing, "_forcing_before"), "_forcing"),
             Delay(Signal("_exact", plant.parameter.elements, plant.parameter.units, exact), self.parameters),
         ]
 
@@ -178,7 +177,7 @@ class Equations(Mover):
         state = like(plant.state, "_state_before")
         exact = like(plant.parameter, self.parameters if values is None else Mover.parameters)
         reads = (state, arriving, exact, *([] if values is None else [problem.plant.time]), *disturbed)
-        writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), _forcing(plant, "_forcing"))
+        writes = (like(plant.state, "_state_after"), like(plant.input, "_acting"), like(plant.forcing, "_forcing"))
 
         def step(s: Signals) -> dict[str, Expression]:
             u, w = getattr(s, arriving.name), expression(ca.DM.zeros(len(plant.names)))
@@ -277,12 +276,7 @@ def real_signals(problem: Problem) -> tuple[Signal, ...]:
     plant = problem.real_plant
     names = "_state_before", "_acting_before", "_exact"
     signals = (like(s, n) for s, n in zip((plant.state, plant.input, plant.parameter), names, strict=True))
-    return (*signals, _forcing(plant, "_forcing_before"))
-
-
-def _forcing(plant: Plant, name: str) -> Signal:
-    """Signal of what disturbances add to the response of every coordinate."""
-    return Signal(name, plant.names, forcing_units(plant))
+    return (*signals, like(plant.forcing, "_forcing_before"))
 
 
 _REAL_NOW = "_exact_now"
@@ -297,7 +291,7 @@ def outside_blocks(mover: Mover, known: PlantModel) -> list[Block]:
         assert values is not None
         ends = Mover.parameters, _REAL_NOW
         blocks.append(_block("outside", problem, real, values, "signals", ends, problem.signal_steps))
-    if outside_names(model):
+    if model.outside:
         t, p = ca.SX.sym("t"), ca.SX.sym("p", model.parameter.size)
         believed = model_values(model, known.signals) or ca.Function("fpirhc_signals", [t, p], [p])
         blocks.append(_block("told", problem, model, believed, "signals_told", ("parameters", "")))
@@ -311,10 +305,10 @@ def _block(
 
     The values are those in the middle of equal steps of the cycle, and the parameters those of the last one.
     """
-    places = [plant.parameter.elements.index(n) for n in outside_names(plant)]
+    places = [plant.parameter.elements.index(n) for n in plant.outside]
     source, target = ends
     units = tuple(plant.parameter.units[k] for k in places)
-    writes = (Signal(shown, outside_names(plant), units), *([like(plant.parameter, target)] if target else []))
+    writes = (Signal(shown, plant.outside, units), *([like(plant.parameter, target)] if target else []))
 
     def step(s: Signals) -> dict[str, Expression]:
         every = [values(s.time + (k + 0.5) * (problem.period / steps), getattr(s, source)) for k in range(steps)]

@@ -349,7 +349,7 @@ class Stepper(Checked):
     @property
     def settings(self) -> Layout:
         """The vector of the live settings among `reads`, 'settings'; an element is a path."""
-        return open_settings(self._composite.blocks)
+        return Layout(open_settings(self._composite.blocks))
 
     def bounds(self) -> dict[str, Interval]:
         """Return for each live setting the interval of the numbers that a device without Python may accept, by path.

@@ -23,7 +23,7 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.user_code import users_level
-from fpirhc.plant.motion import followed_units, with_exact_parameters, with_space
+from fpirhc.plant.motion import with_exact_parameters, with_space
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.metrics import by_name
 from fpirhc.simulation.metrics.shipped import at_limit, rms_error
@@ -276,7 +276,7 @@ def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | Non
         for run in runs
     )
     stuck = float(np.min([at_limit(problem, run) for run in runs]))  # NaN where one of them is
-    return ErrorPair(before, after, _ranges(problem, runs[0]), followed_units(problem.plant), stuck)
+    return ErrorPair(before, after, _ranges(problem, runs[0]), problem.plant.followed, stuck)
 
 
 def _ranges(problem: Problem, run: Run) -> dict[str, float]:

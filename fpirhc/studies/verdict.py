@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, derivative_of, nearest
-from fpirhc.plant.motion import derivative_unit, followed_units, with_space
+from fpirhc.plant.motion import derivative_unit, with_space
 from fpirhc.simulation.loop import HeldInput
 from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, measured_cycles
 from fpirhc.simulation.metrics.shipped import at_limits, rms_error
@@ -98,7 +98,7 @@ def objective(name: str | None, metrics: Sequence[Metric], problem: Problem) -> 
     """
     if name is None or name in (RELATIVE_ERROR, "error"):
         return Objective()
-    names: Any = {None: (), "coordinate": followed_units(problem.plant), "input": problem.plant.inputs}
+    names: Any = {None: (), "coordinate": problem.plant.followed, "input": problem.plant.inputs}
     for metric in metrics:
         element = name.removeprefix(metric.name).removeprefix(".")
         if name != metric.key(element) or (element and element not in names.get(metric.by, (element,))):

@@ -159,7 +159,7 @@ def compose(
     """Wire blocks, in order, by signal name into one step, which returns the traced `outputs` once more by themselves."""
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
-    reads = reads + Layout(tuple([s for s in open_settings(blocks).signals if s.name not in held]))
+    reads = Layout((*reads.signals, *[s for s in open_settings(blocks) if s.name not in held]))
     _require_wired(reads, memory, blocks, delays)
     trace = Layout(tuple([s for b in blocks for s in b.writes.signals if not s.name.startswith("_")]))
     return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, tuple(outputs))
@@ -194,9 +194,9 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
         next_memory[m] = results[f"{m}_next"]
 
 
-def open_settings(blocks: Sequence[Block]) -> Layout:
+def open_settings(blocks: Sequence[Block]) -> tuple[Signal, ...]:
     """Return the signal of the settings, where some blocks read it."""
-    return Layout(tuple({s.name: s for b in blocks for s in b.inputs.signals if s.name == SETTINGS}.values()))
+    return tuple({s.name: s for b in blocks for s in b.inputs.signals if s.name == SETTINGS}.values())
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:

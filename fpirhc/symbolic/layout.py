@@ -128,10 +128,11 @@ class Layout:
     names: tuple[str, ...] = field(init=False, repr=False)
     size: int = field(init=False, repr=False)
     _slices: dict[str, slice] = field(init=False, repr=False)
+    _ends: list[int] = field(init=False, repr=False)  # of the signals, behind a zero
     sizes: ClassVar[dict[str, int]]  # of the signals, by name; every layout has its own, which is no field to be shown
 
     def __post_init__(self) -> None:
-        slices, sizes, at = dict[str, slice](), dict[str, int](), 0
+        slices, sizes, at, ends = dict[str, slice](), dict[str, int](), 0, [0]
         for s in self.signals:
             if s.name in slices:
                 raise InvalidName(f"signal '{s.name}' appears twice in one layout")
@@ -142,8 +143,9 @@ class Layout:
                 raise InvalidValue(f"start value of '{s.name}' is not finite: {s.start}")
             slices[s.name], sizes[s.name] = slice(at, at + size), size
             at += size
+            ends.append(at)
         # They are asked many times while a loop is composed, so they are plain attributes.
-        vars(self).update(names=tuple(slices), size=at, sizes=sizes, _slices=slices)
+        vars(self).update(names=tuple(slices), size=at, sizes=sizes, _slices=slices, _ends=ends)
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
@@ -208,8 +210,7 @@ class Layout:
         """CasADi column -> expressions by name."""
         if not self.signals:
             return {}
-        ends = [0, *[place.stop for place in self._slices.values()]]
-        return dict(zip(self.names, ca.vertsplit(flat, ends), strict=True))
+        return dict(zip(self.names, ca.vertsplit(flat, self._ends), strict=True))
 
     def join(self, expressions: Mapping[str, Matrix]) -> Matrix:
         """CasADi expressions by name -> column, in the layout's order."""

@@ -21,7 +21,7 @@ from fpirhc.horizon.cost import Cost, Horizon, view_of_symbols
 from fpirhc.horizon.transcription import check_names
 from fpirhc.plant.chain import differentiated_signals
 from fpirhc.plant.maps import check_maps, over
-from fpirhc.plant.motion import followed_units, words
+from fpirhc.plant.motion import words
 from fpirhc.plant.plant import Plant
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.symbolic.evaluate import Latest
@@ -59,7 +59,7 @@ def check_problem(problem: Problem) -> None:
     plant, mistakes = problem.plant, Mistakes("problem")
     _check_times(problem, mistakes)
     _check_start(problem, mistakes)
-    mistakes.unknown("judged: quantity", problem.judged or (), followed_units(plant))
+    mistakes.unknown("judged: quantity", problem.judged or (), plant.followed)
     times = np.linspace(0.0, problem.duration, _INSTANTS)
     check_signals(dict.fromkeys((plant, problem.real_plant)), problem.signals, times, mistakes)
     set_points = {n: one for n, one in problem.reference.set_points.items() if n in plant.chains}
@@ -233,7 +233,7 @@ def needed_names(
     states = [element for signal in beside for element in signal.elements]
     measured = tuple(dict.fromkeys((*states, *sensing.measures(plant))))
     if sensing.observer is None:
-        return frozenset((*plant.coordinates, *followed_units(plant))), measured
+        return frozenset((*plant.coordinates, *plant.followed)), measured
     outputs = (element for signal in plant.beside for element in signal.elements)
     shown = (name.rstrip("'") for name in (*measured, *outputs))
     return frozenset((*shown, *(judged or ()), *plant.controlled_names)), measured

@@ -16,7 +16,6 @@ import numpy as np
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
 from fpirhc.fields.user_code import called, scalar_expression
-from fpirhc.plant.motion import outside_names
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import expression, graph, kind
@@ -62,7 +61,7 @@ def model_values(plant: Plant, signals: Mapping[str, Exogenous]) -> ca.Function 
 
 def signals_of(plant: Plant, signals: Mapping[str, Exogenous]) -> dict[str, Exogenous]:
     """Return the signals that a plant has."""
-    return {name: signals[name] for name in outside_names(plant) if name in signals}
+    return {name: signals[name] for name in plant.outside if name in signals}
 
 
 def really_known(signals: Mapping[str, Exogenous]) -> Mapping[str, Exogenous]:
@@ -84,7 +83,7 @@ def check_signals(
     """Add every mistake of the signals to `mistakes`. `plants`: the model, and the plant of a reality where there is one."""
     units: dict[str, str] = {}
     for plant in plants:
-        for name in outside_names(plant):
+        for name in plant.outside:
             unit = plant.parameters[name].unit
             if units.setdefault(name, unit) != unit:
                 mistakes.add(

@@ -15,7 +15,7 @@ from fpirhc.horizon.cost import Cost, Horizon
 from fpirhc.horizon.nominal import nominal_run
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.integrators import USUAL, Integrator, own_steps
-from fpirhc.plant.motion import followed_units, with_exact_parameters
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
@@ -111,7 +111,7 @@ class Problem(Checked):
             return tuple(self.judged)
         weighed = (self.cost.tracked if self.cost is not None else None) or {}
         controlled = self.plant.controlled_names
-        return tuple(n for n in followed_units(self.plant) if n in controlled or (n in weighed and self.moves.shows(n)))
+        return tuple(n for n in self.plant.followed if n in controlled or (n in weighed and self.moves.shows(n)))
 
     @property
     def moves(self) -> Reality | ExternalPlant:
@@ -241,7 +241,7 @@ class Problem(Checked):
         """The reference's own signals, which its block writes."""
         return self.reference.own(self.plant)
 
-    @property
+    @cached_property
     def sample(self) -> tuple[Signal, ...]:
         """What a controller's step is given: the state, outputs and the response, or raw measurements, and beside them states."""
         plant, sensing, shown = self.plant, self.sensing, self.plant.motion

@@ -21,7 +21,7 @@ from fpirhc.fields.kinds import Finite
 from fpirhc.plant.chain import derivatives_function, output_order
 from fpirhc.plant.integrators import Integrator, spurious_growth
 from fpirhc.plant.maps import unlike
-from fpirhc.plant.motion import followed_units, with_exact_parameters
+from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.plant.parameter import Parameter
 from fpirhc.plant.plant import Plant
 
@@ -69,7 +69,7 @@ class Reality(Checked):
             mistakes.add(
                 f"its inputs are {own}, the model's are {expected}; both take the same commands, so name them alike, in order"
             )
-        quantities = {**model.coordinates, **followed_units(model)}
+        quantities = {**model.coordinates, **model.followed}
         mistakes.unknown("seen: coordinate of the model", self.seen, quantities)
         mistakes.unknown("seen: coordinate of the reality", self.seen.values(), plant.coordinates)
         mistakes.unknown("start: state", self.start, plant.state.elements)
@@ -140,7 +140,7 @@ class Reality(Checked):
     @cached_property
     def _units(self) -> dict[str, str]:
         """Of what it can show: its coordinates and its outputs."""
-        return {**self.plant.coordinates, **followed_units(self.plant)}
+        return {**self.plant.coordinates, **self.plant.followed}
 
     def check_motion(self, start: np.ndarray, command: np.ndarray, integrator: Integrator, period: float) -> None:
         """Raise if the reality cannot move from its start, or the integrator cannot follow it there."""

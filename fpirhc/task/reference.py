@@ -26,7 +26,7 @@ from fpirhc.fields.checked import Checked
 from fpirhc.fields.kinds import Count, Positive, described, real_number
 from fpirhc.fields.user_code import called, named_results, scalar_expression
 from fpirhc.plant.maps import time_derivatives
-from fpirhc.plant.motion import followed_units, sampling, unit_of
+from fpirhc.plant.motion import sampling, unit_of
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.evaluate import Latest
@@ -261,7 +261,7 @@ def _arranged(plant: Plant, chains: Mapping[str, Sequence[Expression]]) -> tuple
 def _check(plant: Plant, motion: Mapping[str, Expression], own: Iterable[str] = ()) -> None:
     mistakes = Mistakes("reference")
     mistakes.join(own)
-    known = followed_units(plant)
+    known = plant.followed
     slopes = [name for name in motion if name not in known and name.rstrip("'") in known]
     for name in slopes:
         mistakes.add(f"'{name}' is taken from '{name.rstrip(chr(39))}' by differentiation; leave it out")

@@ -12,7 +12,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.fields.checked import Checked
-from fpirhc.plant.motion import followed_units
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
@@ -74,7 +73,7 @@ def decay_gains(rate: float, order: int) -> tuple[float, ...]:
 def one_rate(gains: Sequence[float]) -> float | None:
     """Return Lambda where the law of these gains is (d/dt + Lambda)^m z = 0; None where its modes differ."""
     rate = gains[-1] / len(gains)
-    return rate if np.allclose(gains, decay_gains(rate, len(gains))) else None
+    return rate if np.allclose(gains, np.poly([-rate] * len(gains))[:0:-1]) else None
 
 
 ROOM = 10.0  # times the largest response that a law may ask for, because a model may be wrong by a factor
@@ -161,13 +160,13 @@ def integral_delay(plant: Plant) -> tuple[Delay, ...]:
 
 def error_signal(plant: Plant) -> Signal:
     """Error to the target of every controlled coordinate."""
-    units = followed_units(plant)
+    units = plant.followed
     return vector("_target_error", plant.controlled_names, [units[c] for c in plant.controlled_names])
 
 
 def integral_signal(plant: Plant, name: str) -> Signal:
     """Integral of the error of every controlled coordinate, under the given name."""
-    every = followed_units(plant)
+    every = plant.followed
     units = [f"{every[c]} {plant.time_unit}" for c in plant.controlled_names]
     return vector(name, plant.controlled_names, units)
 

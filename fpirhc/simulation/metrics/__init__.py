@@ -18,7 +18,6 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import ByName, Checked, FoundByName, checked_call
-from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.summary import line, written_out
@@ -144,7 +143,7 @@ def by_name(names: Sequence[str], values: np.ndarray) -> dict[str, float]:
 
 def coordinate_unit(problem: Problem, coordinate: str) -> str:
     """Return the unit of a judged coordinate or output."""
-    return followed_units(problem.plant)[coordinate]
+    return problem.plant.followed[coordinate]
 
 
 def input_unit(problem: Problem, name: str) -> str:

@@ -13,7 +13,6 @@ import numpy as np
 
 from fpirhc.errors import InvalidValue, without
 from fpirhc.fields.checked import checked_call
-from fpirhc.plant.motion import followed_units
 from fpirhc.simulation.metrics import Better, Metric, measured_cycles
 from fpirhc.simulation.pictures import Quantity, numbers
 from fpirhc.simulation.run import Run
@@ -84,7 +83,7 @@ def Overshoot(judged: str, *, name: str = "overshoot") -> Metric:
         beyond = -changes[latest] * error
         return float(max(beyond[measured_cycles(problem, run)].max(), 0.0))
 
-    unit = lambda problem, _: followed_units(problem.plant).get(judged, "")  # noqa: E731 -- one line says it
+    unit = lambda problem, _: problem.plant.followed.get(judged, "")  # noqa: E731 -- one line says it
     return Metric(name, partial(_of_whole_runs, beyond), unit=unit, main=True)
 
 
@@ -127,7 +126,7 @@ def _unit(problem: Problem, what: What) -> str:
     if isinstance(what, Quantity):
         return what.unit
     plant, (signal, _, element) = problem.plant, what.partition(".")
-    units = {**followed_units(plant), **dict(zip(plant.state.elements, plant.state.entry_units, strict=True))}
+    units = {**plant.followed, **dict(zip(plant.state.elements, plant.state.entry_units, strict=True))}
     commanded = signal in ("command", "command_unclipped", "command_shift", "planned")
     units = {**units, **plant.inputs} if commanded else {**plant.inputs, **units}  # both may have an entry of one name
     higher = signal in ("realised", "nominal", "desired", "deformed", "plant_realised")
