@@ -6,7 +6,6 @@ the motion of a recorded run: with another deformation, other exact parameters, 
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -91,7 +90,7 @@ class _Trial:
     @property
     def begun(self) -> int:
         """A cycle after the warm-up."""
-        return min(math.ceil(self.problem.warm_up_cycles) + 2, min(self.run.cycles, REPLAYED) - 1)
+        return min(self.problem.warm_up_cycles + 2, min(self.run.cycles, REPLAYED) - 1)
 
     def moved(self, problem: Problem) -> Run:
         """A run of the controller, in CasADi's virtual machine."""

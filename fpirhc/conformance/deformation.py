@@ -18,6 +18,7 @@ from fpirhc.contraction.delayed import delayed, radius
 from fpirhc.deformation.base import Deformation, RequestChange, automatic, scaled_for
 from fpirhc.describe import describe
 from fpirhc.symbolic.layout import Layout
+from fpirhc.task.dead_time import Queue
 
 _TRIALS = 5
 _SEEN = 1e-9  # a shorter step drowns in the rounding of the request
@@ -190,7 +191,7 @@ def compares_as_it_says(trial: _Map, draw: Draw) -> Broken:
             if missed > 1e-9:
                 yield f"given the model's response as the plant's, the request misses the desired one by {missed:.3g}"
     elif trial.map.adapts:
-        for _ in range(_WARM + 3 * math.ceil(form.late)):  # until every pair is one of this run
+        for _ in range(_WARM + 3 * Queue(form.late).length):  # until every pair is one of this run
             memory = trial.function(0.0, 0.0, 0.0, memory)[1]
         passes = form.compares == "increment"
         request = trial.function(0.0, 0.0 if passes else jump, jump, memory)[0].full()[:, 0]

@@ -17,6 +17,7 @@ from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, wit
 from fpirhc.deformation.delayed import Paired
 from fpirhc.errors import NotContractive
 from fpirhc.symbolic.evaluate import Latest
+from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 
 _SETTLED = 5000  # cycles in which a memory comes to rest at most
@@ -29,10 +30,8 @@ _JACOBIANS: Latest[Array] = Latest(8)  # a search checks many gains at the same 
 
 
 def delayed(weights: Array, cycles: float) -> Array:
-    """Return the weights of past requests after a dead time; a fraction of a cycle interpolates, as queues do."""
-    whole = math.floor(cycles + 1e-9)
-    share = max(cycles - whole, 0.0)
-    return np.convolve(weights, np.append(np.zeros(whole), [1 - share, share] if share else [1.0]))
+    """Return the weights of past requests after a dead time."""
+    return np.convolve(weights, Queue(cycles).weights)
 
 
 def radius(deformation: Deformation, jacobian: Array, weights: Sequence[Array]) -> float:

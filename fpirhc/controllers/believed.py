@@ -158,7 +158,7 @@ def believed_path(problem: Problem, deformation: Deformation) -> Path:
 def stated_path(problem: Problem) -> Path:
     """Return the way of the commands as the problem states it, in whole cycles."""
     inputs, late, period = problem.plant.input, problem.dead_time, problem.period
-    waits = Queue(tuple(whole(late.inputs.get(name, 0.0) / period) for name in inputs.elements))
+    waits = Queue(late.input_cycles(inputs.elements, period))
     last = Signal("_commanded", inputs.elements, inputs.units, tuple(map(float, problem.inputs_before)))
     return Path(problem, "observer", last, waits, whole(late.measurement / period))
 
@@ -370,8 +370,8 @@ class Pairs:
     @property
     def _commands(self) -> Queue:
         late, period = self.dead_time, self.problem.period
-        waits = (late.inputs.get(name, 0.0) + late.measurement for name in self.problem.plant.inputs)
-        return Queue(tuple(whole(wait / period + self._delay) for wait in waits))
+        delay = late.measurement / period + self._delay
+        return Queue(late.input_cycles(self.problem.plant.inputs, period, delay))
 
 
 def measured(signal: Signal) -> Signal:

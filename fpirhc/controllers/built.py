@@ -54,7 +54,7 @@ class Built:
     aim: Block | None  # that writes the reference's own signals
     error: Signal  # of the judged outputs
     judged: tuple[int, ...]  # their places among the outputs
-    warm_up: float  # number of the first cycle whose response may be used
+    warm_up: int  # number of the first cycle whose response may be used
     planned: Problem | None  # the problem as plans have it, with their cost and limits
     follows: bool = False  # whether what the model has learned corrects the inputs of a plan in every cycle
 

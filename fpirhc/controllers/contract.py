@@ -24,7 +24,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
-from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous, really_known
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -236,14 +235,14 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
     left_open = [name for name in of_problem if getattr(deformation, name) is None]
     if not left_open:
         return deformation
-    lags, inputs, times = problem.moves.lag, tuple(problem.plant.inputs), problem.dead_time.inputs
+    lags, inputs = problem.moves.lag, tuple(problem.plant.inputs)
     known = {
-        "cycles": [whole(times.get(name, 0.0) / problem.period) for name in inputs],
-        "lag": [lags.get(name, 0.0) for name in inputs],
+        "cycles": problem.dead_time.input_cycles(inputs, problem.period),
+        "lag": tuple(lags.get(name, 0.0) for name in inputs),
     }
     square = len(inputs) == len(problem.plant.controlled_names)
     each = {n: square and len({*known[n]}) > 1 for n in left_open}
-    values: dict[str, object] = {n: tuple(known[n]) if each[n] else max(known[n]) for n in left_open}
+    values: dict[str, object] = {n: known[n] if each[n] else max(known[n]) for n in left_open}
     return replace(deformation, **values)
 
 

@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, cast, final
 import casadi as ca
 import numpy as np
 
-from fpirhc.errors import InvalidName, InvalidValue, NotSupported, require
+from fpirhc.errors import InvalidName, NotSupported, require
 from fpirhc.fields.checked import Checked, Inner, replaced
-from fpirhc.fields.kinds import finite_number
 from fpirhc.symbolic.dotted import copied
 from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
-from fpirhc.task.dead_time import MOST, WHOLE, Cycles, every
+from fpirhc.task.dead_time import Cycles, every
 
 Wrapping = TypeVar("Wrapping")
 
@@ -301,32 +300,6 @@ def default_pole(product: float, uncertainty: float) -> float:
     least = 2 * bound / (2 * bound + 1 + ca.sqrt(4 * bound + 1))
     factor, amount = _BEYOND
     return ca.fmin(factor * least + amount, 0.5 * (1 + least)) if uncertainty > 0 else 0.0
-
-
-def check_cycles(owner: str, cycles: Cycles, name: str = "cycles", uncertainty: int | None = None) -> None:
-    """Raise for a dead time that is negative, not finite or beyond 1000 cycles, an empty tuple, one wrong by more than itself."""
-    values = every(cycles)
-    if not values or not all(finite_number(c) and 0 <= c <= MOST for c in values):
-        raise InvalidValue(
-            f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
-            "every controlled coordinate"
-        )
-    shortest = min(values)
-    if uncertainty is not None and not 0 <= uncertainty <= math.ceil(shortest):
-        raise InvalidValue(
-            f"{owner}(uncertainty={uncertainty!r}): expected whole cycles from 0 to {math.ceil(shortest)}, the dead time of "
-            f"{shortest:g} rounded up: a dead time cannot be too long by more than itself"
-        )
-
-
-def check_whole(owner: str, cycles: Cycles, name: str) -> None:
-    """Raise InvalidValue for parts of a cycle, which no model is late by."""
-    for value in every(cycles):
-        low = math.floor(value)
-        if abs(value - round(value)) > WHOLE:
-            raise InvalidValue(
-                f"{owner}({name}={cycles!r}): a model is late by whole control cycles; give {low} or {low + 1} for {value:g}"
-            )
 
 
 @dataclass(frozen=True)

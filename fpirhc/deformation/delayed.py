@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import Deformation, Form, Wrapper, check_cycles, chosen_pole, leaked, memory_of_map
+from fpirhc.deformation.base import Deformation, Form, Wrapper, chosen_pole, leaked, memory_of_map
 from fpirhc.fields.kinds import BelowOne
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
-from fpirhc.task.dead_time import Cycles, Queue
+from fpirhc.task.dead_time import Cycles, Queue, check_cycles
 
 
 @dataclass(frozen=True)

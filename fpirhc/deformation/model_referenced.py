@@ -10,21 +10,12 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 
-from fpirhc.deformation.base import (
-    Deformation,
-    Form,
-    Wrapper,
-    check_cycles,
-    check_whole,
-    chosen_pole,
-    leaked,
-    memory_of_map,
-)
+from fpirhc.deformation.base import Deformation, Form, Wrapper, chosen_pole, leaked, memory_of_map
 from fpirhc.errors import require
 from fpirhc.fields.kinds import BelowOne, NotNegative
 from fpirhc.symbolic.expression import is_finite
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.task.dead_time import Cycles, Queue
+from fpirhc.task.dead_time import Cycles, Queue, check_cycles
 
 
 @dataclass(frozen=True)
@@ -53,8 +44,7 @@ class ModelReferenced(Wrapper):
 
     def __post_init__(self) -> None:
         for name, value in (("cycles", self._cycles), ("measurement", self.measurement)):
-            check_cycles("ModelReferenced", value, name)
-            check_whole("ModelReferenced", value, name)
+            check_cycles("ModelReferenced", value, name, of_model=True)
         # without cycles it is checked with the problem's dead times
         check_cycles("ModelReferenced", self._delays, uncertainty=None if self.cycles is None else self.uncertainty)
 

@@ -171,7 +171,7 @@ class Sensing(Checked):
         weights = (self.estimator.weights(plant.chains[name], period) for name in plant.controlled_names)
         return max(round(float(one @ np.arange(one.size)), _DIGITS) for one in weights)
 
-    def warm_up_cycles(self, plant: Plant, late: float) -> float:
+    def warm_up_cycles(self, plant: Plant, late: float) -> int:
         """Number of the first cycle whose response may be used; samples arrive `late` cycles after they were taken."""
         if self.estimator.measures_all:
             return 1

@@ -11,7 +11,6 @@ was before the gap. A stepper, a simulated loop and `export/templates/controller
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Self
@@ -26,6 +25,7 @@ from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import FINITE, Signals, nan_where
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 
 # In the memory: the last time that was believed, or is expected; the last one that was given; and times in a row that are a period
@@ -111,11 +111,10 @@ def shares(first: int, missing: int, known: int) -> np.ndarray:
 def _forgets(problem: Problem) -> int:
     """Number of samples after which an estimate no longer shows what was before them."""
     plant, estimator, period = problem.plant, problem.sensing.estimator, problem.period
-    late = problem.dead_time
-    queued = max(late.inputs.values(), default=0.0) / period
+    queued = Queue(max(problem.dead_time.inputs.values(), default=0.0) / period).length - 1
     weights = [np.cumsum(estimator.weights(plant.chains[name], period)) for name in plant.controlled_names]
     longest = max(int(np.argmax(w >= w[-1] - _FORGOTTEN)) + 1 for w in weights)
-    return math.ceil(problem.warm_up_cycles + queued) + longest
+    return problem.warm_up_cycles + queued + longest
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,14 +6,15 @@ A `Queue` of past values implements it. A computation that takes a full cycle is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import casadi as ca
+import numpy as np
 
-from fpirhc.errors import Mistakes
+from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import NotNegative
+from fpirhc.fields.kinds import NotNegative, finite_number
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, total
@@ -46,6 +47,10 @@ class DeadTime(Checked):
         measurement = 0.0 if self.measurement < WHOLE * period else self.measurement
         same = (len(inputs), measurement) == (len(self.inputs), self.measurement)
         return self if same else DeadTime(inputs, measurement)
+
+    def input_cycles(self, names: Iterable[str], period: float, later: float = 0.0) -> tuple[int, ...]:
+        """Return the dead times of some inputs, later by some cycles, to the nearest whole cycles."""
+        return tuple(whole(self.inputs.get(name, 0.0) / period + later) for name in names)
 
     def measurement_wait(self, period: float) -> Queue | None:
         """Return how long measurements wait; None where they do not."""
@@ -98,6 +103,12 @@ class Queue:
     def length(self) -> int:
         """Number of cycles that are remembered, the newest included."""
         return max(max(self._shares(c)) for c in every(self.cycles)) + 1
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights of the values of this cycle, the last one, ... in an entry, where all have the same delay."""
+        shares = self._shares(max(every(self.cycles)))
+        return np.array([shares.get(k, 0.0) for k in range(self.length)])
 
     def later(self, cycles: int) -> Queue:
         """Return the queue with every delay longer by whole cycles."""
@@ -154,3 +165,30 @@ def whole(cycles: float) -> int:
 def every(cycles: Cycles) -> tuple[float, ...]:
     """The dead times as a tuple, one entry where all channels share one."""
     return cycles if isinstance(cycles, tuple) else (cycles,)
+
+
+def check_cycles(
+    owner: str, cycles: Cycles, name: str = "cycles", *, uncertainty: int | None = None, of_model: bool = False
+) -> None:
+    """Raise for a dead time that is negative, not finite or beyond 1000 cycles, an empty tuple, one wrong by more than itself.
+
+    `of_model`: whether a model is late by it, which parts of a cycle cannot be.
+    """
+    values = every(cycles)
+    if not values or not all(finite_number(c) and 0 <= c <= MOST for c in values):
+        raise InvalidValue(
+            f"{owner}({name}={cycles!r}): expected a dead time between 0 and {MOST} control cycles, or a tuple with one for "
+            "every controlled coordinate"
+        )
+    shortest = min(values)
+    if uncertainty is not None and not 0 <= uncertainty <= math.ceil(shortest):
+        raise InvalidValue(
+            f"{owner}(uncertainty={uncertainty!r}): expected whole cycles from 0 to {math.ceil(shortest)}, the dead time of "
+            f"{shortest:g} rounded up: a dead time cannot be too long by more than itself"
+        )
+    for value in values if of_model else ():
+        low = math.floor(value)
+        if abs(value - round(value)) > WHOLE:
+            raise InvalidValue(
+                f"{owner}({name}={cycles!r}): a model is late by whole control cycles; give {low} or {low + 1} for {value:g}"
+            )

@@ -273,6 +273,6 @@ class Problem(Checked):
         return self.dead_time.longest / self.period + self.sensing.delay(self.plant, self.period)
 
     @property
-    def warm_up_cycles(self) -> float:
+    def warm_up_cycles(self) -> int:
         """Number of the first cycle whose realised response may be used; no deformation acts before it."""
         return self.sensing.warm_up_cycles(self.plant, self.dead_time.measurement / self.period)
