@@ -26,8 +26,9 @@ from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
-from fpirhc.simulation.loop import cycles_per_call, start_memory
+from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.ranges import Ranges
+from fpirhc.simulation.replay import cycles_per_call
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables

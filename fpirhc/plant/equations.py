@@ -129,7 +129,7 @@ class Equations:
         x, u, p = self.plant.symbols()
         return bool(ca.is_linear(self.controlled_response(x, u, p), u))
 
-    @property
+    @cached_property
     def inverse_opaque(self) -> bool:
         """Whether the inverse response needs a root finder, for which scalar expressions do not suffice."""
         return self.plant.inverse is None and not self.affine

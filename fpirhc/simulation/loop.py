@@ -17,12 +17,12 @@ import numpy as np
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built, build
 from fpirhc.controllers.contract import Undeformed, plant_model
-from fpirhc.controllers.gate import INNER, LOST, Gate
-from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
+from fpirhc.controllers.gate import INNER
+from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.plant.chain import response_names
 from fpirhc.sensing.base import backward_difference, combine
-from fpirhc.simulation.moved import HELD, Mover, acting_blocks, moving, outside_blocks, real_signals
-from fpirhc.simulation.replay import known_samples
+from fpirhc.simulation.moved import Mover, acting_blocks, moving, outside_blocks, real_signals
+from fpirhc.simulation.replay import gated_blocks
 from fpirhc.simulation.tables import disturbance_signal
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -42,15 +42,12 @@ def closed_loop(built: Built) -> Composite:
     """
     problem = built.problem
     mover, inner = moving(problem), built.step
-    lost, ranges = lost_blocks(mover), sensor_ranges(problem)
-    samples = known_samples(problem) if lost or ranges else 0
-    acting = Gate(problem, inner, simulated=True, ranges=ranges, loses=bool(lost), samples=samples)
     disturbed = (disturbance_signal(problem),) if problem.disturbances else ()
-    seeing = sensing_blocks(mover, predicts="state_ahead" in acting.inner.trace)
+    seeing = sensing_blocks(mover, predicts="state_ahead" in inner.trace)
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(mover, disturbed)
-    around = [clock, *outside_blocks(mover, built.model), *seeing, *lost, acting.block(), *judging, *actuating]
+    around = [clock, *outside_blocks(mover, built.model), *seeing, *gated_blocks(mover, inner), *judging, *actuating]
     constants = [Delay(signal, signal.name) for signal in open_settings(around)]
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
     delays = [*mover.delays, Delay(built.model.parameter, "parameters"), *constants]
@@ -113,9 +110,6 @@ class HeldInput(Undeformed):
 
 
 Shown: TypeAlias = tuple[tuple[Signal, ...], Signal]  # signals of the motion, and of the response
-_LOST_QUEUE = "lost_samples_queue"
-_CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
-_SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _PAST, _FULL = "_outputs_past", "_outputs_known"
 
 
@@ -177,30 +171,6 @@ def _late_blocks(problem: Problem, shown: Shown) -> list[Block]:
     resting = tuple(problem.first_shown[name] for name in response_names(plant))
     realised = replace(shown[1], name="realised", start=resting)
     return [*_late_states(states, late), delay_block("see_response", shown[1], realised, [late] * realised.size)]
-
-
-def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
-    """Return how many cycles one call of the loop runs: one where samples may be lost, as those of a body outside, and replayed."""
-    loses = bool(lost_blocks(moving(problem)) or sensor_ranges(problem))
-    return 1 if loses else _CHUNK if compiled else _SHORT
-
-
-def lost_blocks(mover: Mover) -> list[Block]:
-    """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
-    problem = mover.problem
-    drawn, held = problem.sensing.drawn, [one for one in mover.reads if one.name == HELD]
-    if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
-        return []
-    late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
-
-    def step(s: Signals) -> dict[str, Expression]:
-        lost = problem.sensing.lost(ca.vertcat(*(getattr(s, one.name) for one in drawn)))
-        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) for one in held)))
-        arrived, remembered = late.arrived(s, _LOST_QUEUE, now)
-        return {LOST.name: arrived, **remembered}
-
-    memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
-    return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
 
 
 def _late_states(states: Sequence[tuple[Signal, Signal, np.ndarray]], late: Queue | None) -> list[Block]:

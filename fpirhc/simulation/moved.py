@@ -30,7 +30,7 @@ from fpirhc.task.problem import Problem
 
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
 SENT = "_acting"  # signal of the inputs that a foreign reality is sent
-_RAW, HELD = "_foreign", "_foreign_held"
+_RAW, NO_ANSWER = "_foreign", "_foreign_held"  # what it answers, and whether it does not
 
 
 def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
@@ -235,7 +235,7 @@ class Body(Mover):
 
     @property
     def reads(self) -> tuple[Signal, ...]:
-        return vector(_RAW, tuple(self.measures), tuple(self.measures.values())), scalar(HELD)
+        return vector(_RAW, tuple(self.measures), tuple(self.measures.values())), scalar(NO_ANSWER)
 
     @property
     def delays(self) -> list[Delay]:

@@ -18,8 +18,9 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gate import AGAIN, FAILED, HELD, INNER, MISSING, MOST_MISSING, REPLAYS
-from fpirhc.controllers.seeing import seeing_blocks
+from fpirhc.controllers.gate import AGAIN, FAILED, HELD, INNER, LOST, MISSING, MOST_MISSING, REPLAYS, Gate
+from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
+from fpirhc.simulation.moved import NO_ANSWER, Mover, moving
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.evaluate import Evaluator
@@ -37,6 +38,9 @@ _RESOLVED = 2.0**42  # periods from zero within which a period is resolved to a 
 _PATIENCE = 20
 BRIDGED, BY_DIFFERENCES = 5, 20  # cycles: the longest gap that is replayed as it was; behind differences of positions
 _OBSERVED, _SETTLES = "observed_state", 30  # state of a learner, and the steps in which it follows the samples
+_LOST_QUEUE = "lost_samples_queue"
+_CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
+_SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _FORGOTTEN = 1e-7  # of a sample from before a long gap
 
 
@@ -94,6 +98,38 @@ def missed_cycles(time: float, before: float, period: float) -> int:
 def known_samples(problem: Problem) -> int:
     """Return how many good samples are kept: as many as the plant's order."""
     return max(1, *problem.plant.chains.values())
+
+
+def gated_blocks(mover: Mover, inner: Composite) -> list[Block]:
+    """Return the block of a controller behind the gate of a simulated loop, after that of lost samples where any can be lost."""
+    problem, lost, ranges = mover.problem, _lost_blocks(mover), sensor_ranges(mover.problem)
+    samples = known_samples(problem) if lost or ranges else 0
+    gate = Gate(problem, inner, simulated=True, ranges=ranges, loses=bool(lost), samples=samples)
+    return [*lost, gate.block()]
+
+
+def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
+    """Return how many cycles one call of the loop runs: one where samples may be lost, as those of a body outside, and replayed."""
+    loses = bool(_lost_blocks(moving(problem)) or sensor_ranges(problem))
+    return 1 if loses else _CHUNK if compiled else _SHORT
+
+
+def _lost_blocks(mover: Mover) -> list[Block]:
+    """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
+    problem = mover.problem
+    drawn, held = problem.sensing.drawn, [one for one in mover.reads if one.name == NO_ANSWER]
+    if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
+        return []
+    late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
+
+    def step(s: Signals) -> dict[str, Expression]:
+        lost = problem.sensing.lost(ca.vertcat(*(getattr(s, one.name) for one in drawn)))
+        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) for one in held)))
+        arrived, remembered = late.arrived(s, _LOST_QUEUE, now)
+        return {LOST.name: arrived, **remembered}
+
+    memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
+    return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
 
 
 def shares(first: int, missing: int, known: int) -> np.ndarray:

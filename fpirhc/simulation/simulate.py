@@ -19,10 +19,10 @@ from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_setting
 from fpirhc.describe import describe
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
-from fpirhc.simulation.loop import closed_loop, cycles_per_call, plans_exactly, start_memory
+from fpirhc.simulation.loop import closed_loop, plans_exactly, start_memory
 from fpirhc.simulation.moved import moving
 from fpirhc.simulation.ranges import Dropped, Ranges
-from fpirhc.simulation.replay import replaying
+from fpirhc.simulation.replay import cycles_per_call, replaying
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
 from fpirhc.simulation.tables import run_tables

@@ -12,15 +12,11 @@ from typing import Protocol, cast
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gate import HELD
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.kinds import described, named_entries, real_number
-from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.run import Run
-from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
-from fpirhc.symbolic.layout import Layout
 from fpirhc.task.checks import check_values
 from fpirhc.task.problem import Problem
 from fpirhc.task.reference import Steps, in_force, pairs
@@ -137,18 +133,6 @@ class StepArguments:
         self.time[0] = one_number("time", time)
         for name, (view, _) in values.items():
             view[:] = checked_values[name]
-
-    def hold(self, layout: Layout, signals: Layout, missing: int) -> np.ndarray:
-        """Return the memory of a skipped cycle, and write status, command and count of it into the trace.
-
-        `missing`: number of cycles that the next step will count as skipped; 0: this cycle is counted now.
-        """
-        memory = np.where(np.isfinite(self.memory_before), self.memory_before, layout.start())
-        self.trace[signals.slice("status")] = int(Status.SOLVER_FAILED)
-        self.trace[signals.slice("command")] = memory[layout.slice(HELD)]
-        memory[layout.slice(f"{SKIPPED}_before")] += not missing
-        self.trace[signals.slice(SKIPPED)] = memory[layout.slice(f"{SKIPPED}_before")] + missing
-        return memory
 
     def refuse_foreign_memory(self) -> None:
         """Raise for a memory with another fingerprint; a memory of NaN is a restart."""

@@ -29,6 +29,7 @@ from fpirhc.simulation.step_arguments import (
     set_points_now,
 )
 from fpirhc.simulation.trials import warn_of_harm
+from fpirhc.status import Status
 from fpirhc.symbolic.block import Composite, open_settings
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
@@ -418,12 +419,18 @@ class Stepper(Checked):
     def _failed(self, why: str) -> tuple[np.ndarray, np.ndarray]:
         """The last command and the memory as it was, after a solver that raised or failed.
 
-        The next step finds the times of this cycle and of those before it that failed missing, steps over them, and counts them.
+        The next step finds the times of this cycle and of those before it that failed missing, steps over them, and counts them;
+        without any this cycle is counted now.
         """
-        self.why_failed = why
+        self.why_failed, a = why, self._arguments
         missing = missed_cycles(self._time[0] + self._period, self._memory[self._before], self._period)
-        memory = self._arguments.hold(self.memory, self.signals, missing)
-        return memory[self.memory.slice(HELD)].copy(), memory
+        memory = np.where(np.isfinite(a.memory_before), a.memory_before, self.memory.start())
+        command = memory[self.memory.slice(HELD)].copy()
+        memory[self._skipped] += not missing
+        a.trace[self.signals.slice("status")] = int(Status.SOLVER_FAILED)
+        a.trace[self.signals.slice("command")] = command
+        a.trace[self._counted] = memory[self._skipped] + missing
+        return command, memory
 
 
 def _refuse_thread() -> NoReturn:
