@@ -20,8 +20,8 @@ import numpy as np
 from fpirhc.errors import InvalidName, NotSupported, require
 from fpirhc.fields.checked import Checked, Inner, replaced
 from fpirhc.symbolic.dotted import copied
-from fpirhc.symbolic.expression import stays
 from fpirhc.symbolic.layout import Expression, Layout
+from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import Cycles, every
 
 Wrapping = TypeVar("Wrapping")

@@ -21,8 +21,9 @@ from fpirhc.fields.user_code import called
 from fpirhc.plant.integrators import USUAL, Integrator
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.expression import stays, total
+from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named, Signal
+from fpirhc.symbolic.open import stays
 
 
 @dataclass(frozen=True)

@@ -293,10 +293,3 @@ def offset_limits(plant: Plant, horizon: Horizon, layout: Layout) -> ca.Function
     offset = ca.repmat(state[places] - start[places], 1, nodes)
     table = ca.vertcat(data[: rows.start, :], offset, data[rows.stop :, :])
     return ca.Function("fpirhc_offset_limits", [data, start, state], [table])
-
-
-def setting_rows(paths: tuple[str, ...]) -> Layout:
-    """Return the signals at the end of a stage's data; none without settings."""
-    if not paths:
-        return Layout()
-    return Layout((Signal("settings", paths),))

@@ -18,7 +18,7 @@ import numpy as np
 from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
 from fpirhc.fields.user_code import scalar_expression
 from fpirhc.horizon.cost import Cost, Horizon, Linearisation, View, outputs_of, reads_feedforward, view_of
-from fpirhc.horizon.nominal import data_layout, hastened, nominal_motion, reference_state, setting_rows, stage_data
+from fpirhc.horizon.nominal import data_layout, hastened, nominal_motion, reference_state, stage_data
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
 from fpirhc.plant.chain import nominal_responses
 from fpirhc.plant.integrators import spurious_growth
@@ -26,7 +26,7 @@ from fpirhc.plant.maps import by_single_steps, steps_in
 from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 from fpirhc.symbolic.open import number_of, open_in
 from fpirhc.task.limits import Limits, PathConstraint
 from fpirhc.task.reference import Reference
@@ -72,6 +72,7 @@ def _transcribed(
     binding, free = stage.binding, stage.before
     data_of = partial(stage_data, plant, reference, horizon, cost, len(stage.settings), signals)
     settings = [list(map(number_of, stage.settings))] if stage.settings else []
+    rows = (Signal("settings", tuple(one.name() for one in stage.settings)),) if stage.settings else ()
     table = np.asarray(data_of()(0.0, plant.approximate, *settings).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     bounds = limits.input_bounds(plant)
@@ -88,7 +89,7 @@ def _transcribed(
         step=horizon.step,
         state=state,
         input=plant.input,
-        data=data_layout(plant, horizon) + setting_rows(tuple(one.name() for one in stage.settings)),
+        data=data_layout(plant, horizon) + Layout(rows),
         data_of=data_of,
         dynamics=stage.dynamics,
         stage_cost=stage.cost,

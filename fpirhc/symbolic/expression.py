@@ -108,11 +108,6 @@ def power(base: T, exponent: int) -> T | float:
     return math.prod([base] * (exponent - 1), start=base) if exponent else 1.0  # type: ignore[call-overload]
 
 
-def stays(x: float, value: float) -> bool:
-    """Return whether a number is a certain one in every run of the loop; an open one may become another."""
-    return not isinstance(x, ca.SX) and x == value
-
-
 def left_after(period: float, time: float) -> float:
     """Return e^(-T / tau), the share of a distance that is left after a period; 0 for the time constant 0."""
     return ca.exp(-period / ca.fmax(time, TINY))

@@ -72,6 +72,11 @@ def is_open(value: object) -> bool:
     return bool(symbols) and len(open_in(value)) == len(symbols)
 
 
+def stays(x: float, value: float) -> bool:
+    """Return whether a number is a certain one in every run of the loop; an open one may become another."""
+    return not isinstance(x, ca.SX) and x == value
+
+
 def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
     """Return the error of settings that cannot be open, with the reason; `where` says in which case they cannot, after a space."""
     names = [f"'{path}'" for path in paths]
