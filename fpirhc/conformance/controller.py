@@ -33,9 +33,9 @@ from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError
 from fpirhc.plant.motion import with_exact_parameters
 from fpirhc.sensing.sensing import Sensing
+from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
-from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.simulation.trials import without_warning
 from fpirhc.status import Status

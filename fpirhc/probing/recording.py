@@ -18,9 +18,9 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.chain import response_names
 from fpirhc.probing.identification import require_cycles
+from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
-from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.symbolic.layout import Expression, Layout, scalar
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem

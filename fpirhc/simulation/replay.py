@@ -21,6 +21,7 @@ import numpy as np
 from fpirhc.controllers.gate import AGAIN, FAILED, HELD, INNER, LOST, MISSING, MOST_MISSING, REPLAYS, Gate
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.simulation.moved import NO_ANSWER, Mover, moving
+from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.evaluate import Evaluator
@@ -130,6 +131,25 @@ def _lost_blocks(mover: Mover) -> list[Block]:
 
     memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
     return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
+
+
+def raw_measurements(run: Run) -> np.ndarray:
+    """Return what the controller of a run was given in every cycle, shape (cycles, number of measurements); NaN where it was lost.
+
+    It is what the sensors show, as it arrives; state and response where both are measured. `Stepper.step_measured` takes its rows.
+    Of a plant with outputs the state stands before raw measurements of these, unless it is believed.
+    """
+    shown = next((name for name in ("arrived", "measured") if name in run.layout), None)
+    if shown is None:
+        names = [name for name in ("state", "output", "realised") if name in run.layout]
+    else:
+        # A state that is logged before the measurements is not made from them.
+        state_measured = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(shown)
+        names = ["state", shown] if state_measured else [shown]
+    rows = np.hstack([run[name].reshape(run.cycles, -1) for name in names])
+    if LOST.name in run.layout:
+        rows[run[LOST.name].ravel() > 0] = np.nan
+    return rows
 
 
 def shares(first: int, missing: int, known: int) -> np.ndarray:

@@ -14,7 +14,6 @@ import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.fields.kinds import described, named_entries, real_number
-from fpirhc.simulation.run import Run
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.task.checks import check_values
@@ -146,25 +145,6 @@ class StepArguments:
 
 def _view(array: np.ndarray) -> View:
     return cast(View, memoryview(array.data))
-
-
-def raw_measurements(run: Run) -> np.ndarray:
-    """Return what the controller of a run was given in every cycle, shape (cycles, number of measurements); NaN where it was lost.
-
-    It is what the sensors show, as it arrives; state and response where both are measured. `Stepper.step_measured` takes its rows.
-    Of a plant with outputs the state stands before raw measurements of these, unless it is believed.
-    """
-    shown = next((name for name in ("arrived", "measured") if name in run.layout), None)
-    if shown is None:
-        names = [name for name in ("state", "output", "realised") if name in run.layout]
-    else:
-        # A state that is logged before the measurements is not made from them.
-        state_measured = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(shown)
-        names = ["state", shown] if state_measured else [shown]
-    rows = np.hstack([run[name].reshape(run.cycles, -1) for name in names])
-    if "lost_sample" in run.layout:
-        rows[run["lost_sample"].ravel() > 0] = np.nan
-    return rows
 
 
 def numbers_of(name: str, value: object, size: int) -> np.ndarray:

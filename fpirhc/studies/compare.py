@@ -27,9 +27,9 @@ from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
 from fpirhc.simulation.pictures import Picture
 from fpirhc.simulation.ranges import Followed, limits_left
+from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
-from fpirhc.simulation.step_arguments import raw_measurements
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
