@@ -19,8 +19,6 @@ from fpirhc.problem_files.problem_file import Task, with_numbers_of_all
 from fpirhc.problem_files.settings import number_of_case, of_problem, with_numbers
 from fpirhc.task.problem import Problem
 
-_WHOLE_CYCLE = 1e-9  # cycles by which a dead time of whole ones may be off
-
 
 @dataclass(frozen=True, eq=False)
 class Variant:
@@ -235,12 +233,5 @@ def _told_apart(variants: Sequence[Variant]) -> list[Variant]:
 
 
 def _with_dead_times(problem: Problem, percent: float) -> Problem:
-    """The problem with dead times that are longer by so many percent, in whole cycles, rounded away from the true one."""
-    times, whole = problem.dead_time, math.ceil if percent > 0 else math.floor
-    rounding = math.copysign(_WHOLE_CYCLE, percent)
-
-    def changed(time: float) -> float:
-        return max(whole(time / problem.period * (1 + percent / 100) - rounding), 0) * problem.period
-
-    inputs = {name: changed(time) for name, time in times.inputs.items()}
-    return replace(problem, dead_time=replace(times, inputs=inputs, measurement=changed(times.measurement)))
+    """The problem with dead times that are longer by so many percent."""
+    return replace(problem, dead_time=problem.dead_time.longer(percent, problem.period))

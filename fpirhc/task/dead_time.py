@@ -48,6 +48,15 @@ class DeadTime(Checked):
         same = (len(inputs), measurement) == (len(self.inputs), self.measurement)
         return self if same else DeadTime(inputs, measurement)
 
+    def longer(self, percent: float, period: float) -> DeadTime:
+        """Return it longer by so many percent, in whole cycles, rounded away from the true one."""
+
+        def changed(time: float) -> float:
+            cycles = time / period * (1 + percent / 100) - math.copysign(WHOLE, percent)
+            return max((math.ceil if percent > 0 else math.floor)(cycles), 0) * period
+
+        return DeadTime({name: changed(time) for name, time in self.inputs.items()}, changed(self.measurement))
+
     def input_cycles(self, names: Iterable[str], period: float, later: float = 0.0) -> tuple[int, ...]:
         """Return the dead times of some inputs, later by some cycles, to the nearest whole cycles."""
         return tuple(whole(self.inputs.get(name, 0.0) / period + later) for name in names)
