@@ -64,12 +64,14 @@ class Inner:
     """The first value of the same contract that a member holds in a field: what it is around; None for one that stands alone."""
 
     def __set_name__(self, contract: type, name: str) -> None:
-        self._contract = contract
+        self._contract, self._name = contract, name
 
     def __get__(self, value: object, owner: type) -> object:
         if value is None:  # so that a dataclass may have a field of this name, without a default
             raise AttributeError(f"{owner.__name__} is a class; its values have an `inner`")
-        return next((one for one in vars(value).values() if isinstance(one, self._contract)), None)
+        found = next((one for one in vars(value).values() if isinstance(one, self._contract)), None)
+        vars(value)[self._name] = found  # values are frozen, so it is looked for once
+        return found
 
 
 def _abstract(cls: type) -> tuple[str, ...]:
