@@ -9,6 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias, final
 
 import casadi as ca
@@ -52,7 +53,7 @@ class DerivativeEstimator(Checked, ABC):
         return 1
 
     @final
-    @property
+    @cached_property
     def measures_all(self) -> bool:
         """Whether state and response are both measured, so that nothing is estimated."""
         return self.fills(1) == 0
