@@ -24,6 +24,7 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
+from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous, really_known
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -231,18 +232,18 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
         deformation = deformation if inner is deformation.inner else with_inner(deformation, inner)
     if not is_dataclass(deformation):
         return deformation
-    of_problem = (f.name for f in fields(deformation) if f.metadata.get("of_problem"))
-    left_open = [name for name in of_problem if getattr(deformation, name) is None]
+    asked = ((f.name, also) for f in fields(deformation) if (also := f.metadata.get("of_problem")))
+    left_open = [name for name, also in asked if getattr(deformation, name) is getattr(deformation, also) is None]
     if not left_open:
         return deformation
-    lags, inputs = problem.moves.lag, tuple(problem.plant.inputs)
+    lags, inputs, late = problem.moves.lag, tuple(problem.plant.inputs), problem.dead_time
     known = {
-        "cycles": problem.dead_time.input_cycles(inputs, problem.period),
+        "cycles": late.input_cycles(inputs, problem.period),
+        "measurement": (whole(late.measurement / problem.period),),
         "lag": tuple(lags.get(name, 0.0) for name in inputs),
     }
     square = len(inputs) == len(problem.plant.controlled_names)
-    each = {n: square and len({*known[n]}) > 1 for n in left_open}
-    values: dict[str, object] = {n: known[n] if each[n] else max(known[n]) for n in left_open}
+    values = {n: known[n] if square and len({*known[n]}) > 1 else max(known[n]) for n in left_open}
     return replace(deformation, **values)
 
 

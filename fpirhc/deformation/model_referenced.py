@@ -26,7 +26,7 @@ class ModelReferenced(Wrapper):
         map: any deformation that iterates; wrappers that change the gain or the error go inside: ModelReferenced(Filtered(map)).
         cycles: believed dead time d of the inputs, in whole control cycles beyond the one that every loop has; a tuple gives every
             input its own, and then input k belongs to controlled coordinate k. None: that of the problem, to the nearest cycle.
-        measurement: believed dead time of the measurement, in whole cycles.
+        measurement: that of the measurement, in whole cycles. None: that of the problem, or 0 where `cycles` is given.
         lag: believed time constant of the actuators, tau u_act' = u - u_act, s; a tuple gives one per input. Too long a lag is
             nearly harmless, too short a lag is not, and no lag is worst. None: what an external plant states, else 0.
         uncertainty: by how many cycles the sum of the dead times may be wrong; None: the default of `Increment`.
@@ -36,22 +36,22 @@ class ModelReferenced(Wrapper):
         InvalidValue: a dead time, lag, uncertainty or pole out of range, or parts of a cycle.
     """
 
-    cycles: Cycles | None = field(default=None, metadata={"of_problem": True})
-    measurement: float = 0.0  # whether a twin runs, and in which cycle
-    lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"of_problem": True})
+    cycles: Cycles | None = field(default=None, metadata={"of_problem": "cycles"})  # if this field is open
+    measurement: float | None = field(default=None, metadata={"of_problem": "cycles"})
+    lag: NotNegative | tuple[NotNegative, ...] | None = field(default=None, metadata={"of_problem": "lag"})
     uncertainty: int | None = None
     pole: BelowOne | None = None
 
     def __post_init__(self) -> None:
-        for name, value in (("cycles", self._cycles), ("measurement", self.measurement)):
+        for name, value in zip(("cycles", "measurement"), self._late, strict=True):
             check_cycles("ModelReferenced", value, name, of_model=True)
         # without cycles it is checked with the problem's dead times
         check_cycles("ModelReferenced", self._delays, uncertainty=None if self.cycles is None else self.uncertainty)
 
     @property
     def form(self) -> Form:
-        inner, late = self.map.form, self.measurement
-        return replace(inner, compares="model", cycles=self._cycles, measurement=late, lag=self.lag or 0.0)
+        cycles, late = self._late
+        return replace(self.map.form, compares="model", cycles=cycles, measurement=late, lag=self.lag or 0.0)
 
     def memory(self, elements: tuple[str, ...]) -> Layout:
         past = tuple(f"{e}@{k}" for k in range(1, self._queue.length + 1) for e in elements)
@@ -66,18 +66,17 @@ class ModelReferenced(Wrapper):
         undeformed = request - queue.delayed(past, size)
         next_request, next_memory = self.map.step(request, response, undeformed, memory_of_map(self, memory, size))
         deformation = leaked(pole, before, next_request - undeformed)
-        # A deformation that is not a number must not be remembered.
-        remembered = ca.if_else(is_finite(deformation), deformation, before)
+        remembered = ca.if_else(is_finite(deformation), deformation, before)  # what is no number is not remembered
         return desired + deformation, {"own_deformation": queue.pushed(past, remembered), **next_memory}
 
     @property
     def _delays(self) -> Cycles:
-        cycles = self._cycles
-        return tuple(c + self.measurement for c in cycles) if isinstance(cycles, tuple) else cycles + self.measurement
+        cycles, late = self._late
+        return tuple(c + late for c in cycles) if isinstance(cycles, tuple) else cycles + late
 
     @property
-    def _cycles(self) -> Cycles:
-        return 0.0 if self.cycles is None else self.cycles
+    def _late(self) -> tuple[Cycles, float]:
+        return 0.0 if self.cycles is None else self.cycles, self.measurement or 0.0
 
     @property
     def _queue(self) -> Queue:

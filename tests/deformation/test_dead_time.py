@@ -57,6 +57,16 @@ def test_measurements_are_old():
     assert fp.measure(delayed, run).rms_error["q1"] == pytest.approx(np.sqrt(np.mean(run["true_error"][:, 0] ** 2)))
 
 
+def test_a_form_takes_all_dead_times_of_the_problem_or_none():
+    """Late by 5 cycles of the measurement: the form knows it, and one with cycles of its own adds nothing to them."""
+    delayed = replace(two_mass(), dead_time=fp.DeadTime(measurement=5e-3))
+    forms = (fp.ModelReferenced(SIGMOID), fp.ModelReferenced(SIGMOID, cycles=5), fp.ModelReferenced(SIGMOID, cycles=0))
+    runs = [fp.simulate(delayed, fp.ComputedTorque(LAW, form), seed=0, compiled=False) for form in forms]
+    known, own, none = (run["command"] for run in runs)
+    np.testing.assert_allclose(known, own, rtol=1e-9)
+    assert not np.allclose(known, none)
+
+
 def test_prediction_with_the_exact_model_undoes_the_dead_time():
     """The plant moves as without dead time, that much later, when it rests in between."""
     problem = fp.Problem(

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.exchange import told, with_exact_model
+from helpers.exchange import with_exact_model
 from helpers.plants import chain
 
 import fpirhc as fp
@@ -54,7 +54,7 @@ def test_null_behind_sensors_and_dead_time(estimator, wait):
     quanta = QUANTA if isinstance(estimator, fp.PositionDifference) else {}
     late = replace(tasks.two_mass.problem, **wait, sensing=fp.Sensing(quanta, estimator))
     problem = short(with_exact_model(late))
-    referenced = fp.ModelReferenced(SIGMOID, **told(problem))
+    referenced = fp.ModelReferenced(SIGMOID)
     assert change(problem, fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, referenced)) <= 1e-9
 
 
@@ -62,7 +62,7 @@ def test_null_behind_sensors_and_dead_time(estimator, wait):
 def test_null_with_a_measured_response_and_dead_time(wait):
     """The same with ideal sensors, and under a prediction: the mirror sees the measured state, not the predicted one."""
     problem = short(with_exact_model(replace(tasks.two_mass.problem, **wait)))
-    law, adaptive = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID, **told(problem)))
+    law, adaptive = fp.ComputedTorque(LAW), fp.ComputedTorque(LAW, fp.ModelReferenced(SIGMOID))
     assert change(problem, law, adaptive) <= 1e-9
     ahead: Any = {"inputs": 3e-3, "measurement": 1e-3}
     assert change(problem, fp.Predicted(law, **ahead), fp.Predicted(adaptive, **ahead)) <= 1e-9

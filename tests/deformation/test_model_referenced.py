@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.exchange import told, with_exact_model
+from helpers.exchange import with_exact_model
 from helpers.iteration import affine
 from helpers.kinds import shipped
 
@@ -91,7 +91,7 @@ def test_exact_model_is_left_alone(name):
     map = fp.Sigmoid(gain=-0.5 * sign, shift=0.3 * sign, scale=50.0)
     plain, run = (
         fp.simulate(problem, adaptive.with_deformation(d), seed=0, compiled=False)["plant_state"]
-        for d in (fp.Identity(), fp.ModelReferenced(map, **told(problem)))
+        for d in (fp.Identity(), fp.ModelReferenced(map))
     )
     assert np.abs(run - plain).max() <= AMPLIFIED.get(name, 1e-9) * np.abs(plain).max()
 

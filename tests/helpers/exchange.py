@@ -1,7 +1,6 @@
 """Shipped problems with another deformation or an exact model, for several tests."""
 
 from dataclasses import replace
-from typing import Any
 
 import fpirhc as fp
 
@@ -13,10 +12,3 @@ def with_exact_model(problem: fp.Problem) -> fp.Problem:
     plant, sensing = replace(problem.plant, parameters=known), replace(problem.sensing, sensors=sensors)
     signals = {name: fp.Known(one.values) for name, one in problem.signals.items()}
     return replace(problem.of_model, plant=plant, disturbances={}, sensing=sensing, signals=signals)
-
-
-def told(problem: fp.Problem) -> dict[str, Any]:
-    """Settings of `ModelReferenced` with which it knows the problem's dead times, one for every input where they differ."""
-    cycles = tuple(problem.dead_time.inputs.get(name, 0.0) / problem.period for name in problem.plant.inputs)
-    one = cycles[0] if len(set(cycles)) == 1 else cycles
-    return {"cycles": one, "measurement": problem.dead_time.measurement / problem.period}

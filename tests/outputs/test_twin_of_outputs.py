@@ -5,12 +5,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.exchange import told
 
 import fpirhc as fp
 
 LAW, MAP = fp.Exponential(rate=8.0), fp.Sigmoid(gain=-0.3, scale=60.0)
 PLAIN = fp.ComputedTorque(LAW)
+REFERENCED = fp.ComputedTorque(LAW, fp.ModelReferenced(MAP))
 QUANTUM = {"y": fp.Sensor(quantum=1e-5)}
 ESTIMATORS = (fp.VelocityDifference(), fp.PositionDifference(), fp.SavitzkyGolay(window=5, degree=3))
 WAITS = {
@@ -51,17 +51,13 @@ def run(problem: fp.Problem, controller: Any) -> fp.Run:
     return result
 
 
-def referenced(problem: fp.Problem) -> fp.ComputedTorque:
-    return fp.ComputedTorque(LAW, fp.ModelReferenced(MAP, **told(problem)))
-
-
 @pytest.mark.parametrize("wait", WAITS)
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=repr)
 def test_an_exact_model_is_left_alone(estimator, wait):
     """Late, rounded and smoothed alike, the two responses are the same number, to rounding."""
     quanta = QUANTUM if isinstance(estimator, fp.PositionDifference) else {}
     problem = task(estimator, exact=True, dead_time=WAITS[wait], sensing=fp.Sensing(quanta, estimator))
-    one, other = run(problem, PLAIN), run(problem, referenced(problem))
+    one, other = run(problem, PLAIN), run(problem, REFERENCED)
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
 
 
@@ -69,5 +65,5 @@ def test_under_a_prediction_the_twin_sees_what_is_measured():
     """The controller acts on outputs ahead, the twin compares those of the samples: an exact model is left alone."""
     late = WAITS["both"]
     problem = task(fp.PositionDifference(), exact=True, dead_time=late)
-    one, other = (run(problem, fp.Predicted(c, inputs=2e-3, measurement=2e-3)) for c in (PLAIN, referenced(problem)))
+    one, other = (run(problem, fp.Predicted(c, inputs=2e-3, measurement=2e-3)) for c in (PLAIN, REFERENCED))
     np.testing.assert_allclose(other["plant_output"], one["plant_output"], atol=1e-9)
