@@ -294,18 +294,16 @@ def with_field(controller: Controller, name: str, value: object) -> Controller:
 def _with_inside(
     controller: Controller, change: Callable[[Controller, str], Controller], needs: str = ""
 ) -> Controller:
-    """Return the controller around changed ones: its inner one, or those in a dictionary, by name.
-
-    `needs`: the field that is changed inside; NotSupported where there is nothing inside.
-    """
+    """Return the controller around changed ones, with their keys in a dictionary; NotSupported where a field `needs` one inside."""
     if controller.inner is not None:
         inner = change(controller.inner, "")
         return controller if inner is controller.inner else with_inner(controller, inner)
-    for field, held in vars(controller).items():
-        if isinstance(held, Mapping) and held and all(isinstance(one, Controller) for one in held.values()):
-            changed = {name: change(one, name) for name, one in held.items()}
-            same = all(one is held[name] for name, one in changed.items())
-            return controller if same else replace(cast("Any", controller), **{field: changed})
+    for name in getattr(controller, "__dataclass_fields__", ()):
+        held = getattr(controller, name)
+        if isinstance(held, Mapping) and isinstance(next(iter(held.values()), None), Controller):
+            changed = {key: change(one, key) for key, one in held.items()}
+            same = all(one is held[key] for key, one in changed.items())
+            return controller if same else replace(cast("Any", controller), **{name: changed})
     require(not needs, f"{type(controller).__name__} has no {needs} that can be replaced")
     return controller
 

@@ -69,7 +69,8 @@ class Inner:
     def __get__(self, value: object, owner: type) -> object:
         if value is None:  # so that a dataclass may have a field of this name, without a default
             raise AttributeError(f"{owner.__name__} is a class; its values have an `inner`")
-        found = next((one for one in vars(value).values() if isinstance(one, self._contract)), None)
+        held = (vars(value).get(name) for name in getattr(value, "__dataclass_fields__", ()))
+        found = next((one for one in held if isinstance(one, self._contract)), None)
         vars(value)[self._name] = found  # values are frozen, so it is looked for once
         return found
 

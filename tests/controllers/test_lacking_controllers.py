@@ -1,7 +1,7 @@
 """A controller or a map of a user's own that lacks what its contract asks for is told so by name, in the line that makes it."""
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, cast
 
 import pytest
@@ -83,8 +83,10 @@ def test_what_is_lacking_is_told_in_the_line_that_makes_it(make, words):
 def test_what_a_member_holds_is_what_it_is_around():
     """Whatever the name of the field; the facts that it does not tell are those of the inner one."""
     assert Whole(fp.ExactModel(LAW)).inner.inner is LAW
-    assert Whole(fp.ExactModel(LAW)).exact_model
     assert Halved(fp.Paired(fp.Affine(-0.5), cycles=3)).form.cycles == 3
+    computes: Any = type("Computes", (fp.ComputedTorque,), {"other": cached_property(lambda self: LAW)})
+    beside = computes(LAW.tracking)
+    assert (beside.other, beside.inner) == (LAW, None)
     assert Whole(LAW).with_deformation(fp.Affine(-0.5)).other.deformation.gain == -0.5
 
 
