@@ -1,7 +1,6 @@
 """The base of all values that a user makes: their arguments are checked when the value is made, and never again.
 
-A class that derives from `Checked`, or from a contract that does, gets the checks by the annotations of its fields.
-A dataclass needs no line of its own, and a class of another distribution is checked as ours are.
+A class that derives from `Checked`, or from a contract that does, gets the checks by the annotations of its fields, wherever it is.
 """
 
 from __future__ import annotations
@@ -153,7 +152,7 @@ def _arguments_of(owner: type | Callable[..., object]) -> _Arguments:
         owner,
         tuple(p.name for p in ours if p.kind is not p.KEYWORD_ONLY),
         tuple(p.name for p in ours if p.default is p.empty),
-        {p.name: _expected(owner, p) for p in ours},
+        {p.name: _expected(owner, p) for p in ours if p.name != "self"},
         open=len(ours) < len(parameters),
     )
 
@@ -190,6 +189,8 @@ def _mended(expected: Expected, value: object) -> str:
         return f"write '{near[0]}'"
     one = SHORT.repr(value) if isinstance(value, int | float | tuple | str) else f"{type(value).__name__}(...)"
     inside = [f"write {{'NAME': {one}}} with the name of what it belongs to"] * accepts(expected, {"NAME": value})
+    entries = list(value.values()) if isinstance(value, Mapping) else []
+    inside += [f"write one value for all, {SHORT.repr(entry)}" for entry in entries[:1] if accepts(expected, entry)]
     if inside := [*inside, *[f"write {SHORT.repr((value,))}"] * accepts(expected, (value,))]:
         return ", or ".join(inside)
     if isinstance(value, type):
@@ -199,10 +200,10 @@ def _mended(expected: Expected, value: object) -> str:
     parts = {f.name: getattr(value, f.name) for f in fields(value)} if is_dataclass(value) else {}
     if near := [name for name, part in parts.items() if part is not None and expected.fits(part)]:
         return f"give its .{near[0]}"
-    return " or ".join(text for one in expected.classes if (text := _member(one, value)))
+    return " or ".join(filter(None, (_member(own, value, one) for own in expected.classes)))
 
 
-def _member(one: type, value: object) -> str:
+def _member(one: type, value: object, text: str) -> str:
     """How a value of a public class is written, or which members a contract has; empty for classes of others."""
     package = import_module(__name__.partition(".")[0])
     if one.__module__.partition(".")[0] != package.__name__:
@@ -215,7 +216,9 @@ def _member(one: type, value: object) -> str:
         return f"write fp.{written}" if one.__name__ in package.__all__ else ""
     public = {name: getattr(package, name, None) for name in package.__all__}  # only a mistake pays for importing them
     members = [n for n, m in public.items() if isinstance(m, type) and issubclass(m, one) and not inspect.isabstract(m)]
-    return f"one of {', '.join(sorted(members))}"
+    ours = {n: _arguments_of(public[n]) for n in sorted(members)}
+    alone = [n for n, own in ours.items() if len(own.required) == 1 and accepts(own.expected[own.required[0]], value)]
+    return f"write {' or '.join(f'fp.{n}({text})' for n in alone)}" if alone else f"one of {', '.join(ours)}"
 
 
 def replaced(value: Value, field: str, content: object) -> Value | None:
@@ -266,7 +269,6 @@ class FoundByName:
     """Base of dataclasses whose dictionaries are found by name."""
 
     def __post_init__(self) -> None:
-        """Let every dictionary in a public field be found by name."""
         find_by_name(self)
 
 

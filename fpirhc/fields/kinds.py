@@ -23,8 +23,7 @@ from fpirhc.errors import InvalidField
 from fpirhc.symbolic.open import is_open
 
 SHORT = reprlib.Repr()
-SHORT.maxstring = SHORT.maxother = 60
-SHORT.maxdict = 2
+SHORT.maxstring, SHORT.maxother, SHORT.maxdict = 60, 60, 2
 
 
 def described(value: object) -> str:
@@ -46,7 +45,8 @@ def described(value: object) -> str:
 def call_of(one: type | Callable[..., object]) -> str:
     """Return how a value of the class, or a call of the function, is written: "Sigmoid(gain=...)"."""
     signature = _signature(one)
-    needed = [p for p in (signature.parameters.values() if signature else ()) if p.default is p.empty]
+    given = signature.parameters.values() if signature else ()
+    needed = [p for p in given if p.default is p.empty and p.name != "self"]
     named = [f"{p.name}=..." for p in needed if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     return f"{one.__name__}({', '.join(named)})"
 

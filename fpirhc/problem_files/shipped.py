@@ -51,6 +51,12 @@ def stated(path: Path, name: str, without: Any) -> Any:
         return without
 
 
+def problem_files(folder: Path) -> list[Path]:
+    """Return the files of a folder that define `controllers` outside every function, without running them."""
+    every = (one for one in sorted(folder.glob("*.py")) if isfile(one))
+    return [one for one in every if "\ncontrollers" in one.read_text(encoding="utf-8", errors="replace")]
+
+
 def missing(path: Path) -> str:
     """Say which packages of a problem file are not installed, and how they are; empty where none is missing."""
     names = [name for name in needed(path) if find_spec(name) is None]
@@ -72,19 +78,15 @@ def find_problem(name_or_path: str) -> Path:
         return path
     if name_or_path in shipped:
         return shipped[name_or_path]
-    beside = [str(one) for one in sorted((path if isdir(path) else path.parent).glob("*.py")) if isfile(one)]
+    beside = [str(one) for one in sorted(path.parent.glob("*.py")) if isfile(one)]
     if exists(path):
+        such = [*map(str, problem_files(path))] if isdir(path) else []
         what = "a folder" if isdir(path) else "not a Python file"
-        such = f", such as {', '.join(beside[:_OFFERED])}" if isdir(path) and beside else ""
-        raise ProblemFileError(f"'{name_or_path}' is {what}; a problem file ends in .py{such}")
-    named = (
-        f"no file at '{name_or_path}'"
-        if path.suffix or path.parent != Path()
-        else f"problem '{name_or_path}' is unknown"
-    )
-    near = (
-        get_close_matches(name_or_path, beside, n=1) if path.suffix else [one for one in beside if one == f"{path}.py"]
-    )
+        first = f"; it has {len(such)}, such as {', '.join(such[:_OFFERED])}" if such else ""
+        raise ProblemFileError(f"'{name_or_path}' is {what}; a problem file ends in .py{first}")
+    is_path = path.suffix or path.parent != Path()
+    named = f"no file at '{name_or_path}'" if is_path else f"problem '{name_or_path}' is unknown"
+    near = get_close_matches(name_or_path, beside, n=1) if path.suffix else [n for n in beside if n == f"{path}.py"]
     near = near or get_close_matches(path.stem, shipped, n=1, cutoff=0.5)
     hint = f" Did you mean '{near[0]}'?" if near else ""
     raise ProblemFileError(f"{named}.{hint} Give the path of a problem file, or a name from 'fpirhc list'")

@@ -11,19 +11,17 @@ import numpy as np
 import pandas as pd
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import resolved
 from fpirhc.describe import digest
-from fpirhc.errors import FpirhcError, InvalidProblem, InvalidValue, package
+from fpirhc.errors import InvalidProblem, InvalidValue, package
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import LogSpan, TuningSpans, current_setting
+from fpirhc.problem_files.settings import TuningSpans, current_setting
 from fpirhc.studies import Progress
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import Runner
 from fpirhc.studies.variants import Draws, Variant, Variants
 from fpirhc.studies.verdict import Objective, objective
-from fpirhc.summary import written_out
 from fpirhc.task.cases import is_whole
 
 _STARTS = 10  # first trials, which are random
@@ -160,21 +158,9 @@ class _Search:
 
 
 def check_spaces(task: Task, chosen: Mapping[str, Controller]) -> None:
-    """Raise unless all these controllers have a search space, with one that could be written."""
-    lacking = [name for name in chosen if not task.tuning.get(name)]
-    if not lacking:
-        return
-    adapting = [n for n, c in task.controllers.items() if n in lacking and c.deformation.adapts]
-    name = (adapting or lacking)[0]
-    for path, factors in (("deformation.gain", (3.0, 0.1)), ("tracking.rate", (0.3, 3.0))):
-        try:
-            value = current_setting(resolved(task.problem, task.controllers[name]), path)
-            ends = ", ".join(written_out(value * factor, 2) for factor in factors)
-            example = f"{{'{path}': fpirhc.{LogSpan.__name__}({ends})}}"
-            break
-        except FpirhcError:
-            example = "{'PATH': fpirhc.Span(LOW, HIGH)}"
-    raise InvalidProblem(
-        f"problem '{task.name}': no search space for controller {', '.join(map(repr, lacking))}; add to its file, for example, "
-        f"tuning = {{{name!r}: {example}}}"
-    )
+    """Raise unless all these controllers have a search space."""
+    if lacking := [name for name in chosen if not task.tuning.get(name)]:
+        raise InvalidProblem(
+            f"problem '{task.name}': no search space for controller {', '.join(map(repr, lacking))}; add to its file, for example, "
+            f"tuning = {{{lacking[0]!r}: {{'deformation.gain': fpirhc.LogSpan(-2.0, -0.1)}}}}"
+        )

@@ -28,18 +28,14 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: ANY.simulate(tasks.two_mass.problem, torque()),
         "simulate needs seed; write simulate(problem=..., controller=..., seed=...)",
     ),
-    "a misspelt argument": (
-        lambda: ANY.simulate(tasks.two_mass.problem, torque(), seed=0, compile=False),
-        "simulate has no argument 'compile'. Did you mean 'compiled'?",
-    ),
     "a seed that is no number": (
         lambda: ANY.simulate(tasks.two_mass.problem, torque(), seed="a"),
         "simulate.seed: expected a whole number of at least 0, got the text 'a'",
     ),
-    "one controller for a review": (
-        lambda: ANY.review(tasks.two_mass.problem, torque(), seed=0, mismatch=0.0),
-        "review.controllers: expected {name: a Controller}, got a value of the class ComputedTorque",
-    ),
+    "a name of a method": (lambda: ANY.Cases({"a": {}}).matching(all=[]), "no argument 'all'. Valid: wanted."),
+    "a number for a signal": (lambda: ANY.Sensor(noise=2e-3), "or None, got 0.002; write fp.Noise(0.002)"),
+    "a mapping for a number": (lambda: ANY.Predicted(torque(), {"Q1": 0.06}), "; write one value for all, 0.06"),
+    "a number for a mapping": (lambda: ANY.DeadTime(0.02), "; write {'NAME': 0.02} with the name of what it belongs"),
     "a misspelt word": (
         lambda: ANY.Horizon(10, 0.01, replan="cycles"),
         "Horizon.replan: expected 'stage' or 'cycle' or a whole number from 1 to 1000000, got the text 'cycles'; write 'cycle'",

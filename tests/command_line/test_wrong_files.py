@@ -18,7 +18,7 @@ from fpirhc.__main__ import main
 REVIEW = ("review", "mine.py")
 BESIDE = {
     "notes.txt": "x = 1\n",
-    "two_mess.py": "1 / 0\n",
+    "a_mess.py": "1 / 0\n",
     "empty.csv": "",
     "words.csv": "# of Monday\n\ntime,angle\n0,abc\n",
     "other.csv": "time,phi\n0,1\n0.02,1\n",
@@ -257,7 +257,7 @@ compare nofile => problem 'nofile' is unknown. Give the path of a problem file, 
 compare mien.py => no file at 'mien.py'. Did you mean 'mine.py'?
 compare mine => problem 'mine' is unknown. Did you mean 'mine.py'?
 compare Two_Mass => Did you mean 'two_mass'?
-compare . => '.' is a folder; a problem file ends in .py, such as mine.py, two_mess.py
+compare . => '.' is a folder; a problem file ends in .py; it has 1, such as mine.py
 mine.py => the command 'mine.py' is unknown. Write fpirhc compare mine.py.
 reveiw mine.py => Did you mean 'review'?
 --verion => the option '--verion' is unknown. Did you mean '--version'? ... See fpirhc --help
@@ -282,7 +282,6 @@ study mine.py --draws 2 --metric rms_error => has a number for every coordinate;
 study mine.py --draws 2 --metric '' => metric '' is unknown. Valid: relative error, cycles, rms_error
 study mine.py --over deformation.map.gain=1:2 => expected PATH=LOW:HIGH:COUNT
 study mine.py --over deformation.map.gian=1:2:3 => has no 'gian'. Did you mean 'gain'?
-run mine.py RHC --duration 0 => '--duration' is unknown
 run mine.py RHC+FPI --set deformation.map.gain=nan => expected a finite number other than zero ... got nan
 run mine.py RHC --set limits.inputs.torque=5 => Limits.inputs['torque']: expected (a number, a number), got 5.0
 compare mine.py --set exact.mass=-1 => enlarges the error: mass of the plant and of the model differ in sign; give the model
