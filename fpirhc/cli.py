@@ -53,7 +53,8 @@ def compare(
     """
     task = _task(problem, set_, controllers)
     from fpirhc.report.html import render
-    from fpirhc.report.terminal import announce_backend, progress_bars
+    from fpirhc.report.terminal import announce_backend, progress_bars, show_plans
+    from fpirhc.status import Status
     from fpirhc.studies.compare import compare as run
     from fpirhc.studies.compare import select
     from fpirhc.studies.open_loop import first_plans
@@ -63,7 +64,8 @@ def compare(
         with progress_bars() as progress:
             progress("first plans", 0, 1)
             solved = first_plans(task, named)
-        return _show_plans(task, solved)
+        show_plans(task.name, solved)
+        raise typer.Exit(0 if all(one.plan.status == Status.OK for one in solved) else 4)
     folder = opt.folder_of(out, task.name, *["part"] * bool(controllers or set_))
     with progress_bars() as progress:
         result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
@@ -72,14 +74,6 @@ def compare(
     interrupted = any(why.startswith("interrupted") for why in result.skipped.values())
     finished = any(entry.run.stop is None for entry in result.entries)
     raise typer.Exit(130 if interrupted else 0 if finished else 1 if result.entries else 2)
-
-
-def _show_plans(task: Any, solved: Any) -> None:
-    from fpirhc.report.terminal import show_plans
-    from fpirhc.status import Status
-
-    show_plans(task.name, solved)
-    raise typer.Exit(0 if all(one.plan.status == Status.OK for one in solved) else 4)
 
 
 def _line() -> str:
@@ -134,7 +128,7 @@ def run(
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], opt.folder_of(out, task.name)
     from fpirhc.controllers.contract import resolved
-    from fpirhc.report.html import save_figure
+    from fpirhc.errors import writing
     from fpirhc.report.terminal import announce_backend, progress_bars, say, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
@@ -150,7 +144,8 @@ def run(
     plain = "".join(c if c.isalnum() or c == "-" else "_" for c in controller)
     files = [folder / f"{plain}.npz", folder / f"{plain}.png"]
     found.save(files[0])
-    save_figure(found.plot(), files[1])
+    with writing(folder, "--out"):
+        found.plot().savefig(files[1], dpi=120)
     announce_backend([found])
     since = f"{task.problem.measure_from:g} {task.problem.time_unit}"
     say(task.title, "bold", f" {controller}: errors from t = {since} on, seed {seed}.")

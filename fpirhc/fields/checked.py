@@ -225,8 +225,7 @@ def replaced(value: Value, field: str, content: object) -> Value | None:
     """Return the same frozen value with another content of a field; None where it is no dataclass or has no such field."""
     if not is_dataclass(value) or field not in [f.name for f in fields(value)]:
         return None
-    changed: Value = replace(value, **{field: content})  # type: ignore[type-var]  # mypy does not narrow type variables
-    return changed
+    return cast(Value, cast(Any, replace)(value, **{field: content}))
 
 
 class ByName(dict[str, Value]):

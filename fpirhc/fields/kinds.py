@@ -44,8 +44,7 @@ def described(value: object) -> str:
 
 def call_of(one: type | Callable[..., object]) -> str:
     """Return how a value of the class, or a call of the function, is written: "Sigmoid(gain=...)"."""
-    signature = _signature(one)
-    given = signature.parameters.values() if signature else ()
+    given = found.parameters.values() if (found := _signature(one)) else ()
     needed = [p for p in given if p.default is p.empty and p.name != "self"]
     named = [f"{p.name}=..." for p in needed if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
     return f"{one.__name__}({', '.join(named)})"

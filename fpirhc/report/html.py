@@ -1,7 +1,4 @@
-"""HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view.
-
-The verdict is first, then come the main columns, charts, pictures, notes, and settings.
-"""
+"""HTML reports: one self-contained file with its styles, scripts and pictures inside, from a template and a view."""
 
 from __future__ import annotations
 
@@ -9,7 +6,6 @@ import base64
 import hashlib
 import json
 import textwrap
-from collections import Counter
 from collections.abc import Sequence
 from colorsys import hsv_to_rgb
 from dataclasses import dataclass
@@ -20,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fpirhc.errors import FpirhcError, OutputError
+from fpirhc.errors import FpirhcError
 from fpirhc.simulation.drawing import BANDS, PALETTE, new_figure, responses_of, shown_motion
 from fpirhc.simulation.pictures import player
 from fpirhc.studies import finite_alone
@@ -31,7 +27,6 @@ from fpirhc.whole_file import write_whole
 if TYPE_CHECKING:
     from jinja2 import Environment
     from markupsafe import Markup
-    from matplotlib.figure import Figure
 
     from fpirhc.simulation.picture import Drawing
     from fpirhc.studies import View
@@ -122,8 +117,6 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     every = [Markup(script) for script in scripts]
     styles = [Markup(asset(style)) for style in ("uPlot.min.css", "report.css")]
     template = _environment().get_template(name)
-    others = Counter(str(outcome) for _, outcome in list(view.sentences)[1:] if outcome not in IN_FULL)
-    said = ", ".join(f"{count} {outcome}" for outcome, count in others.items())
     digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii") for script in scripts)
     hashes = " ".join(f"'sha256-{one}'" for one in digests)
     policy = (
@@ -132,7 +125,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
     )
     illustrated = ["Contraction"] if context.get("contraction") else []  # lists that stand above their pictures
     context |= {"in_full": IN_FULL, "policy": Markup(policy), "illustrated": illustrated}
-    return template.render(view=view, others=said, styles=styles, scripts=every, **context)
+    return template.render(view=view, styles=styles, scripts=every, **context)
 
 
 @cache
@@ -179,7 +172,9 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
     longest = max(entries, key=lambda e: e.run.cycles).run
     edges = np.unique(np.linspace(0, longest.cycles, min(INTERVALS, longest.cycles) + 1).astype(int))
     first, colours = entries[0].run, colours_of(comparison)
-    names = first.layout["error"].elements
+    names, inputs = first.layout["error"].elements, first.layout["command"].elements
+    limits = {one.name: one for e in entries for one in e.limits}
+    ends = {n: finite_alone([one.lower, one.upper]) for n, one in limits.items()}
     charts = [
         _chart(f"error of {c}", first.unit(f"error.{c}"), [(e.name, e.run[f"error.{c}"]) for e in entries], edges)
         for c in names
@@ -188,10 +183,11 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
         aims = [("set-point", longest[f"setpoint.{c}"])] if "setpoint" in longest.layout else []
         own = [(e.name, e.run[f"{shown_motion(e.run.layout)}.{c}"]) for e in entries]
         lines = [*aims, ("reference", longest[f"reference.{c}"]), *own]
-        charts.append(_chart(c, first.unit(f"reference.{c}"), lines, edges))
-    for i in first.layout["command"].elements:
-        lines = [(e.name, e.run[f"command.{i}"]) for e in entries]
-        charts.append(_chart(f"command {i}", first.unit(f"command.{i}"), lines, edges))
+        charts.append({**_chart(c, first.unit(f"reference.{c}"), lines, edges), "limits": ends.get(c, [])})
+    for n in (*inputs, *(n for n in limits if n not in (*names, *inputs))):
+        lines = [(e.name, one.values) for e in entries for one in e.limits if one.name == n]
+        title = f"command {n}" if n in inputs else n
+        charts.append({**_chart(title, limits[n].unit, lines, edges), "limits": ends[n]})
     for e in entries:
         for c in e.run.layout["desired"].elements:
             lines = [(what, e.run[f"{signal}.{c}"]) for what, signal in responses_of(e.run.layout).items()]
@@ -246,18 +242,6 @@ _BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
 _GOLDEN = 0.618034  # of a turn, from hue to hue
 
 
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure to a file.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    try:
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise OutputError(f"cannot write the figure to '{path}': {error.strerror}") from None
-
-
 def colours_of(comparison: Comparison) -> dict[str, str]:
     """Return the colour of every controller that ran, by name: that of its place in the problem file, whichever others ran."""
     more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(comparison.places)))
@@ -267,14 +251,13 @@ def colours_of(comparison: Comparison) -> dict[str, str]:
 
 
 def contraction_charts(comparison: Comparison) -> list[dict[str, Any]]:
-    """Return a chart of the factor for every gain by its own name and scale."""
-    entries = [e for e in comparison.entries if e.contraction is not None and e.run.cycles > 2]
+    """Return a chart of the factor for every gain by its own name and scale, where a run has measured it."""
     groups: dict[tuple[str, float], list[tuple[str, Contraction]]] = {}
-    for entry in entries:
-        if entry.contraction is not None:
-            name, scale = entry.contraction.report.own  # where no gain converges: of the effective gain
+    for entry in comparison.entries:
+        if (known := entry.contraction) is not None and np.isfinite(known.measured):
+            name, scale = known.report.own  # where no gain converges: of the effective gain
             own = (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
-            groups.setdefault(own, []).append((entry.name, entry.contraction))
+            groups.setdefault(own, []).append((entry.name, known))
     return [_chart_of_factor(name, scale, same) for (name, scale), same in groups.items()]
 
 

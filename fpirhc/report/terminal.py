@@ -1,7 +1,6 @@
 """The output on the terminal: progress bars, sentences, and tables that fold.
 
-Columns that do not fit beside each other go on below, and no column is cut or lost. Every part begins with the columns that name
-the rows.
+Columns that do not fit go on below, none is cut or lost, and every part begins with the columns that name the rows.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import math
 import re
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -39,15 +37,14 @@ if TYPE_CHECKING:
     from fpirhc.studies import View
     from fpirhc.studies.open_loop import Solved
 
-STYLES = {
+STYLES: dict[Outcome | None, str] = {  # by the outcome that a sentence states
     Outcome.BETTER: "green",
     Outcome.WORSE: "bold red",
     Outcome.MIXED: "yellow",
     Outcome.DOUBTFUL: "yellow",
-    Outcome.NO_DIFFERENCE: "",
     Outcome.NOT_COMPARABLE: "dim",
     Outcome.LIMIT_LEFT: "bold red",
-    None: "",  # a remark
+    Outcome.LEAVES: "bold red",
 }
 _GLUE = "\ue000"  # in place of a space that is held
 _NAMED = 24  # characters of a name that stand on one line where there is little room
@@ -76,12 +73,8 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
     say(view.study.title, "bold", f" {view.conditions}")
     sentences = list(view.sentences)
     show_sentences(shown := sentences if verbose else sentences[:1])
-    if others := sentences[len(shown) :]:
-        outcomes = Counter(str(outcome) for _, outcome in others if outcome not in IN_FULL)
-        say(
-            f"other pairs: {', '.join(f'{count} {outcome}' for outcome, count in outcomes.items())}"
-        ) if outcomes else None
-        show_sentences(one for one in others if one[1] in IN_FULL)
+    say(f"other pairs: {view.others}") if view.others and not verbose else None
+    show_sentences(one for one in sentences[len(shown) :] if one[1] in IN_FULL)
     for table in view.tables:
         if table.rows:
             narrow = replace(table.narrow, title="" if table.title == view.study.title else table.title)
@@ -120,7 +113,7 @@ def show_brief(table: Table, console: Console | None = None) -> None:
 def show_sentences(sentences: Iterable[tuple[str, Outcome | None]]) -> None:
     """Print sentences in the colours of the outcomes that they state."""
     for text, outcome in sentences:
-        say(f"- {text}", STYLES[outcome])
+        say(f"- {text}", STYLES.get(outcome, ""))
 
 
 def show_table(table: Table, console: Console | None = None) -> None:

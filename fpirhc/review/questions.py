@@ -20,7 +20,7 @@ from fpirhc.plant.chain import zero_dynamics
 from fpirhc.plant.motion import with_space
 from fpirhc.review.experiments import BUSY, GOOD, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, with_gain
 from fpirhc.simulation.ranges import TOLERANCE, Followed, hard_limits
-from fpirhc.simulation.trials import ModelAsPlant
+from fpirhc.simulation.trials import ModelAsPlant, spoils
 from fpirhc.status import Status
 from fpirhc.summary import written_out
 from fpirhc.symbolic.dotted import paths_to
@@ -400,9 +400,10 @@ def _model(case: Case) -> Fact:
     require(stuck <= MOSTLY, "With the model as plant the command stands at a limit: run it where commands are free.")
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
     name, numbers, harms = _added(case, without, adapted, SLIGHT)
-    spoils = case.outside or numbers["error_with"] > case.plain.errors(case.plain.nominal)[name]
-    no = spoils and not case.outside and harms > 2 and numbers["added"] > (SLIGHT if harms > 10 else 0.01)
-    verdict = Verdict.NO if no else Verdict.CAUTION if spoils and harms > WORSE else Verdict.YES
+    cured, error = case.plain.errors(case.plain.nominal)[name], numbers["error_with"]
+    no = not case.outside and spoils(harms, numbers["added"], error, cured)
+    caution = harms > WORSE and (case.outside or error > cured)
+    verdict = Verdict.NO if no else Verdict.CAUTION if caution else Verdict.YES
     return Fact(verdict, numbers, name)
 
 

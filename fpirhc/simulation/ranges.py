@@ -5,7 +5,7 @@ A level below zero is a run that no plant would make. An error of a million time
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -190,7 +190,13 @@ def hard_limits(problem: Problem, run: Run) -> list[Followed]:
     return [Followed(n, one.unit, one.lower, one.upper, v) for (n, one), v in pairs if not np.isnan(v).all()]
 
 
-def limits_left(problem: Problem, run: Run) -> tuple[Followed, ...]:
-    """Return the hard limits that a run has left by more than the tolerance, the worst first; arguments as in `hard_limits`."""
-    worst = {one: float(one.beyond.max()) for one in hard_limits(problem, run)}
+def input_limits(problem: Problem, run: Run) -> list[Followed]:
+    """Return the limits of inputs along a run, which every command keeps."""
+    ends = zip(problem.plant.inputs.items(), *problem.limits.input_bounds(problem.plant), strict=True)
+    return [Followed(n, unit, float(low), float(high), run[f"command.{n}"]) for (n, unit), low, high in ends]
+
+
+def limits_left(limits: Sequence[Followed]) -> tuple[Followed, ...]:
+    """Return those limits that are left by more than the tolerance, the worst first."""
+    worst = {one: float(one.beyond.max(initial=0.0)) for one in limits}
     return tuple(sorted((one for one in worst if worst[one] > TOLERANCE), key=lambda one: -worst[one]))

@@ -202,10 +202,17 @@ def _free(name: str, plant: Plant) -> str:
     return name
 
 
-MUCH_WORSE, FAR_WORSE = 2.0, 10.0  # ratio of the errors
 _ROUNDING = 1e-9  # share of the coordinate's range
 MOSTLY = 0.5  # share of the cycles at a limit, from which a run shows nothing
-SLIGHT, CLEAR = 1e-3, 1e-2  # added error as a share of the coordinate's range
+
+
+def spoils(ratio: float, added: float, error: float, cured: float) -> bool:
+    """Whether adaptation harms: it makes an error twice as large, and adds a hundredth of the range, or ten times and a thousandth.
+
+    On a right model it does so only where the error is above the one that it `cured`: that without adaptation on the plant itself.
+    """
+    much = not (ratio <= 2.0 or added <= 1e-2) or not (ratio <= 10.0 or added <= 1e-3)
+    return much and error > cured
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,17 +259,10 @@ class ErrorPair:
         """Whether the pair shows nothing: commands stand at a limit in both runs, where no adaptation can act."""
         return self.at_limit >= MOSTLY  # NaN is informative
 
-    @property
-    def fails(self) -> bool:
-        """Whether it makes one worse by a factor of two and a hundredth of its range, or by ten times and a thousandth.
-
-        Where the run without adaptation ends early there is nothing that it makes worse.
-        """
-        known = all(map(math.isfinite, self.without.values()))
-        return known and (self._beyond(MUCH_WORSE, CLEAR) or self._beyond(FAR_WORSE, SLIGHT))
-
-    def _beyond(self, ratio: float, share: float) -> bool:
-        return any(not (self.ratio(n) <= ratio or self.added(n) <= share) for n in self.without)
+    def fails(self, cured: Mapping[str, float] | None = None) -> bool:
+        """Whether it `spoils` a coordinate; where the run without adaptation ends early there is nothing that it makes worse."""
+        known, least = all(map(math.isfinite, self.without.values())), cured or dict.fromkeys(self.without, 0.0)
+        return known and any(spoils(self.ratio(n), self.added(n), self.adapted[n], least[n]) for n in self.without)
 
 
 def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | None = None) -> ErrorPair:
@@ -322,8 +322,8 @@ def harm(problem: Problem, controller: Controller, cycles: int) -> str:
     except FpirhcError:  # what the runs cannot do says nothing about the controller
         return ""
     real = errors_of(short, runs, names) if runs else None
-    reasons = [f"on the plant {real.sentence}"] if real and real.fails else []
-    if null.fails and (real is None or null.adapted[null.worst] > real.without[null.worst]):
+    reasons = [f"on the plant {real.sentence}"] if real and real.fails() else []
+    if null.fails(real.without if real else None):
         reasons.append(f"on its own model, with nothing to adapt {null.sentence}")
     return "; ".join(reasons)
 

@@ -6,13 +6,14 @@ import json
 import math
 import time
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from fpirhc.describe import as_written
-from fpirhc.studies.verdict import Outcome
+from fpirhc.studies.verdict import IN_FULL, Outcome
 from fpirhc.summary import Table, in_percent
 
 if TYPE_CHECKING:
@@ -34,6 +35,12 @@ class View:
     facts: Mapping[str, Any] = field(repr=False)  # what the JSON object holds
     # sentences by the heading under which a page has them
     lists: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def others(self) -> str:
+        """How many sentences behind the first one state which outcome, without those that every output shows in full."""
+        counts = Counter(str(outcome) for _, outcome in self.sentences[1:] if outcome not in IN_FULL)
+        return ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
 
     def html(self) -> str:
         """Return the verdict and the first table for a notebook."""

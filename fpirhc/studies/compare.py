@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,12 +22,13 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
+from fpirhc.problem_files.shipped import shipped_folders
 from fpirhc.review.questions import misplaced, slips
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
 from fpirhc.simulation.pictures import Picture
-from fpirhc.simulation.ranges import Followed, limits_left
+from fpirhc.simulation.ranges import Followed, hard_limits, input_limits, limits_left
 from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
@@ -72,7 +74,7 @@ class Contraction:
     """The factor by which the iteration shrinks an error per cycle."""
 
     growing: float  # share of the cycles in which small errors grow
-    measured: float
+    measured: float  # NaN: the response is late, or does not move in every direction
     report: ContractionReport
     spectrum: np.ndarray
 
@@ -81,11 +83,16 @@ class Contraction:
         near = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1]) ** 2, axis=0))
         named = zip(run.layout["desired"].elements, near, strict=True)
         each = (f"{n} {written_out(v)}{with_space(run.unit(f'desired.{n}'))}" for n, v in named)
-        one, factor = self.report, f"Measured factor {written_out(self.measured)}"
-        if one.converging:  # a fit is right within two hundredths
-            factor += ": the bound does not hold in this run" * (self.measured > one.predicted + 0.02)
-            alone = f"The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review. "
-            factor = alone * (run.controller not in lost) + factor
+        one, factor = self.report, "No factor is measured: the response is late, or does not move in every direction"
+        if np.isfinite(self.measured):  # a fit is right within two hundredths
+            wrong = one.converging and self.measured > one.predicted + 0.02
+            factor = (
+                f"Measured factor {written_out(self.measured)}{': the bound does not hold in this run' * bool(wrong)}"
+            )
+        if one.converging and run.controller not in lost:
+            factor = (
+                f"The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review. {factor}"
+            )
         return f"{one.text}. {factor}; realised - desired, rms: {', '.join(each)}."
 
 
@@ -103,8 +110,8 @@ class Entry:
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
     cycle: tuple[float, ...] | None = None  # median time of a cycle, that of 99 %, and the longest, us
-    left: tuple[Followed, ...] = ()  # hard limits that it leaves, the worst first
-    noise: str = ""  # that its response has none, and how to see what it costs
+    limits: tuple[Followed, ...] = ()  # along the run: those of inputs, and hard ones of states, rates and paths
+    left: tuple[Followed, ...] = ()  # those that it leaves, the worst first
     notes: tuple[str, ...] = ()
 
     @property
@@ -223,6 +230,7 @@ def compare(
             skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
             break
     yard = Yardstick.of(problem, seed)
+    found = findings(entries, task.headline, yard, skipped, aim, _causes(problem, entries, yard))
     return Comparison(
         **circumstances(task, selected, command, begin),
         seed=seed,
@@ -231,7 +239,7 @@ def compare(
         rivals=frozenset(e.name for e in entries if not e.exact and (aim.metric or follows(e, yard))),
         entries=tuple(entries),
         skipped=skipped,
-        findings=findings(entries, task.headline, yard, skipped, aim, _causes(problem, entries, yard)),
+        findings=(*found, *_without_noise(task, found[0].pair)),
         pictures=task.pictures,
         time_unit=problem.time_unit,
     )
@@ -256,8 +264,6 @@ class _Rows:
         self.composed: dict[str, tuple[Simulator, ComposedStep | None]] = {}
         self.wanted: list[tuple[Any, int]] = []  # Functions to be compiled, and so many calls of each
         self._model = ModelAsPlant(task.problem, seed=seed)
-        adaptive = [n for n, one in controllers.items() if one.deformation.adapts and pair_of(controllers, n)]
-        self._asked = task.headline[1] if task.headline and task.headline[1] in adaptive else next(iter(adaptive), None)
 
     def compose(self, name: str) -> None:
         """Compose a loop, and its step by hand."""
@@ -281,12 +287,11 @@ class _Rows:
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
         cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
-        noise = _without_noise(problem, ready, name) if name == self._asked else ""
-        left = limits_left(problem, run)
+        left = limits_left(limits := (*input_limits(problem, run), *hard_limits(problem, run)))
         told = [one.sentence for one in left]
         notes = (*told, *ready.notes(problem), *run.remarks, *broken, *metrics.broken.values())
         adapts, exact = ready.deformation.adapts, _has_exact_model(problem, ready)
-        return Entry(name, run, metrics, adapts, pair, judged, exact, contraction, null, cycle, left, noise, notes)
+        return Entry(name, run, metrics, adapts, pair, judged, exact, contraction, null, cycle, limits, left, notes)
 
     def _null(self, pair: str, name: str, judged: frozenset[str] | None) -> ErrorPair:
         return errors_of(*self._model.pair((self.composed[pair][0], self.composed[name][0])), judged)
@@ -296,7 +301,7 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     if not metrics.numbers.get("contraction.predicted"):
         return None
     spectrum, late = sampled_spectrum(problem, run), problem.response_delay
-    growing, measured = (metrics[f"contraction.{n}"][""] for n in ("growing", "measured"))
+    growing, measured = metrics["contraction.growing"][""], metrics["contraction.measured"].get("", np.nan)
     growing = 0.0 if late else growing  # behind a delay the iteration is another one, which was asked before the run
     largest = largest_behind_estimator(problem, controller.deformation)
     return Contraction(growing, measured, assess_gain(controller.deformation, spectrum, late, largest), spectrum)
@@ -309,16 +314,16 @@ def _has_exact_model(problem: Problem, controller: Controller) -> bool:
     return wrong and fixed and controller.exact_model
 
 
-def _without_noise(problem: Problem, controller: Controller, name: str) -> str:
-    """A sentence where the response of a controller that adapts it is measured as no sensor does."""
+def _without_noise(task: Task, pair: tuple[str, str] | None) -> list[Finding]:
+    """A sentence where the response that the first pair adapts is measured as no sensor does."""
+    problem = task.problem
+    if not pair or not problem.moves.simulated or task.controllers[pair[1]].deforms in ("target", "turns"):
+        return []
     shown = {*problem.sensing.measures(problem.plant)} - {n for n, one in problem.sensing.sensors.items() if one.acts}
-    if (
-        not problem.moves.simulated
-        or controller.deforms in ("target", "turns")
-        or not {*response_names(problem.plant)} <= shown
-    ):
-        return ""
-    return f"{name} measures its response without noise; what noise costs: fpirhc study PROBLEM --limits noise."
+    file = task.name if any(folder in task.path.parents for folder in shipped_folders()) else str(task.path)
+    words = shlex.join(["fpirhc", "study", file, "--limits", "noise", "-c", *pair])
+    text = f"{pair[1]} measures its response without noise; how much it bears: {words}"
+    return [Finding(text)] if {*response_names(problem.plant)} <= shown else []
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one

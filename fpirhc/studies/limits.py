@@ -1,7 +1,4 @@
-"""How much of something a controller bears before it fails: doubling and halving of one quantity, a row for every limit.
-
-Controllers know nothing of what grows.
-"""
+"""How much of something a controller, which knows nothing of it, bears before it fails: one quantity is doubled and halved."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.studies import Progress, versions
 from fpirhc.studies.compare import select
 from fpirhc.studies.variants import Variant, Variants
-from fpirhc.studies.verdict import left_alone, ranges
+from fpirhc.studies.verdict import left_alone, ranges, relative
 from fpirhc.summary import in_units
 from fpirhc.task.cases import as_declared
 from fpirhc.task.problem import Problem
@@ -119,13 +119,6 @@ class Runner:
             return simulator(base, resolved(base, controller), compiled=compiled, live=paths)
         except FpirhcError as error:
             return error
-
-
-def relative(errors: Mapping[str, float], sizes: Mapping[str, float]) -> float:
-    """Return the rms errors over these sizes, root mean square over the coordinates; infinite where one is no number."""
-    shares = [rms / sizes[c] for c, rms in errors.items()]
-    error = math.hypot(*shares) / math.sqrt(len(shares))
-    return error if math.isfinite(error) else math.inf
 
 
 def run_variants(

@@ -1,8 +1,7 @@
 """The verdict: what adaptation does to a pair of controllers, as an outcome, a ratio per coordinate, and flags.
 
-The figure by which controllers are compared and tuned is an `Objective`: the relative error, or any metric with a better direction.
-An outcome follows from the ratios of the errors. A flag is a row of a table: what is measured of a run, from when on it counts,
-and a sentence; some turn a smaller error into a doubtful one.
+Controllers are compared and tuned by an `Objective`: the relative error, or any metric with a better direction. An outcome follows
+from ratios of errors. A flag is a row of a table: what is measured, from when on it counts, and a sentence.
 """
 
 from __future__ import annotations
@@ -126,10 +125,11 @@ class Outcome(StrEnum):
     DOUBTFUL = "doubtful"  # a smaller error, and a reason why it is no success
     NO_DIFFERENCE = "no difference"
     NOT_COMPARABLE = "not comparable"
-    LIMIT_LEFT = "hard limit left"  # of whatever error, and of every controller
+    LIMIT_LEFT = "hard limit left"  # of whatever error
+    LEAVES = "leaves a limit"  # of controllers, and of no pair
 
 
-IN_FULL = None, Outcome.LIMIT_LEFT  # of the sentences that short outputs show beside the first one
+IN_FULL = None, Outcome.LEAVES  # of the sentences that short outputs show beside the first one
 
 
 @dataclass(frozen=True)
@@ -250,6 +250,12 @@ def _swing(pair: Pair) -> float:
     return float((far / np.maximum(high - low, TINY)).max(initial=0.0))
 
 
+def _misfit(pair: Pair) -> float:
+    """The measured contraction factor, where the error falls all the same."""
+    fell = all(pair.adaptive.errors[n] < pair.plain.errors[n] for n in pair.names)
+    return pair.adaptive.metrics["contraction.measured"].get("", math.nan) if fell else math.nan
+
+
 def _at(pair: Pair) -> str:
     """The limit at which a command stands most."""
     problem, run = pair.yard.problem, pair.adaptive.run
@@ -264,7 +270,8 @@ def _at(pair: Pair) -> str:
 def _null(pair: Pair) -> float:
     """How many times as large it makes the error of a right model, where the null test fails."""
     null = pair.adaptive.null
-    return null.ratio(null.worst) if null is not None and null.fails and not null.stuck else math.nan
+    fails = null is not None and not null.stuck and null.fails(pair.plain.errors)
+    return null.ratio(null.worst) if null is not None and fails else math.nan
 
 
 @dataclass(frozen=True)
@@ -291,7 +298,9 @@ FLAGS = (
     Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(lambda pair: math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing, 0.05,
          "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
-    Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation", True),
+    Flag(_misfit, 1.0, "its measured contraction factor is {value}, though errors fall: noise, friction, rounding or a limit is in "
+         "the fit, too"),
+    Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation"),
 )  # fmt: skip
 
 
@@ -313,8 +322,7 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     names = plain.name, adaptive.name
     ended = {e.name: e.run.stop for e in (plain, adaptive) if e.run.stop is not None}
     if ended:
-        lost = Outcome.WORSE if adaptive.name in ended else Outcome.BETTER
-        outcome = Outcome.NOT_COMPARABLE if len(ended) == 2 else lost
+        outcome = _of_lost(ended, adaptive)
         texts = [f"{' and '.join(n)} do{'es' * (len(n) == 1)} not finish: {why}" for why, n in by_reason(ended).items()]
         return Finding(f"{'; '.join(texts)}.", outcome, names)
     before, after, run = plain.errors, adaptive.errors, adaptive.run
@@ -342,6 +350,12 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
 
 
+def _of_lost(lost: Collection[str], adaptive: Entry) -> Outcome:
+    """The outcome of a pair of which one or both have no number."""
+    kept = Outcome.LIMIT_LEFT if adaptive.left else Outcome.BETTER
+    return Outcome.NOT_COMPARABLE if len(lost) == 2 else Outcome.WORSE if adaptive.name in lost else kept
+
+
 def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     """Return what adaptation does to the number that the problem is judged by."""
     names, metric = (plain.name, adaptive.name), aim.metric
@@ -351,8 +365,7 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     )
     lost = [n for n, v in zip(names, (before, after), strict=True) if not math.isfinite(v)]
     if lost:
-        outcome = Outcome.NOT_COMPARABLE if len(lost) == 2 else Outcome.WORSE if lost == [names[1]] else Outcome.BETTER
-        return Finding(f"{' and '.join(lost)}: no {aim.column}.", outcome, names)
+        return Finding(f"{' and '.join(lost)}: no {aim.column}.", _of_lost(lost, adaptive), names)
     ratio = after / before if before * after > 0 else math.nan
     if abs(after - before) <= metric.floor or HELPS <= ratio <= HURTS:
         outcome = Outcome.NO_DIFFERENCE
@@ -363,16 +376,14 @@ def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     return Finding(text, outcome, names, {aim.column: ratio})
 
 
-def _limits_first(finding: Finding, *entries: Entry) -> Finding:
-    """The finding that says first who leaves a hard limit; where the last of them does, its error is no success."""
-    text = " ".join([*(leaves(e) for e in entries if e.left), finding.text])
-    kept = not entries[-1].left or finding.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)
-    return replace(finding, text=text, outcome=finding.outcome if kept else Outcome.LIMIT_LEFT)
-
-
-def leaves(entry: Entry) -> str:
-    """Return which hard limit a controller leaves, of several the worst."""
-    return f"{entry.name} leaves a limit: {entry.left[0].sentence}."
+def leaves(entries: Sequence[Entry]) -> str:
+    """Return who leaves a hard limit, of several the worst: every limit once, with all names and the worst number."""
+    worst, said = {e.name: e.left[0] for e in entries if e.left}, list[str]()
+    for limit in dict.fromkeys(one.name for one in worst.values()):
+        names = sorted((n for n in worst if worst[n].name == limit), key=lambda n: -worst[n].beyond.max())
+        one, whose = len(names) == 1, f" of {names[0]}"
+        said.append(f"{', '.join(names)} leave{'s' * one} a limit: {worst[names[0]].sentence}{'' if one else whose}.")
+    return " ".join(said)
 
 
 def findings(
@@ -387,14 +398,15 @@ def findings(
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     pairs.sort(key=lambda p: ((p[0].name, p[1].name) != headline, "solve" not in p[1].run.layout))
-    judged = [_limits_first(judge_by(aim, *pair), *pair) for pair in pairs] if aim.metric is not None else []
-    judged += [_limits_first(judge(*pair, yard), *pair) for pair in pairs]
+    judged = [judge_by(aim, *pair) for pair in pairs] if aim.metric is not None else []
+    judged += [judge(*pair, yard) for pair in pairs]
     if not judged:
         judged = [Finding("No controller is here both with and without adaptation.", Outcome.NOT_COMPARABLE)]
-    told = {n for f in judged if f is judged[0] or f.outcome is Outcome.LIMIT_LEFT for n in f.pair or ()}
-    judged += [Finding(leaves(e), Outcome.LIMIT_LEFT) for e in entries if e.left and e.name not in told]
+    if (left := leaves(entries)) and any(by_name[name].left for name in judged[0].pair or ()):
+        judged[0] = replace(judged[0], text=f"{left} {judged[0].text}")
+    elif left:
+        judged.append(Finding(left, Outcome.LEAVES))
     judged += map(Finding, causes)
-    judged += [Finding(e.noise) for e in entries if e.noise]
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 
@@ -406,27 +418,26 @@ def follows(entry: Entry, yard: Yardstick) -> bool:
     return entry.run.stop is None and not any(yard.beyond(entry, n) for n in names) and not (idle and all(idle))
 
 
-def relative_error(entry: Entry, yard: Yardstick, names: Collection[str]) -> float:
-    """Return the error over the ranges, root mean square over these coordinates; infinite for a run that ended early."""
-    if entry.run.stop is not None:
-        return math.inf
-    shares = [entry.errors[n] / yard.scales[n] for n in names]
-    return math.hypot(*shares) / math.sqrt(len(shares))
+def relative(errors: Mapping[str, float], sizes: Mapping[str, float]) -> float:
+    """Return the rms errors over these sizes, root mean square over the coordinates; infinite where one is no number."""
+    shares = [rms / sizes[c] for c, rms in errors.items()]
+    error = math.hypot(*shares) / math.sqrt(len(shares))
+    return error if math.isfinite(error) else math.inf
 
 
 def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yard: Yardstick) -> Iterator[str]:
     names = (pairs[0][1].weighed if pairs else None) or [*yard.scales]
-    rows = {e.name: relative_error(e, yard, names) for e in entries}
-    fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows[e.name])}
+    rows = {e.name: relative({n: e.errors[n] for n in names}, yard.scales) for e in entries if e.run.stop is None}
+    fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows.get(e.name, math.inf))}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
         above = "" if any(follows(e, yard) for e in entries) else "No controller follows. "
         among = " with the wrong model" * any(e.exact for e in entries)
         yield f"{above}Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
     for exact in (e for e in entries if e.exact):
-        beaten = [n for n, v in fair.items() if v < HELPS * rows[exact.name]]
+        beaten = [n for n, v in fair.items() if v < HELPS * rows.get(exact.name, math.inf)]
         if beaten:
-            yield f"{exact.name} is no bound here; smaller errors: {', '.join(beaten)}. A bound has their cost and prediction."
+            yield f"{exact.name} is no lower bound: errors are smaller with {', '.join(beaten)}."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
             lost = [n for n in entry.errors if yard.beyond(entry, n)]

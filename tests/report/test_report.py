@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -91,6 +92,15 @@ def test_data_of_the_charts_is_complete(comparison, written):
     assert (at, measured) == pytest.approx((-0.5, found.measured), rel=1e-4)
     bound = dict(zip(factor["across"]["values"], factor["series"][0]["values"], strict=True))
     assert bound[at] == pytest.approx(found.report.predicted, rel=1e-4)
+
+
+def test_hard_limits_are_in_the_charts_of_what_they_limit(tmp_path):
+    """A limited state that nobody judges has a chart of its own; a price is no limit, and an error and a free input have none."""
+    limits = fp.Limits(inputs={"u": (-20.0, math.inf)}, states={"y": (-9.0, 9.0), "y'": (-4.0, 5.0)}, prices={"y": 1.0})
+    fp.write_report(compared("plain", limits=limits), tmp_path / "limited.html")
+    charts = {c["title"]: c for c in data_of((tmp_path / "limited.html").read_text(encoding="utf-8"))["charts"]}
+    shown = {title: (chart["unit"], chart["limits"]) for title, chart in charts.items() if "limits" in chart}
+    assert shown == {"y": ("m", []), "command u": ("N", [-20.0, None]), "y'": ("m/s", [-4.0, 5.0])}
 
 
 def test_a_controller_has_the_colour_of_its_place_in_the_file(written, tmp_path):

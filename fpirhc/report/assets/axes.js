@@ -18,8 +18,9 @@ const AXIS_OF_VALUES = {
 };
 
 // The range of values of a chart: where a run that ended early is shown whole, what it reached at last does not hide the rest.
-const TALL = 20; // largest size that is shown, over the usual one
-function rangeOfValues(ended) {
+// A limit is in it where the lines come near, so that a far one flattens no chart.
+const TALL = 20, NEAR = 1.3; // largest size that is shown, over the usual one; range with a limit, over that of the lines
+function rangeOfValues(ended, limits = []) {
   return (chart, low, high) => {
     if (low === null) return [0, 1];
     const [times] = chart.data, last = times[times.length - 1], { min, max } = chart.scales.x;
@@ -28,6 +29,7 @@ function rangeOfValues(ended) {
       const most = TALL * sizes.sort((a, b) => a - b)[sizes.length >> 1];
       if (most > 0) [low, high] = [Math.max(low, -most), Math.min(high, most)];
     }
-    return uPlot.rangeNum(low, high, 0.1, true);
+    const near = limits.filter((v) => v !== null && Math.max(v, high) - Math.min(v, low) <= NEAR * (high - low));
+    return uPlot.rangeNum(Math.min(low, ...near), Math.max(high, ...near), 0.1, true);
   };
 }

@@ -12,11 +12,11 @@ const LINES = {
   "set-point": [null, 1.2, [1, 3]],
   limit: [null, 1.2, [5, 4]],
 };
-const ink = getComputedStyle(document.documentElement).getPropertyValue("--ink").trim();
+const styles = getComputedStyle(document.documentElement), ink = styles.getPropertyValue("--ink").trim();
 // The palette's black is the page's ink, which is light where the page is dark.
 const tone = (color) => (color === "#111111" ? ink : color);
 const colors = Object.fromEntries(DATA.controllers.map((c) => [c.name, tone(c.color)]));
-const faint = getComputedStyle(document.documentElement).getPropertyValue("--line").trim();
+const faint = styles.getPropertyValue("--line").trim();
 const shown = new Set(DATA.controllers.map((c) => c.name));
 const sync = uPlot.sync("time");
 const plots = [];
@@ -47,6 +47,16 @@ function bands(chart, spec) {
   ctx.restore();
 }
 
+// Hard limits as thin dashed lines.
+function limits({ ctx, bbox, scales, valToPos }, spec) {
+  ctx.save();
+  ctx.strokeStyle = styles.getPropertyValue("--worse");
+  ctx.setLineDash([8, 6]);
+  for (const v of spec.limits ?? [])
+    if (v !== null && v >= scales.y.min && v <= scales.y.max) ctx.stroke(new Path2D(`M${bbox.left} ${valToPos(v, "y", true)}h${bbox.width}`));
+  ctx.restore();
+}
+
 // Whether a run that a chart shows ended early.
 const ended = (spec) => DATA.controllers.some((c) => c.ended && (spec.only ? c.name === spec.only : shown.has(c.name)));
 
@@ -64,7 +74,9 @@ function place(spec) {
   const box = document.createElement("div");
   box.className = "chart";
   const title = document.createElement("h3");
-  title.textContent = spec.title + " [" + spec.unit + "]";
+  const [low, high] = spec.limits ?? [];
+  const bounded = (low ?? high ?? null) === null ? "" : `, limits ${low ?? "-∞"} to ${high ?? "∞"}`;
+  title.textContent = `${spec.title} [${spec.unit}]${bounded}`;
   box.append(title);
   document.getElementById(spec.only ? "responses" : spec.real ? "reality" : spec.across ? "contraction" : "charts").append(box);
   return { box, spec };
@@ -90,11 +102,11 @@ function draw({ box, spec }) {
     width: box.clientWidth,
     height: HEIGHT,
     series,
-    scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec)) } },
+    scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec), spec.limits) } },
     axes: [{ ...axis, ...labelled, ...(spec.across ? { values: AXIS_OF_VALUES.values } : {}), label: across.label }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: spec.across ? {} : { sync: { key: sync.key } },
     legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
-    hooks: spec.across ? {} : { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)] },
+    hooks: spec.across ? {} : { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => limits(chart, spec)] },
   };
   const chart = new uPlot(options, [across.values, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });

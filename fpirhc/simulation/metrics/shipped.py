@@ -163,9 +163,9 @@ def growing(problem: Problem, run: Run) -> float | None:
 def measured(problem: Problem, run: Run) -> float | None:
     """Return the factor that is fitted to requests and responses of the run; NaN where they do not excite every direction.
 
-    None for a plant outside whose response is late, or that nothing excites.
+    None where the response is late: it does not belong to the last request. None too for a plant outside that nothing excites.
     """
-    if not _adapts(run) or (problem.response_delay and not problem.moves.simulated):
+    if not _adapts(run) or problem.response_delay:
         return None
     factor = identified_factor(run["deformed"], run["plant_realised"], _gain(run), _weights(run))
     return factor if problem.moves.simulated or np.isfinite(factor) else None
