@@ -38,6 +38,7 @@ def test_random_box_constrained_problems_are_solved_or_honestly_not(seed, low, h
 
 
 CACHE: dict[str, Any] = {}
+GAIN = {"b": fp.Parameter(1.0, 1.0, "1")}
 
 
 def setup_module():
@@ -197,8 +198,7 @@ def test_a_second_start_takes_the_iterations_of_both():
 
 def test_a_multiplier_counts_at_its_own_bound_alone():
     """Positive at the upper one, negative at the lower one: elsewhere a plan is judged as without it; NaN is no small residual."""
-    gain = {"b": fp.Parameter(1.0, 1.0, "1")}
-    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, gain, lambda q, u, p: {"y": p.b * u.u}, order=1)
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, GAIN, lambda q, u, p: {"y": p.b * u.u}, order=1)
     task = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Horizon(stages=4, step=0.1), fp.Quadratic({"y": 1.0}, {"u": 1.0})
     free, bound = (horizon_of(plant, *task, fp.Limits(states=one)) for one in ({}, {"y": (-0.3, 0.4)}))
 
@@ -231,7 +231,7 @@ def test_a_move_that_lowers_the_cost_by_nothing_is_no_error(beside, status):
 @pytest.mark.parametrize("side", [-1, 1])
 def test_of_two_starts_the_plan_that_costs_less_with_its_violations_is_taken(side):
     """A remembered plan stays in its valley, although the one from nothing is in a deeper one, beyond a limit with a price."""
-    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, {}, lambda q, u, p: {"y": u.u}, order=1)
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, GAIN, lambda q, u, p: {"y": p.b * u.u}, order=1)
     cost = fp.CustomCost(terms=lambda v: {"valleys": (v.input.u**2 - 1) ** 2 - 0.3 * side * v.input.u})
     states = {"y": (-0.5, 9.0) if side < 0 else (-9.0, 0.5)}
     limits = fp.Limits(inputs={"u": (-3.0, 3.0)}, states=states, prices={"y": 1.5})
