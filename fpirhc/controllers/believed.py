@@ -158,9 +158,9 @@ def believed_path(problem: Problem, deformation: Deformation) -> Path:
 def stated_path(problem: Problem) -> Path:
     """Return the way of the commands as the problem states it, in whole cycles."""
     inputs, late, period = problem.plant.input, problem.dead_time, problem.period
-    waits = Queue(late.input_cycles(inputs.elements, period))
+    waits, seen = Queue(late.input_cycles(inputs.elements, period)), late.measurement_cycles(period)
     last = Signal("_commanded", inputs.elements, inputs.units, tuple(map(float, problem.inputs_before)))
-    return Path(problem, "observer", last, waits, whole(late.measurement / period))
+    return Path(problem, "observer", last, waits, seen)
 
 
 def model_block(path: Path) -> Block:
@@ -369,9 +369,8 @@ class Pairs:
 
     @property
     def _commands(self) -> Queue:
-        late, period = self.dead_time, self.problem.period
-        delay = late.measurement / period + self._delay
-        return Queue(late.input_cycles(self.problem.plant.inputs, period, delay))
+        late, period, names = self.dead_time, self.problem.period, self.problem.plant.inputs
+        return Queue(late.input_cycles(names, period, late.measurement / period + self._delay))
 
 
 def measured(signal: Signal) -> Signal:

@@ -24,7 +24,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
-from fpirhc.task.dead_time import whole
 from fpirhc.task.exogenous import Exogenous, really_known
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
@@ -239,7 +238,7 @@ def late_deformation(deformation: Deformation, problem: Problem) -> Deformation:
     lags, inputs, late = problem.moves.lag, tuple(problem.plant.inputs), problem.dead_time
     known = {
         "cycles": late.input_cycles(inputs, problem.period),
-        "measurement": (whole(late.measurement / problem.period),),
+        "measurement": (late.measurement_cycles(problem.period),),
         "lag": tuple(lags.get(name, 0.0) for name in inputs),
     }
     square = len(inputs) == len(problem.plant.controlled_names)

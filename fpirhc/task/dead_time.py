@@ -61,6 +61,10 @@ class DeadTime(Checked):
         """Return the dead times of some inputs, later by some cycles, to the nearest whole cycles."""
         return tuple(whole(self.inputs.get(name, 0.0) / period + later) for name in names)
 
+    def measurement_cycles(self, period: float) -> int:
+        """Return the dead time of the measurement, to the nearest whole cycle."""
+        return whole(self.measurement / period)
+
     def measurement_wait(self, period: float) -> Queue | None:
         """Return how long measurements wait; None where they do not."""
         return Queue(self.measurement / period) if self.measurement else None

@@ -160,14 +160,12 @@ def integral_delay(plant: Plant) -> tuple[Delay, ...]:
 
 def error_signal(plant: Plant) -> Signal:
     """Error to the target of every controlled coordinate."""
-    units = plant.followed
-    return vector("_target_error", plant.controlled_names, [units[c] for c in plant.controlled_names])
+    return vector("_target_error", plant.controlled_names, [plant.followed[c] for c in plant.controlled_names])
 
 
 def integral_signal(plant: Plant, name: str) -> Signal:
     """Integral of the error of every controlled coordinate, under the given name."""
-    every = plant.followed
-    units = [f"{every[c]} {plant.time_unit}" for c in plant.controlled_names]
+    units = [f"{plant.followed[c]} {plant.time_unit}" for c in plant.controlled_names]
     return vector(name, plant.controlled_names, units)
 
 

@@ -54,9 +54,8 @@ class LinearLaw(IntegralLaw):
 
     def gains_of(self, plant: Plant) -> list[tuple[float, ...]]:
         """Gains of every controlled coordinate; by default those of its order."""
-        orders = plant.response_orders.values()
-        of = {order: self.gains(order) for order in {*orders}}
-        return [of[order] for order in orders]
+        of = {order: self.gains(order) for order in {*plant.response_orders.values()}}
+        return [of[order] for order in plant.response_orders.values()]
 
     def check(self, plant: Plant, period: float) -> None:  # noqa: ARG002
         """Raise if modes do not decay in the steps of a map."""
