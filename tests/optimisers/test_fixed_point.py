@@ -107,11 +107,10 @@ def test_single_iterations_get_out_of_a_bad_plan():
     cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, deviation={"thrust": 1e-2})
     horizon, limits = fp.Horizon(stages=20, step=2e-2), fp.Limits(inputs={"thrust": (0.0, 40.0)})
     ocp, data = horizon_of(plant, reference, horizon, cost, limits)
-    first = np.array([2.0, 0.0])
+    one, first = fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([2.0, 0.0])
     best = fp.solve(ocp, fp.Ipopt(), first, data)
     # As after a plan for another model: nearly all thrust at once.
-    bad = np.linspace(40.0, 0.0, horizon.stages)
-    *_, (inputs, numbers) = repeated(fp.FixedPoint(iterations=1, tolerance=1e-6), ocp, data, first, 40, bad)
+    *_, (inputs, numbers) = repeated(one, ocp, data, first, 40, np.linspace(40.0, 0.0, horizon.stages))
     assert numbers[4] == fp.Status.OK
     np.testing.assert_allclose(inputs, best.inputs, atol=1e-4)
 
