@@ -71,7 +71,7 @@ for gain in (-1.0, -0.1, -0.05):
     print(f"gain {gain}: plain {plain:.2f} mm, model-referenced {referenced:.2f} mm")
 
 # %%
-# A stepper for the machine warns of such a controller before it runs.
+# A stepper of a real plant warns of such a controller before it runs.
 
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
