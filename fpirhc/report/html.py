@@ -124,7 +124,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
     illustrated = ["Contraction"] if context.get("contraction") else []  # lists that stand above their pictures
-    context |= {"in_full": IN_FULL, "policy": Markup(policy), "illustrated": illustrated}
+    context |= {"in_full": IN_FULL, "policy": Markup(policy), "illustrated": illustrated, "chart": context.get("chart")}
     return template.render(view=view, styles=styles, scripts=every, **context)
 
 

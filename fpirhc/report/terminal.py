@@ -94,7 +94,8 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         by_text: dict[str, list[str]] = {}
         for row in table.rows:
             by_text.setdefault(row.cells[k], []).append(row.cells[0])
-        if len(by_text) == 1 or (table.columns[k].left and table.names == 1):  # one name tells a row from others
+        alike, in_words = len(by_text) == 1 < len(table.rows), table.columns[k].left and table.names == 1
+        if alike or in_words:  # one name tells a row from others
             most = max(by_text, key=lambda text: len(by_text[text]))
             apart = [f"{text} ({', '.join(names)})" for text, names in by_text.items() if text != most]
             below.append(f"{table.columns[k].head}: {'; '.join([*apart, 'else ' * bool(apart) + (most or '-')])}")
@@ -102,8 +103,7 @@ def show_brief(table: Table, console: Console | None = None) -> None:
             kept.append(k)
         else:
             more.append(table.columns[k].head)
-    if kept:
-        show_table(table.of([*range(table.names), *kept]), console)
+    show_table(table.of([*range(table.names), *kept]), console) if kept else None
     if more:
         below.append(f"more columns by --verbose: {', '.join(more)}")
     for text in below:

@@ -42,11 +42,6 @@ class View:
         counts = Counter(str(outcome) for _, outcome in self.sentences[1:] if outcome not in IN_FULL)
         return ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
 
-    def html(self) -> str:
-        """Return the verdict and the first table for a notebook."""
-        notes = [*(text for text, _ in self.sentences), *(text for texts in self.lists.values() for text in texts)]
-        return replace(self.tables[0].narrow, title=self.study.title).html(notes)
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Study(ABC):
@@ -67,7 +62,9 @@ class Study(ABC):
 
     def _repr_html_(self) -> str:
         """Verdict and first table, for notebooks."""
-        return self.view.html()
+        view = self.view
+        notes = [*(text for text, _ in view.sentences), *(text for texts in view.lists.values() for text in texts)]
+        return replace(view.tables[0].narrow, title=self.title).html(notes)
 
 
 def circumstances(task: Task, controllers: Mapping[str, Controller], command: str, begin: float) -> dict[str, Any]:

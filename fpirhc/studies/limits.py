@@ -156,17 +156,19 @@ class Limits(Study):
         table: a row per controller and quantity: unit, holds (NaN where the problem as it stands fails), error (largest relative
             one there), fails (infinite where nothing does), and why.
         fails: relative error from which a run has failed.
+        tried: by quantity and controller the values that were tried, each with the largest relative error there.
     """
 
     table: pd.DataFrame
     fails: float
+    tried: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]
 
     @property
     def view(self) -> View:
         heads = ("controller", "what grows", "holds at", "error there", "fails at", "why")
         shown = Table(f"{self.problem}: where controllers fail", [Column(c, left=c == "why") for c in heads], names=2)
         rows: Iterator[Any] = self.table.itertuples()
-        borne: dict[str, list[str]] = {}
+        borne, grown, tables = dict[str, list[str]](), dict[str, tuple[str, int]](), [shown]
         for row in rows:
             share = row.unit.startswith("of ")  # of the range, of the samples
             holds, fails = (number(100 * value if share else value) for value in (row.holds, row.fails))
@@ -180,6 +182,7 @@ class Limits(Study):
             there = "" if math.isnan(row.error) else in_percent(row.error)
             shown.add([row.controller, what, holds, there, fails, row.why])
             if row.unit:
+                grown[row.quantity] = what, 100 if share else 1
                 borne.setdefault(f"{row.quantity}".capitalize(), []).append(f"{row.controller} fails {where}")
         grows = " ".join(f"{name.capitalize()}: {_GROWS[name]}." for name in dict.fromkeys(self.table.quantity))
         about = (
@@ -187,8 +190,15 @@ class Limits(Study):
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
             "reference's range. What holds may have a large error."
         )
+        for what, (head, times) in grown.items():
+            known = {name: dict(pairs) for name, pairs in self.tried[what].items()}
+            values = sorted(set.intersection(*map(set, known.values())))  # at which all controllers were tried
+            columns = [Column(text) for text in ("controller", *(number(times * v) for v in values))]
+            tables.append(Table(f"error at {head}", columns))
+            for name, errors in known.items():
+                tables[-1].add([name, *(in_percent(errors[v]) if math.isfinite(errors[v]) else "none" for v in values)])
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
-        return View(self, [(f"{q}: {', '.join(some)}.", None) for q, some in borne.items()], about, (shown,), facts)
+        return View(self, [(f"{q}: {', '.join(some)}.", None) for q, some in borne.items()], about, tables, facts)
 
 
 @checked_call
@@ -208,14 +218,11 @@ def limits(
 
         mismatch    f: exact = approximate (exact / approximate)^f of all parameters; 1 is the problem's own.
                     Where one is 0 or the signs differ: approximate + f (exact - approximate)
-        plants      percent within which exact parameters are drawn; none of 100 plants may fail
-        latency     commands arrive later, by whole cycles
         noise       deviation of white noise on every measured quantity, as a share of its range along the reference
-        lost        probability that a sample of a cycle is lost
 
     Args:
         task: a problem with its controllers.
-        over: names of quantities; None: all.
+        over: names of quantities: mismatch, plants, latency, noise, lost; None: all.
         controllers: names; None: all.
         fails: relative error from which a run has failed.
         seed: of noise, lost samples and plants, the same in all runs.
@@ -246,8 +253,9 @@ def limits(
                     kept.append(found)
                 if progress:
                     progress(name, done, len(wanted))
+    tried = {what: {name: rows[name, what].pop("tried", ()) for name in chosen} for what in wanted}
     table = pd.DataFrame([rows[name, what] for name in chosen for what in wanted])
-    return Limits(table=table, fails=fails, **circumstances(task, chosen, command, begin))
+    return Limits(table=table, fails=fails, tried=tried, **circumstances(task, chosen, command, begin))
 
 
 def _outside(problem: Problem, run: Run) -> float:
@@ -286,8 +294,8 @@ def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float)
         holds, ends = (math.nan, quantity.start) if start else bracket(failed, quantity)
     except FpirhcError as error:
         return {"unit": "", "holds": math.nan, "error": math.nan, "fails": math.nan, "why": f"not tried: {error}"}
-    largest, why = errors.get(holds, math.nan), reasons.get(ends, "")
-    return {"unit": quantity.unit, "holds": holds, "error": largest, "fails": ends, "why": why}
+    row = {"unit": quantity.unit, "holds": holds, "error": errors.get(holds, math.nan), "fails": ends}
+    return row | {"why": reasons.get(ends, ""), "tried": [*errors.items()]}
 
 
 def bracket(failed: Callable[[float], bool], of: Quantity) -> tuple[float, float]:

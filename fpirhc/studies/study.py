@@ -210,7 +210,8 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     aim, summary = result.figure, result.summary
     than, most = ("smaller", "smallest") if aim.sign > 0 else ("larger", "largest")
     for row in _rows(summary.iloc[1:]):
-        share = f"{than} in {row.better} of {row.variants}.{''.join(_moved(result, row.controller))}"
+        medians = f"in the median {aim.text(summary['median'].iloc[0])} -> {aim.text(row.median)}"
+        share = f"{than} in {row.better} of {row.variants}, {medians}.{''.join(_moved(result, row.controller))}"
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
         better = Outcome.DOUBTFUL if row.controller in result.chatter else Outcome.BETTER
         clear = better if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE

@@ -91,7 +91,11 @@ def tune(
     if trials < 1:
         raise InvalidValue(f"trials {trials}: expected at least 1")
     chosen = select(task, controllers) if controllers or not task.tuning else select(task, [*task.tuning])
-    check_spaces(task, chosen)
+    if lacking := [name for name in chosen if not task.tuning.get(name)]:
+        raise InvalidProblem(
+            f"problem '{task.name}': no search space for controller {', '.join(map(repr, lacking))}; add to its file, for example, "
+            f"tuning = {{{lacking[0]!r}: {{'deformation.gain': fpirhc.LogSpan(-2.0, -0.1)}}}}"
+        )
     check_gains(task, chosen)
     aim = objective(task.headline_metric if metric is None else metric, task.metrics, task.problem)
     variants = variants or Draws(1, seed=seed)
@@ -155,12 +159,3 @@ class _Search:
         """The mean cost of settings over the variants."""
         costs = [self.aim.cost(row) for row in self.runner.rows(replace(one, settings=own) for one in self.variants)]
         return sum(costs) / len(costs)
-
-
-def check_spaces(task: Task, chosen: Mapping[str, Controller]) -> None:
-    """Raise unless all these controllers have a search space."""
-    if lacking := [name for name in chosen if not task.tuning.get(name)]:
-        raise InvalidProblem(
-            f"problem '{task.name}': no search space for controller {', '.join(map(repr, lacking))}; add to its file, for example, "
-            f"tuning = {{{lacking[0]!r}: {{'deformation.gain': fpirhc.LogSpan(-2.0, -0.1)}}}}"
-        )

@@ -212,9 +212,6 @@ def test_what_counts_and_what_comes_first():
     assert told.startswith("metric 'mine' could not be computed (ZeroDivisionError: division by zero)")
 
 
-# --- Judged by hand -----------------------------------------------------------------------------------------------------
-
-
 def tank(**changes: Any) -> fp.Problem:
     """Y' = -2 y + u with u = 3 held: y = 1.5 - 0.5 exp(-2 t) from y = 1; the model's decay is 3 1/s too fast."""
     rate = fp.Parameter(5.0, 2.0, "1/s")
@@ -350,8 +347,7 @@ def test_a_hard_limit_that_is_left_is_red_for_every_controller(tmp_path, monkeyp
     first, fastest = found.findings[0], np.abs(found["law"].run["plant_state.x'"]).max()
     assert (str(first.outcome), first.ratios["x"] < 0.1) == ("hard limit left", True)
     assert first.text.startswith(f"law, law+FPI leave a limit: x' reaches {fastest:.4g} m/s, beyond")
-    assert (first.text.count("beyond"), "of the cycles of law. law+FPI against law" in first.text) == (1, True)
-    assert "law+FPI against law: hard limit left (rms error x " in first.text
+    assert "of the cycles of law. law+FPI against law: hard limit left (rms error x " in first.text
     assert main(["compare", "slow.py", "--no-compile", "-c", "plan", "law"]) == 0
     assert "law leaves a limit: x' reaches" in " ".join(capsys.readouterr().out.split())
     page = next(tmp_path.rglob("report.html")).read_text()
@@ -365,7 +361,7 @@ def test_a_response_without_noise_is_told_and_how_to_see_what_noise_costs():
     noisy = replace(one.problem, sensing=fp.Sensing({"q''": fp.Sensor(noise=fp.Noise(0.1))}))
     for problem, told in (one.problem, 1), (noisy, 0):
         said = " ".join(fp.compare(replace(one, problem=problem), seed=0, controllers=[*one.headline]).verdict)
-        assert said.count(f"without noise; how much it bears: fpirhc study {one.name} --limits noise -c RHC") == told
+        assert said.count(f"without noise; what noise costs: fpirhc study {one.name} --limits noise -c RHC") == told
 
 
 def test_the_time_of_a_cycle_is_the_median_beside_the_longest(monkeypatch):
