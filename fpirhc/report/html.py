@@ -174,7 +174,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
     first, colours = entries[0].run, colours_of(comparison)
     names, inputs = first.layout["error"].elements, first.layout["command"].elements
     limits = {one.name: one for e in entries for one in e.limits}
-    ends = {n: finite_alone([one.lower, one.upper]) for n, one in limits.items()}
+    ends = {n: finite_alone(_round([one.lower, one.upper])) for n, one in limits.items()}
     charts = [
         _chart(f"error of {c}", first.unit(f"error.{c}"), [(e.name, e.run[f"error.{c}"]) for e in entries], edges)
         for c in names

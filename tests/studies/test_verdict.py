@@ -157,6 +157,11 @@ def test_flags_turn_a_smaller_error_into_a_doubtful_one():
     said = {n: one.text.partition("). ")[2] or "none" for n, one in found.items()}
     assert {n: said[n] for n, (*_, words) in FLAGS.items() if words not in said[n]} == {}
     assert "is at a limit of its value (c: -10 to 10 1/s), where nothing adapts" in said["limit"]
+    odd = [m for m in tasks.two_mass.metrics if m.name != "contraction.measured"]
+    odd += [fp.Metric("contraction.measured", lambda _problem, _run: 1.25)]
+    for facts, falls in ((Facts(), Facts(0.1, 0.1)), True), ((Facts(), Facts(0.1, 0.9)), False):
+        [one] = findings(compared({"A": facts}, metrics=odd)).values()
+        assert ("Its measured contraction factor is 1.25, though errors fall" in one.text) == falls
     slow = {"limits": fp.Limits(inputs={"c": (-LIMIT, LIMIT)}, rates={"c": (-200.0, 200.0)})}
     [at_rate] = findings(compared({"A": SWINGS(2.0)}, slow)).values()
     assert "is at a limit of its rate (c: -200 to 200 1/s^2), where nothing adapts" in at_rate.text
@@ -371,8 +376,6 @@ def test_the_time_of_a_cycle_is_the_median_beside_the_longest(monkeypatch):
     found = fp.compare(tasks.van_der_pol, seed=0, controllers=["RHC"], compiled=False)
     assert found.view.tables[0].rows[0].cells[-2] == "2 / 40 / 40"
 
-
-# --- Plants that are not shipped ------------------------------------------------------------------------------------------
 
 ABROAD: dict[str, tuple[dict[str, Any], dict[str, str], dict[str, float]]] = {
     # 7e-6 becomes .39 mol/l in the only weighted output, though the jacket's error is smaller; its model is exact
