@@ -53,9 +53,7 @@ def _taken(name: str) -> str:
     installed = [p for p in sys.path if p and Path(p).resolve() != Path.cwd()]
     if name in sys.stdlib_module_names or PathFinder.find_spec(name, installed):
         return "a module of that name is installed, which the file would hide from everything beside it"
-    if name in shipped_problems():
-        return "a shipped problem has it (see 'fpirhc list')"
-    return ""
+    return "a shipped problem has it (see 'fpirhc list')" if name in shipped_problems() else ""
 
 
 def _usable(name: str) -> str:

@@ -229,9 +229,8 @@ class Sweep:
                 commands = self.functions.command.over(self._at_cycles(bounds))
                 drift = self.functions.drift.over(self._within(bounds)).distance(0.0).max(axis=1)
                 return Tube(follows, commands, np.abs(self.errors) + follows.error, self._factor(bounds), drift)
-            if not all(
-                np.max(v) < largest for v in (follows.deviation, follows.error, follows.responses.distance(0.0))
-            ):
+            sizes = follows.deviation, follows.error, follows.responses.distance(0.0)
+            if not all(np.max(size) < largest for size in sizes):
                 break
             bounds = follows.widened(bounds)
         where = self.chains.plant.state.elements[int(np.argmax(np.nan_to_num(bounds.deviation).max(axis=1)))]
@@ -270,9 +269,7 @@ class Sweep:
 
     def _factor(self, bounds: Bounds) -> float:
         matrices = self._factors(bounds)[0].transpose(2, 0, 1)
-        if not np.isfinite(matrices).all():
-            return math.inf
-        return float(np.abs(np.linalg.eigvals(matrices)).max())
+        return float(np.abs(np.linalg.eigvals(matrices)).max()) if np.isfinite(matrices).all() else math.inf
 
     def _follow(self, bounds: Bounds) -> Bounds:
         """The bounds that follow: the inequalities of the proof in their order."""

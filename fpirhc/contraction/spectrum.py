@@ -251,9 +251,8 @@ def identified_factor(
     if not smallest > _INDEPENDENT * np.linalg.norm(request_steps):
         return float("nan")
     fitted = np.linalg.lstsq(excitation, answer, rcond=None)[0].T
-    return predicted_factor(
-        np.linalg.eigvals(fitted if weights is None else fitted @ np.array(weights)), effective_gain
-    )
+    weighted = fitted if weights is None else fitted @ np.array(weights)
+    return predicted_factor(np.linalg.eigvals(weighted), effective_gain)
 
 
 def _without_trend(rows: Array) -> Array:

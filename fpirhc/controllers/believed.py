@@ -345,9 +345,7 @@ class Pairs:
         kept += [(self._commands, self.problem.plant.input, self.problem.inputs_before)]
         kept += [(self._states, self.problem.plant.output, self.problem.start_output)] * self.with_outputs
         places = zip(("pair_states", "pair_commands", "pair_outputs"), kept, strict=False)
-        return tuple(
-            m for name, (queue, one, start) in places for m in queue.memory(name, one.elements, start.tolist())
-        )
+        return tuple(m for n, (queue, of, start) in places for m in queue.memory(n, of.elements, start.tolist()))
 
     def pair(self, s: Signals, newest: Expression) -> tuple[Expression, Expression, dict[str, Expression]]:
         """Return state and command of the response, and what is remembered."""

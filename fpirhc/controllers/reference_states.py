@@ -158,9 +158,7 @@ def request_of_plans(problem: Problem) -> RequestChange:
             f"the scale of the deformation cannot be chosen: input '{free[0]}' has no finite limits, so the desired response "
             "may jump by any amount; give the deformation its scale (Sigmoid(scale=...)), or Limits(inputs=...)"
         )
-    at_start = np.asarray(
-        plant.equations.input_gain(problem.start_state, (lower + upper) / 2, plant.approximate).full()
-    )
+    at_start = plant.equations.input_gain(problem.start_state, (lower + upper) / 2, plant.approximate).full()
     return RequestChange(float(np.linalg.norm(np.abs(at_start) @ (upper - lower))), sudden=True)
 
 

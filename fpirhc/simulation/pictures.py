@@ -124,9 +124,7 @@ class OverTime(Picture):
                 axis.axhline(level, color="#777777", lw=0.8, ls="--")
             drawing.caption_axes(axis, "", up)
         axes[-1].set_xlabel(drawing.time_label(next(iter(runs.values()))))
-        axes[0].legend(
-            fontsize=7, ncols=3, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0)
-        )  # it hides no line
+        axes[0].legend(fontsize=7, ncols=3, frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0))  # above lines
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,9 +373,8 @@ class Planar(Picture):
         for one in self._shapes(x, p):
             numbers = [v for point in one.points for v in point] + ([] if one.radius is None else [one.radius])
             if any(len(point) != 2 for point in one.points) or any(ca.SX(v).numel() != 1 for v in numbers):
-                raise InvalidValue(
-                    f"Planar({self.title!r}, shapes=...): expected points (x, y) of scalars, got {one!r}"
-                )
+                what = f"Planar({self.title!r}, shapes=...)"
+                raise InvalidValue(f"{what}: expected points (x, y) of scalars, got {one!r}")
             column += numbers
         return ca.vertcat(*column)
 

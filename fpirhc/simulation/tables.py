@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import casadi as ca
 import numpy as np
 
@@ -62,9 +60,7 @@ def by_place(problem: Problem, disturbance: Expression) -> dict[str, Expression]
 def added(problem: Problem, disturbance: Expression) -> tuple[Expression, Expression]:
     """Return what disturbances add to y, y', ... below the responses, and to the controlled responses."""
     plant, orders = problem.plant, problem.disturbed_outputs
-    values: Mapping[str, Expression] = dict(
-        zip(disturbance_signal(problem).elements, ca.vertsplit(disturbance), strict=True)
-    )
-    own = {e: v for e, v in values.items() if e.rstrip("'") in orders}
+    values = zip(disturbance_signal(problem).elements, ca.vertsplit(disturbance), strict=True)
+    own = {e: v for e, v in values if e.rstrip("'") in orders}
     below = [own.get(e, 0) for e in plant.output.elements]
     return ca.vertcat(*below), ca.vertcat(*(own.get(n + "'" * orders.get(n, 0), 0) for n in plant.controlled_names))

@@ -237,9 +237,8 @@ def limits(
     begin, chosen = time.perf_counter(), select(task, controllers)
     check_gains(task, chosen)
     wanted = list(over or QUANTITIES)
-    for name in wanted:
-        if name not in QUANTITIES:
-            raise InvalidName(f"quantity '{name}' is unknown.{nearest(name, QUANTITIES)}")
+    for name in [one for one in wanted if one not in QUANTITIES]:
+        raise InvalidName(f"quantity '{name}' is unknown.{nearest(name, QUANTITIES)}")
     metrics = [*(m for m in task.metrics if m.name == "rms_error"), Metric("outside", _outside)]
     header = header_of(replace(task, controllers=chosen), {"kind": "limits", "fails": fails, "seed": seed}, metrics)
     with Kept(folder and folder / "limits.jsonl", header) as kept:

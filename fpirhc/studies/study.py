@@ -148,9 +148,8 @@ def _chatter(table: pd.DataFrame, task: Task) -> dict[str, dict[str, float]]:
 
 def summarised(table: pd.DataFrame, aim: Objective, also: Sequence[str] = ()) -> pd.DataFrame:
     """Return a row per controller, see `VariantStudy`. A run that failed is worse than every other one."""
-    values = table.assign(
-        value=[aim.value(dict(zip(map(str, table), row, strict=True))) for row in table.itertuples(index=False)]
-    )
+    every = (dict(zip(map(str, table), row, strict=True)) for row in table.itertuples(index=False))
+    values = table.assign(value=[*map(aim.value, every)])
     wide = values.pivot(index="variant", columns="controller", values="value")
     wide = wide.loc[[*dict.fromkeys(table.variant)], [*dict.fromkeys(table.controller)]]
     failures = (table.outcome != "finished").groupby(table.controller).sum()

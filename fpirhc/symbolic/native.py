@@ -242,9 +242,7 @@ def _made(command: Sequence[str], place: Path, work: str) -> None:
         made = Path(near) / place.name
         process = _run([*command, "-o", str(made)])
         if process.returncode != 0 or not made.is_file():
-            lines = process.stderr.replace(work + os.sep, "").strip().splitlines() or [
-                f"exit code {process.returncode}"
-            ]
+            lines = [*process.stderr.replace(work + os.sep, "").strip().splitlines(), f"exit code {process.returncode}"]
             # The line that names the error, not the line that names the function around it.
             message = next((line for line in lines if "error" in line or "undefined" in line), lines[0])
             raise CompileError(f"the C compiler '{command[0]}' failed: {message}")

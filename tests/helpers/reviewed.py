@@ -34,12 +34,8 @@ def answers(problem: fp.Problem, controller: Controller | None = None, mismatch:
 
 def cart(limits: fp.Limits, reference: Any, exact: float, **settings: Any) -> fp.Problem:
     """M x'' = F, the model's mass 1 kg."""
-    plant = fp.Plant(
-        coordinates={"x": "m"},
-        inputs={"F": "N"},
-        response=lambda q, v, u, p: {"x": u.F / p.mass},
-        parameters={"mass": fp.Parameter(1.0, exact, "kg")},
-    )
+    mass = {"mass": fp.Parameter(1.0, exact, "kg")}
+    plant = fp.Plant({"x": "m"}, {"F": "N"}, mass, lambda q, v, u, p: {"x": u.F / p.mass})
     return fp.Problem(plant, fp.Trajectory(reference), period=1e-2, limits=limits, **settings)
 
 
@@ -72,9 +68,7 @@ def limited_rate() -> fp.Problem:
         fp.Limits(inputs={"F": (-20.0, 20.0)}, rates={"F": (-20.0, 20.0)}),
         lambda t: {"x": 1 - ca.cos(2 * t)},
         2.0,
-        start={"x": 0.5},
-        duration=6.0,
-        measure_from=2.0,
+        **{"start": {"x": 0.5}, "duration": 6.0, "measure_from": 2.0},
         horizon=fp.Horizon(stages=20, step=0.05),
         cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, rate={"F": 1e-3}),
     )
@@ -82,20 +76,13 @@ def limited_rate() -> fp.Problem:
 
 def turntable(reference: Callable[[Any], Any]) -> fp.Problem:
     """It follows a bearing that turns on with 1 rad/s."""
-    plant = fp.Plant(
-        coordinates={"yaw": "rad"},
-        inputs={"torque": "N m"},
-        response=lambda q, v, u, p: {"yaw": (u.torque - p.friction * v.yaw) / p.inertia},
-        parameters={"inertia": fp.Parameter(0.3, 0.4, "kg m^2"), "friction": fp.Parameter(0.05, 0.1, "N m s")},
-    )
+    known = {"inertia": fp.Parameter(0.3, 0.4, "kg m^2"), "friction": fp.Parameter(0.05, 0.1, "N m s")}
+    turns = lambda q, v, u, p: {"yaw": (u.torque - p.friction * v.yaw) / p.inertia}  # noqa: E731
     return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"yaw": reference(t)}),
-        start={"yaw": 0.0, "yaw'": 1.0},
-        period=5e-3,
-        duration=8.0,
-        measure_from=1.0,
-        limits=fp.Limits(inputs={"torque": (-3.0, 3.0)}),
+        fp.Plant({"yaw": "rad"}, {"torque": "N m"}, known, turns),
+        fp.Trajectory(lambda t: {"yaw": reference(t)}),
+        {"yaw": 0.0, "yaw'": 1.0},
+        **{"period": 5e-3, "duration": 8.0, "measure_from": 1.0, "limits": fp.Limits({"torque": (-3.0, 3.0)})},
         horizon=fp.Horizon(stages=20, step=2e-2),
         cost=fp.Quadratic(states={"yaw": 100.0, "yaw'": 1.0}, deviation={"torque": 1e-2}),
     )
@@ -103,22 +90,14 @@ def turntable(reference: Callable[[Any], Any]) -> fp.Problem:
 
 def ball(start: float) -> fp.Problem:
     """A ball under a magnet of which the current is commanded."""
-    plant = fp.Plant(
-        coordinates={"gap": "m"},
-        inputs={"current": "A"},
-        response=lambda q, v, u, p: {"gap": 9.81 - p.inductance / (2 * 0.06) * (u.current / q.gap) ** 2},
-        parameters={"inductance": fp.Parameter(2.0e-4, 1.4e-4, "H m")},
-    )
+    falls = lambda q, v, u, p: {"gap": 9.81 - p.inductance / (2 * 0.06) * (u.current / q.gap) ** 2}  # noqa: E731
     return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"gap": 0.009 + 0 * t}),
-        start={"gap": start},
-        period=1e-3,
-        duration=1.0,
-        limits=fp.Limits(inputs={"current": (0.0, 3.0)}),
+        fp.Plant({"gap": "m"}, {"current": "A"}, {"inductance": fp.Parameter(2.0e-4, 1.4e-4, "H m")}, falls),
+        fp.Trajectory(lambda t: {"gap": 0.009 + 0 * t}),
+        {"gap": start},
+        **{"period": 1e-3, "duration": 1.0, "measure_from": 0.5, "limits": fp.Limits({"current": (0.0, 3.0)})},
         horizon=fp.Horizon(stages=40, step=1e-2),
         cost=fp.Quadratic(states={"gap": 1e6, "gap'": 1e2}, deviation={"current": 1.0}),
-        measure_from=0.5,
     )
 
 
@@ -129,10 +108,7 @@ def biased(size: float) -> fp.Problem:
         fp.Limits(inputs={"F": (-20.0, 20.0)}),
         lambda t: {"x": 0.5 * ca.sin(2 * t)},
         1.2,
-        start={"x": 0.0, "x'": 1.0},
-        duration=6.0,
-        measure_from=2.0,
-        sensing=sensing,
+        **{"start": {"x": 0.0, "x'": 1.0}, "duration": 6.0, "measure_from": 2.0, "sensing": sensing},
         horizon=fp.Horizon(stages=20, step=0.05),
         cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}, deviation={"F": 1e-3}),
     )
@@ -162,9 +138,7 @@ def servo() -> fp.Problem:
         plant=plant,
         reference=fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(0.8 * t)}),
         start={"load": 0.0, "swing": 0.4, "motor": 0.0, "turn": 8.0},
-        period=0.01,
-        duration=10.0,
-        measure_from=5.0,
+        **{"period": 0.01, "duration": 10.0, "measure_from": 5.0},
         limits=fp.Limits(inputs={"V": (-220.0, 220.0)}),
         horizon=fp.Horizon(stages=20, step=0.1),
         cost=fp.Quadratic(outputs={"angle": 1e3, "angle'": 1.0}, rate={"V": 1e-4}),

@@ -17,13 +17,9 @@ def asked(problem: fp.Problem, deformation) -> Any:
 
 def lagging() -> fp.Reality:
     """A mass on a spring behind an actuator: tau du/dt = u_c - u."""
-    behind = fp.Plant(
-        coordinates={"q": "m", "acting": "N"},
-        inputs={"u": "N"},
-        order={"q": 2, "acting": 1},
-        parameters={"m": fp.Parameter(1.5, 1.0, "kg")},
-        response=lambda q, v, u, p: {"q": (q.acting - 10 * q.q) / p.m, "acting": (u.u - q.acting) / LAG},
-    )
+    known, order = {"m": fp.Parameter(1.5, 1.0, "kg")}, {"q": 2, "acting": 1}
+    moves = lambda q, v, u, p: {"q": (q.acting - 10 * q.q) / p.m, "acting": (u.u - q.acting) / LAG}  # noqa: E731
+    behind = fp.Plant({"q": "m", "acting": "N"}, {"u": "N"}, known, moves, order=order)
     return fp.Reality(behind, start={"q": 0.0, "q'": 1.5, "acting": 0.0})
 
 

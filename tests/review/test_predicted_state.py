@@ -16,21 +16,10 @@ KP, KD = RATE**2, 2 * RATE
 
 def mass(late: float) -> fp.Problem:
     """A mass that a force pushes of which the model knows nothing, to be held at rest."""
-    plant = fp.Plant(
-        coordinates={"q": "m"},
-        inputs={"u": "m/s^2"},
-        parameters={"w": fp.Parameter(0.0, FORCE, "m/s^2")},
-        response=lambda q, v, u, p: {"q": u.u - p.w},
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(0 * t)}),
-        start={"q": 0.1},
-        period=PERIOD,
-        duration=12.0,
-        measure_from=10.0,
-        dead_time=fp.DeadTime(inputs={"u": late}),
-    )
+    force = {"w": fp.Parameter(0.0, FORCE, "m/s^2")}
+    plant = fp.Plant({"q": "m"}, {"u": "m/s^2"}, force, lambda q, v, u, p: {"q": u.u - p.w})
+    rest, lasts = fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(0 * t)}), {"duration": 12.0, "measure_from": 10.0}
+    return fp.Problem(plant, rest, {"q": 0.1}, PERIOD, **lasts, dead_time=fp.DeadTime(inputs={"u": late}))
 
 
 def law(late: float, form: Deformation | None = None, **by: Any) -> Controller:

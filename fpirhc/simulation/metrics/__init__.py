@@ -116,9 +116,8 @@ class Metric(Checked):
             return {}
         if isinstance(result, Mapping) != (self.by is not None):
             expected = "one number" if self.by is None else f"a mapping with a number for every {self.by}"
-            raise InvalidValue(
-                f"metric '{self.name}': its function must return {expected}, got {type(result).__name__}"
-            )
+            got = type(result).__name__
+            raise InvalidValue(f"metric '{self.name}': its function must return {expected}, got {got}")
         items = result.items() if isinstance(result, Mapping) else [("", result)]
         return {str(element): self._number(value) for element, value in items}
 
@@ -296,9 +295,7 @@ class Column:
 
     def text(self, value: float | None, *, missing: str, none: str) -> str:
         """Return a number as text; `missing` for None, `none` for NaN."""
-        if value is None:
-            return missing
-        return none if math.isnan(value) else self.metric.text(value)
+        return missing if value is None else none if math.isnan(value) else self.metric.text(value)
 
     def best(self, values: Iterable[float | None]) -> float | None:
         """Return the best number; None where no direction is better or there is no number."""

@@ -116,9 +116,7 @@ def _times(unit: str, time: str) -> str:
 
 def _of_whole_runs(function: Callable[[Problem, Run], float], problem: Problem, run: Run) -> float:
     """NaN for a run that ended early or before it is measured."""
-    if run.stop is not None or not measured_cycles(problem, run).any():
-        return float("nan")
-    return function(problem, run)
+    return function(problem, run) if run.stop is None and measured_cycles(problem, run).any() else float("nan")
 
 
 def _unit(problem: Problem, what: What) -> str:
