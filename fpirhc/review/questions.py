@@ -17,29 +17,27 @@ from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
 from fpirhc.plant.chain import zero_dynamics
-from fpirhc.plant.motion import with_space
 from fpirhc.review.experiments import BUSY, GOOD, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, with_gain
-from fpirhc.simulation.ranges import TOLERANCE, Followed, hard_limits
+from fpirhc.simulation.ranges import TOLERANCE, apart, hard_limits, misplaced, slip
 from fpirhc.simulation.trials import ModelAsPlant, spoils
 from fpirhc.status import Status
 from fpirhc.summary import written_out
 from fpirhc.symbolic.dotted import paths_to
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.symbolic.expression import TINY
-from fpirhc.task.problem import Problem
 
-INSTANTS = 2000  # of the reference
-MINOR, ROUNDING = 1e-3, 1e-6  # added error as a share of the largest, and of the task
+MINOR, ROUNDING, TIMID = 1e-3, 1e-6, 10.0  # added error, of the largest, and of the task; times it at a calm gain
 NEAR, FAR, BAD = 0.2, 0.5, 1.0  # errors as shares of the task: it follows, it does not, and adaptation shows nothing
 MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loop; push that latency leaves; of a limit
-TIMID = 10.0  # times the error at a gain that is as calm
 CALM, CHATTER, RINGING = 0.1, 0.01, 0.9  # step of a command a cycle: mean, rms from noise; what a swing leaves
 SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
+TURNED = "Mend the sign of the inputs in the model: with those of the plant turned it follows."
 GROWS = "a push leaves {largest_factor:5} of itself a cycle later"
-MOVES = "commands change by {mean_step:%} of what they cover a cycle"
+MOVES = "commands change by {mean_step:%} of their range in a cycle"
 RINGS = "it swings with a period of {period} {time}, and a swing leaves {swing:%} of the last"
+BEST = "| {error_without:%} without adaptation| {error_recommended:%} at {recommended_gain:4}"
 BUSIER = "the total variation of {of} is {movement:r}| {movement_without:r} without adaptation"
-RESERVE = "the relative error is {error:%}| {error_at_twice:%} at twice the gain| {error_without:%} without adaptation"
+RESERVE = "the relative error is {error:%}| {error_at_twice:%} at twice the gain" + BEST
 SAID = {1.0: "error", -1.0: "error_turned", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
 Numbers = Mapping[str, float]
 
@@ -88,24 +86,9 @@ def _posed(case: Case) -> Fact | None:
     return Fact(verdict, {"share_finite": finite.mean()}, root=True) if len(finite) else None
 
 
-def misplaced(problem: Problem) -> list[str]:
-    """Return which states start, or have a reference, outside their hard limits, in words."""
-    plant, times, found = problem.plant, np.linspace(0.0, problem.duration, INSTANTS), list[str]()
-    along = problem.reference.function(plant).map(INSTANTS)(times[None, :])[0].full()
-    for at, (name, place) in enumerate(zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)):
-        low, high = problem.limits.states.get(name, (-np.inf, np.inf))
-        unit, wanted = with_space(plant.state.units[at]), along[place] if place >= 0 else np.zeros(0)
-        for what, values in ("start", problem.start_state[[at]]), ("reference", wanted[np.isfinite(wanted)]):
-            beyond = Followed(name, unit, low, high, values).beyond
-            if name not in problem.limits.prices and beyond.max(initial=0.0) > TOLERANCE:
-                worst = f"{values[beyond.argmax()]:.4g}{unit}"
-                found.append(f"the {what} of {name} is {worst}, outside its hard limits of {low:g} and {high:g}{unit}")
-    return found
-
-
 def _inside(case: Case) -> Fact | None:
-    found, verdict = misplaced(case.problem), Verdict.NO
-    return Fact(verdict, {"outside": len(found)}, "; ".join(found), root=True) if found else None
+    found = misplaced(case.problem)
+    return Fact(Verdict.NO, {"outside": len(found)}, "; ".join(found), root=True) if found else None
 
 
 def _ranges(case: Case) -> Fact | None:
@@ -124,16 +107,17 @@ def _follows(case: Case) -> Fact:
     column, by = errors[bench.first(len(errors)) :, case.problem.judged_names.index(name)], predictor(bench.controller)
     offset = by is not None and not by.residual_time and abs(column.mean()) > OFFSET * rms and 0.01 < share < math.inf
     numbers |= {"mean_error": abs(column.mean())} if offset else {}  # of a wrong model in the prediction
-    return Fact(Verdict.NO if far else Verdict.CAUTION if offset or share > NEAR else Verdict.YES, numbers, name)
+    turned = bool(share > BAD and bench.share(bench.run(gain=-np.ones(len(case.problem.plant.inputs)))) <= NEAR)
+    verdict = Verdict.NO if far else Verdict.CAUTION if offset or share > NEAR else Verdict.YES
+    return Fact(verdict, numbers, name, f"{TURNED} {slip(case.problem)}".strip() * turned, root=turned)
 
 
 def _saturates(case: Case) -> Fact | None:
-    bench, run, plant = case.bench, case.bench.nominal, case.problem.plant
+    bench, run, plant, drawn = case.bench, case.bench.nominal, case.problem.plant, case.problem.sensing.drawn
     limits, names = np.array(bench.problem.limits.input_bounds(plant)), list(plant.inputs)
     if not run.cycles or not np.isfinite(limits).any():
         return None
-
-    stuck = max(bench.draws, key=bench.held) if bench.problem.sensing.drawn else run
+    stuck, calm = (max(bench.draws, key=bench.held), bench.held(bench.quiet)) if drawn else (run, math.inf)
     held, states, plain = bench.held(stuck), run["plant_state"][bench.first(run.cycles) :], case.plain
     stands = bench.at_limits(stuck)[bench.first(stuck.cycles) :].mean(axis=0)
     wanted = [needed_commands(case.problem, states, exact=one) for one in (False, case.problem.reality is None)]
@@ -142,29 +126,30 @@ def _saturates(case: Case) -> Fact | None:
     with np.errstate(divide="ignore", invalid="ignore"):
         shares = np.where(asked == 0, 0.0, asked / np.where(asked < 0, *limits))
         outside = beyond > ROUNDING * np.abs(asked).max(axis=0)
-        needs = np.where(outside, 1 + 2 * beyond / (limits[1] - limits[0]), shares).max(axis=0)
+        size = np.where(np.isfinite(limits).all(axis=0), limits[1] - limits[0], 2 * np.abs(limits).min(axis=0))
+        needs = np.where(outside, 1 + 2 * beyond / np.where(size > 0, size, np.inf), shares).max(axis=0)
     at = int((stands if held > SATURATED else np.nan_to_num(needs)).argmax())
-    numbers = {"at_a_limit": held}
+    numbers = {"at_a_limit": held} | ({"at_a_limit_without_noise": calm} if drawn else {})
     if np.isfinite(needs[at]) and not plant.equations.hidden:
         least, most, ends = asked[:, at].min(), asked[:, at].max(), limits[:, at]
         numbers |= {"needed": needs[at]}
         numbers |= {"needed_least": least, "needed_most": most} if most > least else {"needed_always": most}
         numbers |= {"lower": ends[0], "upper": ends[1]} if np.isfinite(ends).all() else {}
     once = max(np.abs(np.diff(one[:, at])).mean() for one in wanted) / case.problem.period
-    moves, short = plain.moves(plain.nominal)[at], numbers.get("needed", 0.0) > ROOM
+    moves, short = plain.moves(plain.nominal)[at], 2 * calm >= held and numbers.get("needed", 0.0) > ROOM
     room = "needed" in numbers and np.abs(asked[:, at]).max() <= ROOM * np.abs(limits[:, at]).max()  # by its size alone
     swings = plain.controller.planner is not None and room and moves > 4 * once
     swings = swings and min(held, plain.held(plain.nominal)) > SATURATED  # by itself
     numbers |= {"period": 2 * plain.span[at] / moves} if swings else {}  # of a square wave
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
     verdict = Verdict.NO if lost or swings else Verdict.CAUTION if held > SATURATED else Verdict.YES
-    ways = "model Predicted weight" if swings else "model speed limits" * bool(short)
+    ways = "model Predicted weight" if swings else "model sign speed limits" * bool(short)
     return Fact(verdict, numbers, names[at], ways=ways, root=bool(swings or short))
 
 
 def _returns(case: Case) -> Fact:
     bench = case.bench
-    require(bench.held(bench.nominal) <= MOSTLY, "A command at its limits is no loop: see whether it follows.")
+    require(bench.held(bench.nominal) <= MOSTLY, "Commands stand at limits, so a push shows nothing: mend that first.")
     back, far, step = bench.back, bench.along[0], bench.steps(bench.start)
     worst, stuck = max(one.factor for one in bench.along), max(back.held, far.held)
     calm = not (rings := back.swing > RINGING and back.left > LEFT) and back.left <= GOOD and worst < 1 and step <= CALM
@@ -173,9 +158,9 @@ def _returns(case: Case) -> Fact:
     numbers |= {"time_constant": -case.problem.period / math.log(back.factor)} if 0 < back.factor < 1 else {}
     numbers |= {"swing": back.swing, "period": back.cycles * case.problem.period} if back.swing else {}
     numbers |= {"mean_step": step} | ({"at_a_limit": stuck} if stuck else {})
-    says = GROWS if worst >= 1 else MOVES if step > CALM else RINGS * rings
+    says = GROWS * (worst >= 1) or MOVES * (step > CALM) if back.left <= GOOD else ""
     limited = stuck > max(SATURATED, bench.held(bench.start))
-    return Fact(verdict, numbers, ways="limits" * limited, says=says * (back.left <= GOOD))
+    return Fact(verdict, numbers, ways="limits" * limited, says=says or RINGS * rings)
 
 
 def _plans(case: Case) -> Fact | None:
@@ -300,19 +285,7 @@ def set_gain(controller: Controller, times: float) -> str:
     """What to write for so many times the gain: by a path that `--set` takes, where the gain is a number of its own."""
     name, value = own_gain(controller.deformation)
     paths = (path.replace(".map", "") for path in paths_to(name, controller, 9) if "deformation." in path)
-    return f"Set {' and '.join(paths) or f'the {name}'} to {times * value:.4g}."
-
-
-def apart(problem: Problem) -> dict[str, float]:
-    """How many times the plant's value the model's is, of parameters that are apart by a power of ten."""
-    known = problem.plant.parameters.items() if problem.reality is None else ()
-    ratios = {n: p.approximate / p.exact for n, p in known if not p.outside and p.exact}
-    return {n: ratio for n, ratio in ratios.items() if ratio and not 0.1 < abs(ratio) < 10}
-
-
-def slips(problem: Problem) -> str:
-    """The same in words."""
-    return ", ".join(f"{name} is {written_out(ratio)} times the plant's" for name, ratio in apart(problem).items())
+    return f"Set {' and '.join(paths) or f'the {name}'} to {times * value:.4g}.{' The present sign is wrong.' * bool(times < 0)}"
 
 
 def recommended_gain(case: Case) -> Fact:
@@ -367,8 +340,7 @@ def gain_by_run(case: Case) -> Fact:
         verdict = Verdict.NO if best or found.alone <= GOOD else Verdict.UNKNOWN
     elif calm and ratio > (WORSE if reserve and not spare else LITTLE):
         best = 1.0
-    lost = "a push grows" if own.admitted else "it is refused"
-    lost += "| the relative error is {error:%}| {error_without:%} without adaptation"
+    lost = f"{'a push grows' if own.admitted else 'it is refused'}| the relative error is {{error:%}}{BEST}"
     says = lost * (own.error < found.alone) if not right else "" if not poor else RESERVE if calm else BUSIER
     if own.turned:  # also where a turned gain works
         return Fact(Verdict.NO, numbers, of, f"{own.turned}.")
@@ -430,37 +402,37 @@ QUESTIONS = (
              "iterations the relative error is {error_with_more_iterations:%} in place of {error:%}", "Give the optimiser more "
              "iterations, or a smaller tolerance, before anything else."),
     Question("input_limits", "Do the input limits fit the task?", _saturates, "the loop swings with a period of {period} "
-             "{time} without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| and the reference "
-             "needs {needed_least} to {needed_most:u} of {of}| and the reference needs {needed_always:u} of {of}| whose limits are "
-             "{lower} to {upper:u}", "", "gain rate weight window Predicted limits speed"),
-    Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}| {error_without:%} without "
-             "adaptation| {error_recommended:%} at {recommended_gain:4}", "No gain that was run helps, is calm, and has reserve.",
-             "filter form lag Predicted window sensors without", "adaptive"),
+             "{time} without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| in "
+             "{at_a_limit_without_noise:%} without noise| and the reference needs {needed_least} to {needed_most:u} of {of}| and "
+             "the reference needs {needed_always:u} of {of}| whose limits are {lower} to {upper:u}", "",
+             "gain rate weight estimator Predicted limits speed"),
+    Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}" + BEST, "No gain that was "
+             "run helps, is calm, and has reserve.", "filter form lag Predicted estimator sensors without", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
-             "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain lag without rate weight window "
+             "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain lag without rate weight estimator "
              "Predicted rival limits speed"),
     Question("returns", "Does it come back from a push?", _returns, "{left:%} of the push is left after {pushed}", "",
-             "model gain lag rate weight window Predicted form without limits"),
+             "model gain lag rate weight estimator Predicted form without limits"),
     Question("horizon", "Is the horizon long enough?", _horizon, "the relative error is {error:%}| "
              "{error_with_twice_the_horizon:%} with twice the stages", "Give the horizon {recommended_stages:.0f} stages."),
     Question("box", "Does it come back for every plant in the range of the parameters?", _box, "{share_that_come_back:%} of "
              "{plants} plants do", "Narrow the range of the parameters.", "gain rate limits without", of="loop"),
     Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it bears {least} to {most} times "
-             "their gain", "", "gain form rate weight window", of="loop"),
+             "their gain", "", "gain form rate weight estimator", of="loop"),
     Question("latency", "Does it bear half a cycle of latency?", _latency, "the relative error is then {error:%}| "
              "{error_without:%} without adaptation| {left:%} of a push is left", "Run it where no command is late.",
-             "gain form rate weight window", of="loop"),
+             "gain form rate weight estimator", of="loop"),
     Question("limits", "Do states, rates and paths keep their limits?", _left, "a limit of {of} is left in {share_of_cycles:%} of "
              "the cycles| by at most {excess:u}", "A command keeps limits of inputs and their rates alone: leave room to the "
              "others.", "gain rate weight speed"),
     Question("inner", "Are the zero dynamics stable?", _inner, "the largest real part is {rate_with_outputs_held} 1/{time}",
              "States without a task go off: weigh them in the cost, or control another output."),
-    Question("noise", "Is the chatter from noise small?", _noise, "noise moves {of} by {rms_step:%} of what it covers a cycle| "
+    Question("noise", "Is the chatter from noise small?", _noise, "noise moves {of} by {rms_step:%} of its range in a cycle| "
              "its total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with less "
-             "noise.", "gain filter window rate weight"),
+             "noise.", "gain filter estimator rate weight"),
     Question("model", "Would it do little harm if the model were right?", _model, "the rms error of {of} is then "
              "{error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides, where it may cure more.",
-             "form window gain without", "adaptive"),
+             "form estimator gain without", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "the rms error of {of} is {error_without:u} "
-             "without adaptation| {error_with:u} with it", "", "gain form lag window Predicted sensors without", "adaptive"),
+             "without adaptation| {error_with:u} with it", "", "gain form lag estimator Predicted sensors without", "adaptive"),
 )  # fmt: skip

@@ -16,14 +16,14 @@ from fpirhc.horizon.cost import view_of
 from fpirhc.plant.motion import with_space
 from fpirhc.simulation.run import Run
 from fpirhc.status import STOPPED, Status
-from fpirhc.summary import in_percent
+from fpirhc.summary import in_percent, written_out
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Layout
 from fpirhc.task.problem import Problem
 
 _RUNAWAY = 1e6  # times the largest value of the reference, or of the start
-_INSTANTS = 200  # of the reference
+_INSTANTS, _MANY = 200, 2000  # of the reference
 _MOTIONS: Latest[np.ndarray] = Latest(4)  # of references
 _ERRORS = ("true_error", "error")  # where they are logged: the first that a run has
 # where the moving state is logged: the first that a run has
@@ -200,3 +200,30 @@ def limits_left(limits: Sequence[Followed]) -> tuple[Followed, ...]:
     """Return those limits that are left by more than the tolerance, the worst first."""
     worst = {one: float(one.beyond.max(initial=0.0)) for one in limits}
     return tuple(sorted((one for one in worst if worst[one] > TOLERANCE), key=lambda one: -worst[one]))
+
+
+def misplaced(problem: Problem) -> list[str]:
+    """Return which states start, or have a reference, outside their hard limits, in words."""
+    plant, times, found = problem.plant, np.linspace(0.0, problem.duration, _MANY), list[str]()
+    along = problem.reference.function(plant).map(_MANY)(times[None, :])[0].full()
+    for at, (name, place) in enumerate(zip(plant.state.elements, plant.equations.known_by_outputs, strict=True)):
+        low, high = problem.limits.states.get(name, (-np.inf, np.inf))
+        unit, wanted = with_space(plant.state.units[at]), along[place] if place >= 0 else np.zeros(0)
+        for what, values in ("start", problem.start_state[[at]]), ("reference", wanted[np.isfinite(wanted)]):
+            beyond = Followed(name, unit, low, high, values).beyond
+            if name not in problem.limits.prices and beyond.max(initial=0.0) > TOLERANCE:
+                worst = f"{values[beyond.argmax()]:.4g}{unit}"
+                found.append(f"the {what} of {name} is {worst}, outside its hard limits of {low:g} and {high:g}{unit}")
+    return found
+
+
+def apart(problem: Problem) -> dict[str, float]:
+    """How many times the plant's value the model's is, of parameters that are apart by a power of ten or by sign."""
+    known = {n: p.approximate / p.exact for n, p in problem.plant.parameters.items() if p.exact and not p.outside}
+    return {n: ratio for n, ratio in known.items() if ratio and not 0.1 < ratio < 10 and problem.reality is None}
+
+
+def slip(problem: Problem) -> str:
+    """What parameters are apart, in words; '' where there is none."""
+    told = ", ".join(f"{name} is {written_out(ratio)} times the plant's" for name, ratio in apart(problem).items())
+    return f"In the model {told}: is it a slip of {'sign' if ' -' in told else 'units'}?" * bool(told)

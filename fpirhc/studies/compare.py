@@ -23,12 +23,11 @@ from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.problem_files.shipped import shipped_folders
-from fpirhc.review.questions import misplaced, slips
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
 from fpirhc.simulation.pictures import Picture
-from fpirhc.simulation.ranges import Followed, hard_limits, input_limits, limits_left
+from fpirhc.simulation.ranges import Followed, hard_limits, input_limits, limits_left, misplaced, slip
 from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
@@ -60,7 +59,7 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            more = " ".join(filter(None, (_slip(task.problem), best)))
+            more = " ".join(filter(None, (slip(task.problem), best)))
             owners.setdefault(f"{error}{more and f'. {more}'}", []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
@@ -249,11 +248,7 @@ def _causes(problem: Problem, entries: Sequence[Entry], yard: Yardstick) -> list
     """What the file itself says of loops that do not follow, or leave a limit."""
     placed = [f"{text[0].upper()}{text[1:]}." for text in misplaced(problem)]
     lost = any(not e.adaptive and not follows(e, yard) for e in entries)
-    return [*placed, *filter(None, [_slip(problem) * lost])]
-
-
-def _slip(problem: Problem) -> str:
-    return f"In the model {slip}: is it a slip of units?" if (slip := slips(problem)) else ""
+    return [*placed, *filter(None, [slip(problem) * lost])]
 
 
 class _Rows:

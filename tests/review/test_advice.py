@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from helpers import tasks
-from helpers.reviewed import answers, mass, torque
+from helpers.reviewed import answers, biased, heater, mass, plans, torque
 
 import fpirhc as fp
 from fpirhc.__main__ import main
@@ -67,11 +67,11 @@ def behind_an_actuator(lag: float) -> fp.Problem:
 
 
 def test_a_lag_is_named_where_no_gain_helps():
-    """An own run with the lag that is named is nearer than one without adaptation, which is nearer than today's."""
+    """An own run with the one that is named is nearer than with another, or without adaptation, and today's is the worst."""
     problem, own = behind_an_actuator(0.4), law(-1.5, 3.0)
     [lag] = re.findall(r"lag=(\S+) of ", answers(problem, own)["pays"].change)
-    stated = replace(own, deformation=replace(own.deformation, lag=float(lag)))
-    laws = stated, own.with_deformation(fp.Identity()), own
+    stated = [replace(own, deformation=replace(own.deformation, lag=one)) for one in (float(lag), 0.16)]  # both pass
+    laws = *stated, own.with_deformation(fp.Identity()), own
     errors = [fp.measure(problem, fp.simulate(problem, c, seed=0, compiled=False)).rms_error["q"] for c in laws]
     assert errors == sorted(errors)
 
@@ -107,12 +107,62 @@ def test_the_rate_that_is_named_is_the_one_that_passes():
     two, one = (fp.ComputedTorque(fp.Exponential(rate, integral=False)) for rate in (2.0, 0.5))
     told, vain = (answers(lift(), rate)["input_limits"].change for rate in (two, one))
     assert told == "Set the rate of the tracking law to 8."
-    assert vain.startswith("No run with one of these passes: rate 0.25, 1, 0.125, 2; limits 2x; speed")
+    assert vain.partition("twice the error: ")[2].startswith("rate 0.25, 1, 0.125, 2; limits 2x; speed")
 
 
-def test_a_window_is_looked_for_up_to_eight_times_the_own():
-    seen = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(2e-4))}, fp.SavitzkyGolay(window=5, degree=2))
-    assert "to 41." in answers(motor(1.0, sensing=seen), fp.ComputedTorque(fp.Exponential(8.0)))["noise"].change
+@pytest.mark.parametrize(
+    ("limit", "noise", "own", "window"),
+    [(12, 2e-4, fp.SavitzkyGolay(5, 2), 41), (6, 1e-3, fp.PositionDifference(), 15)],
+)
+def test_another_estimator_is_named_where_noise_moves_the_command(limit, noise, own, window):
+    """Not wider limits where it stands at them by noise alone."""
+    problem = motor(1.0, sensing=fp.Sensing({"q": fp.Sensor(noise=fp.Noise(noise))}, own))
+    found = answers(replace(problem, limits=fp.Limits({"V": (-limit, limit)})), fp.ComputedTorque(fp.Exponential(8.0)))
+    told = found["noise" if limit > 6 else "input_limits"]
+    assert told.change.startswith(f"Take the estimator SavitzkyGolay(window={window}, degree=2).")
+    assert limit > 6 or "in 0 % without noise" in told.evidence
+
+
+def test_what_passes_at_twice_the_error_is_named_with_its_price():
+    seen = fp.Sensing({"x": fp.Sensor(noise=fp.Noise(9e-3)), "x'": fp.Sensor(noise=fp.Noise(6e-2))})
+    told = answers(replace(biased(0.0), sensing=seen, duration=4.0), plans(iterations=3)["RHC"])["noise"].change
+    assert re.search(r'rate={"F": 1\.0}\)\. The error is then 1\.8\d times as large\.$', told)
+
+
+ENDS = ("0.0, 2.0", "0.0, 5.0"), ("1.8, 12.0", "0.0, 12.0"), ("-4.0, 1.5", "-4.0, 4.25"), ("2.0, inf", "0.0, inf")
+
+
+@pytest.mark.parametrize(("ends", "wider"), ENDS)
+def test_limits_are_widened_at_the_end_where_commands_stand_and_not_beyond_zero(ends, wider):
+    """A room needs 0.9 to 3.7 K/s."""
+    low, high = map(float, ends.split(","))
+    task = {"reference": fp.Trajectory(lambda t: {"T": 2 + ca.sin(0.5 * t)}), "start": {"T": 2.0}, "duration": 20.0}
+    problem = replace(heater(), **task, limits=fp.Limits({"u": (low, high)}))
+    told = answers(problem, fp.ComputedTorque(fp.Exponential(3.0)))["input_limits"].change
+    assert told == f'Widen the limits of the inputs: Limits(inputs={{"u": ({wider})}}).'
+
+
+@pytest.mark.parametrize("wrong", ["model", "reality", "both", "map"])
+def test_a_wrong_sign_is_called_so(wrong):
+    """Of the model's parameter, of what moves, of an input that is positive, and of the map's gain."""
+    problem, own = motor(-1.6 if wrong == "model" else 1.6), fp.ComputedTorque(fp.Exponential(8.0))
+    if wrong == "reality":
+        real = replace(problem.plant, response=lambda q, v, u, p: {"q": -p.gain * u.V - 2 * v.q})
+        problem = replace(problem, reality=fp.Reality(real))
+    if wrong == "both":
+        cooled = replace(heater().plant, response=lambda x, u, p: {"T": -u.u - p.a * x.T})
+        problem = replace(heater(), plant=cooled, reference=fp.Trajectory(lambda t: {"T": 2 + ca.sin(t)}))
+    found = answers(problem, law(0.5) if wrong == "map" else own)
+    bad = {a.change for a in found.values() if a.verdict in ("caution", "no")}
+    assert [" sign " in one for one in bad] == [True]
+
+
+def test_a_slip_of_units_is_named_where_a_controller_does_not_fit():
+    inertia = {"J": fp.Parameter(5e-5, 0.05, "kg m^2")}
+    light = fp.Plant({"q": "rad"}, {"u": "N m"}, inertia, lambda q, v, u, p: {"q": (u.u - 0.1 * v.q) / p.J})
+    plan = {"horizon": fp.Horizon(20, 0.02), "cost": fp.Quadratic({"q": 1e2}, deviation={"u": 1e-2})}
+    told = answers(mass(plant=light, **plan), fp.RecedingHorizon(fp.FixedPoint()))["fits"].change
+    assert told.startswith("In the model J is 0.001 times the plant's: is it a slip of units? FixedPoint")
 
 
 def pushed_away(force: float, **settings: Any) -> fp.Problem:

@@ -17,23 +17,11 @@ MAP = fp.Affine(gain=-1.0)
 
 def drifting(*, exact: float = POLE) -> fp.Problem:
     """Y' = -p y + p u behind a pole that is fast against the period, along a sine: .43 of it passes in a cycle."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "m"},
-        order=1,
-        parameters={"p": fp.Parameter(POLE, exact, "1/s")},
-        response=lambda y, u, p: {"y": p.p * (u.u - y.y)},
-    )
-    return fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"y": ca.sin(8 * t)}),
-        start={"y": 0.0},
-        period=0.005,
-        duration=2.0,
-        horizon=fp.Horizon(stages=10, step=0.005),
-        cost=fp.Quadratic(states={"y": 1.0}, deviation={"u": 1e-3}),
-        measure_from=1.0,
-    )
+    pole = {"p": fp.Parameter(POLE, exact, "1/s")}
+    plant = fp.Plant({"y": "m"}, {"u": "m"}, pole, lambda y, u, p: {"y": p.p * (u.u - y.y)}, order=1)
+    plan = {"horizon": fp.Horizon(10, 0.005), "cost": fp.Quadratic({"y": 1.0}, deviation={"u": 1e-3})}
+    sine = fp.Trajectory(lambda t: {"y": ca.sin(8 * t)})
+    return fp.Problem(plant, sine, {"y": 0.0}, period=0.005, duration=2.0, measure_from=1.0, **plan)
 
 
 def planned(*deformation: Deformation) -> Controller:
@@ -68,11 +56,13 @@ def test_the_form_that_passes_passes():
     assert rms(model, planned(fp.ModelReferenced(MAP))) == pytest.approx(rms(model, planned()), rel=1e-9)
 
 
-@pytest.mark.parametrize(("late", "verdict"), [(0.0, "yes"), (0.01, "no")])
-def test_masses_that_do_not_drift_pass_until_a_dead_time_is_not_paired(late, verdict):
-    """Without a spring there is no drift within a cycle: the plain form leaves a right model as it is."""
+@pytest.mark.parametrize(
+    ("late", "gain", "verdict"), [(0.0, -1.0, "yes"), (0.01, -0.298, "caution"), (0.01, -0.4, "no")]
+)
+def test_masses_that_do_not_drift_pass_until_a_dead_time_is_not_paired(late, gain, verdict):
+    """Without a spring there is no drift within a cycle: the plain form leaves a right model; the second makes 1.6 of the error."""
     problem = reviewed.mass(dead_time=fp.DeadTime(inputs={"u": late})) if late else reviewed.mass()
-    controller = fp.ComputedTorque(fp.Exponential(rate=5.0), fp.Affine(gain=-0.4 if late else -1.0))
+    controller = fp.ComputedTorque(fp.Exponential(rate=5.0), fp.Affine(gain))
     assert alone(problem, controller).verdict == verdict
 
 
@@ -80,15 +70,8 @@ def test_a_null_test_goes_on_until_errors_count():
     """The input is too weak for the start, so the first cycles show nothing; the plain form disturbs a right model later."""
     strong = {"b": fp.Parameter(1.0, 1.5, "1")}
     plant = fp.Plant({"y": "m"}, {"u": "m/s"}, strong, lambda y, u, p: {"y": p.b * u.u}, order=1)
-    problem = fp.Problem(
-        plant=plant,
-        reference=fp.Trajectory(lambda t: {"y": 0.1 * ca.sin(t)}),
-        start={"y": 1.0},
-        period=1e-3,
-        duration=10.0,
-        limits=fp.Limits(inputs={"u": (-0.4, 0.4)}),
-        measure_from=8.0,
-    )
+    sine, lasts = fp.Trajectory(lambda t: {"y": 0.1 * ca.sin(t)}), {"duration": 10.0, "measure_from": 8.0}
+    problem = fp.Problem(plant, sine, {"y": 1.0}, 1e-3, **lasts, limits=fp.Limits({"u": (-0.4, 0.4)}))
     law = fp.ComputedTorque(fp.Exponential(rate=5.0, integral=False, bumpless=False), fp.Affine(gain=-0.05))
     found = alone(problem, law)
     right = replace(problem, plant=replace(plant, parameters={"b": fp.Parameter(1.0, 1.0, "1")}))

@@ -57,7 +57,7 @@ sigmoid = lambda gain: fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp
 LOADED = lambda q, v, u, p: {"q": u.u, "load": 100 * (q.q - q.load) - 0.3 * v.load}  # noqa: E731
 PLANT = fp.Plant({"q": "rad", "load": "rad"}, {"u": "rad/s^2"}, {}, LOADED, controlled=["q"])
 SINES = fp.Trajectory(lambda t: {"q": ca.sin(t), "load": ca.sin(t)})
-SWINGING = fp.Problem(PLANT, SINES, {"q": 0.0, "load": 0.0}, period=2e-3, duration=8.0)
+SWINGING = fp.Problem(PLANT, SINES, {"q": 0.0, "load": 0.0}, period=2e-3, duration=4.0)
 SERVO = -1.0, -1.97, -2.12
 CTC6, PAIRED = "CTC+FPI (eq 6)", "CTC+FPI paired"
 CASES: dict[str, Case] = {
@@ -177,7 +177,7 @@ CASES: dict[str, Case] = {
     ),
     "a mass that is another one": Case(
         lambda: (biased(0.0).with_exact(np.array([1 / 10.5])), plans()),
-        changes={("RHC", "follows"): "Mend the model: mass is 10.5 times the plant's."},
+        changes={("RHC", "follows"): "In the model mass is 10.5 times the plant's: is it a slip of units?"},
     ),
     "tanks that leak, whose plans end elsewhere": Case(
         shipped("leaking_tanks", "RHC+FPI"),
