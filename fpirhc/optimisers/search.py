@@ -381,7 +381,7 @@ def solve_free(hessian: ca.SX, free: ca.SX, right: ca.SX) -> ca.SX:
     lower, pivots = ca.SX.eye(n), list[ca.SX]()
     for j in range(n):
         known = sum((lower[j, k] ** 2 * pivots[k] for k in range(j)), start=ca.SX(0))
-        pivot = free[j] * (hessian[j, j] - known) + (1 - free[j])
+        pivot = free[j] * (hessian[j, j] - known)
         size = ca.fabs(hessian[j, j]) + TINY
         pivots.append(ca.if_else(pivot > BOX_PIVOT * size, pivot, size))
         for i in range(j + 1, n):
