@@ -129,17 +129,27 @@ def test_what_passes_at_twice_the_error_is_named_with_its_price():
     assert re.search(r'rate={"F": 1\.0}\)\. The error is then 1\.8\d times as large\.$', told)
 
 
+def heated(limits: fp.Limits) -> fp.Problem:
+    """A room that needs 0.9 to 3.7 K/s."""
+    wave = fp.Trajectory(lambda t: {"T": 2 + ca.sin(0.5 * t)})
+    return replace(heater(), reference=wave, start={"T": 2.0}, duration=20.0, measure_from=3.0, limits=limits)
+
+
 ENDS = ("0.0, 2.0", "0.0, 5.0"), ("1.8, 12.0", "0.0, 12.0"), ("-4.0, 1.5", "-4.0, 4.25"), ("2.0, inf", "0.0, inf")
 
 
 @pytest.mark.parametrize(("ends", "wider"), ENDS)
 def test_limits_are_widened_at_the_end_where_commands_stand_and_not_beyond_zero(ends, wider):
-    """A room needs 0.9 to 3.7 K/s."""
     low, high = map(float, ends.split(","))
-    task = {"reference": fp.Trajectory(lambda t: {"T": 2 + ca.sin(0.5 * t)}), "start": {"T": 2.0}, "duration": 20.0}
-    problem = replace(heater(), **task, limits=fp.Limits({"u": (low, high)}))
-    told = answers(problem, fp.ComputedTorque(fp.Exponential(3.0)))["input_limits"].change
+    told = answers(heated(fp.Limits({"u": (low, high)})), fp.ComputedTorque(fp.Exponential(3.0)))["input_limits"].change
     assert told == f'Widen the limits of the inputs: Limits(inputs={{"u": ({wider})}}).'
+
+
+def test_a_change_with_which_a_no_is_a_caution_is_said_to_be_no_yes():
+    limits, form = fp.Limits({"u": (-9.0, 9.0)}, rates={"u": (-0.2, 0.2)}), fp.ModelReferenced(fp.Affine(-0.5))
+    told = answers(heated(limits), fp.ComputedTorque(fp.Exponential(3.0), form))["input_limits"]
+    assert told.change == "Slow the reference to a quarter of its speed. It is better then, but no yes yet."
+    assert told.verdict == "no"
 
 
 @pytest.mark.parametrize("wrong", ["model", "reality", "both", "map"])
