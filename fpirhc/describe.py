@@ -108,6 +108,7 @@ def as_written(value: Any, prefix: str = "", width: float = math.inf) -> str:
     else:
         named = isinstance(plain := describe(value), str)
         text = json.dumps(value, ensure_ascii=False) if isinstance(value, str) else plain if named else repr(plain)
+        text = text if named else text.replace("inf", "math.inf")
         return _COMPUTED.sub(lambda number: f"{float(number[0]):.6g}", text)
     whole = f"{begin}{', '.join(parts)}{end}"
     lines = indent("".join(f"\n{one}," for one in parts), "    ")

@@ -87,10 +87,8 @@ class Plan:
                 means_something = stage > 0 or k < ocp.state.size - ocp.written
                 if by > most[k] and means_something and ocp.hard[k]:
                     side, end = ("below", low) if value < low else ("above", high)
-                    limit, beyond = _apart(end, by), _apart(value, by)
-                    violations.append(
-                        (stage > 0, -by, f"'{name}' is {beyond} {unit}, {side} {limit}, at stage {stage}")
-                    )
+                    limit, far = _apart(end, by), _apart(value, by)
+                    violations.append((stage > 0, -by, f"'{name}' is {far} {unit}, {side} {limit}, at stage {stage}"))
         return tuple(text for _, _, text in sorted(violations)[:_WORST])
 
     def overflow(self) -> str:

@@ -112,7 +112,7 @@ def test_the_rate_that_is_named_is_the_one_that_passes():
 
 @pytest.mark.parametrize(
     ("limit", "noise", "own", "window"),
-    [(12, 2e-4, fp.SavitzkyGolay(5, 2), 41), (6, 1e-3, fp.PositionDifference(), 15)],
+    [(12, 2e-4, fp.SavitzkyGolay(5, 2), 41), (1.75, 1e-3, fp.PositionDifference(), 31)],
 )
 def test_another_estimator_is_named_where_noise_moves_the_command(limit, noise, own, window):
     """Not wider limits where it stands at them by noise alone."""
@@ -135,7 +135,7 @@ def heated(limits: fp.Limits) -> fp.Problem:
     return replace(heater(), reference=wave, start={"T": 2.0}, duration=20.0, measure_from=3.0, limits=limits)
 
 
-ENDS = ("0.0, 2.0", "0.0, 5.0"), ("1.8, 12.0", "0.0, 12.0"), ("-4.0, 1.5", "-4.0, 4.25"), ("2.0, inf", "0.0, inf")
+ENDS = ("0.0, 2.0", "0.0, 5.0"), ("1.8, 12.0", "0.0, 12.0"), ("-4.0, 1.5", "-4.0, 4.25"), ("2.0, inf", "0.0, math.inf")
 
 
 @pytest.mark.parametrize(("ends", "wider"), ENDS)
