@@ -405,9 +405,9 @@ QUESTIONS = (
              "{time} without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| in "
              "{at_a_limit_without_noise:%} without noise| and the reference needs {needed_least} to {needed_most:u} of {of}| and "
              "the reference needs {needed_always:u} of {of}| whose limits are {lower} to {upper:u}", "",
-             "gain rate weight estimator Predicted limits speed"),
+             "model gain rate weight estimator Predicted limits speed"),
     Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}" + BEST, "No gain that was "
-             "run helps, is calm, and has reserve.", "filter form lag Predicted estimator sensors without", "adaptive"),
+             "run helps, is calm, and has reserve.", "model filter form lag Predicted estimator sensors without", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
              "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain lag without rate weight estimator "
              "Predicted rival limits speed"),

@@ -148,8 +148,7 @@ def test_limits_are_widened_at_the_end_where_commands_stand_and_not_beyond_zero(
 def test_a_change_with_which_a_no_is_a_caution_is_said_to_be_no_yes():
     limits, form = fp.Limits({"u": (-9.0, 9.0)}, rates={"u": (-0.2, 0.2)}), fp.ModelReferenced(fp.Affine(-0.5))
     told = answers(heated(limits), fp.ComputedTorque(fp.Exponential(3.0), form))["input_limits"]
-    assert told.change == "Slow the reference to a quarter of its speed. It is better then, but no yes yet."
-    assert told.verdict == "no"
+    assert (told.verdict, told.change[-34:]) == ("no", "It is better then, but no yes yet.")
 
 
 @pytest.mark.parametrize("wrong", ["model", "reality", "both", "map"])
@@ -167,12 +166,13 @@ def test_a_wrong_sign_is_called_so(wrong):
     assert [" sign " in one for one in bad] == [True]
 
 
-def test_a_slip_of_units_is_named_where_a_controller_does_not_fit():
-    inertia = {"J": fp.Parameter(5e-5, 0.05, "kg m^2")}
-    light = fp.Plant({"q": "rad"}, {"u": "N m"}, inertia, lambda q, v, u, p: {"q": (u.u - 0.1 * v.q) / p.J})
-    plan = {"horizon": fp.Horizon(20, 0.02), "cost": fp.Quadratic({"q": 1e2}, deviation={"u": 1e-2})}
-    told = answers(mass(plant=light, **plan), fp.RecedingHorizon(fp.FixedPoint()))["fits"].change
-    assert told.startswith("In the model J is 0.001 times the plant's: is it a slip of units? FixedPoint")
+def test_a_slip_of_units_is_named_where_a_controller_does_not_fit_and_where_it_is_lost():
+    known, falls = {"m": fp.Parameter(5e-5, 0.05, "kg")}, lambda q, v, u, p: {"q": (u.u - v.q) / p.m}
+    light = fp.Plant({"q": "m"}, {"u": "N"}, known, falls)
+    problem = mass(plant=light, horizon=fp.Horizon(20, 0.02), cost=fp.Quadratic({"q": 1e2}, deviation={"u": 1e-2}))
+    asks = "In the model m is 0.001 times the plant's: is it a slip of units?"
+    assert answers(problem, fp.RecedingHorizon(fp.FixedPoint()))["fits"].change.startswith(f"{asks} FixedPoint")
+    assert {a.change for a in answers(problem).values() if a.verdict in ("caution", "no")} == {asks}
 
 
 def pushed_away(force: float, **settings: Any) -> fp.Problem:
