@@ -103,9 +103,7 @@ def package(name: str, extra: str, what: str = "this") -> Any:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as missing:
-        raise NotInstalled(
-            f"{what} needs {missing.name}, which is not installed: pip install 'fpirhc[{extra}]'"
-        ) from None
+        raise NotInstalled(f"{what} needs {missing.name}, not installed here: pip install 'fpirhc[{extra}]'") from None
 
 
 class ConcurrentUse(FpirhcError, RuntimeError):

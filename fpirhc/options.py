@@ -87,9 +87,7 @@ def given(metavar: str | None, text: str, *names: str, **more: Any) -> Any:
 
 Problem = Annotated[str, typer.Argument(metavar="PROBLEM", help="name of a shipped problem, or path of a file")]
 Controller = Annotated[str, typer.Argument(metavar="CONTROLLER", help="name of a controller of the problem")]
-Controllers = Annotated[
-    list[str] | None, given("NAME ...", "only these controllers of the file", "--controllers", "-c")
-]
+Controllers = Annotated[list[str] | None, given("NAME ...", "only these controllers", "--controllers", "-c")]
 Out = Annotated[Path | None, given("FOLDER", "folder of the results [default: in results/PROBLEM]")]
 Seed = Annotated[int, given("N", "seed of noise and of what is drawn", min=0)]
 Mismatch = Annotated[
@@ -99,9 +97,7 @@ _REPLACED = "replace numbers: deformation.gain=-1.2, exact.m1=1.4, start.q1=2"
 Set = Annotated[list[str] | None, given("PATH=NUMBER ...", _REPLACED, "--set")]
 Json = Annotated[bool, given(None, "print one JSON object", "--json")]
 Verbose = Annotated[bool, given(None, "print every column and every remark", "--verbose", "-v")]
-NoCompile = Annotated[
-    bool, given(None, "do not compile: loops run in CasADi's virtual machine, slower", "--no-compile")
-]
+NoCompile = Annotated[bool, given(None, "no compiling: loops run in CasADi's virtual machine, slower", "--no-compile")]
 Processes = Annotated[int, given("N", "number of processes", min=1)]
 Count = given("N", "number of plants that are drawn at random", min=1)
 Cases = Annotated[list[str] | None, given("NAME ...", "named cases of the file: names, groups, or all")]

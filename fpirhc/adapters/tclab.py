@@ -97,9 +97,7 @@ def tclab_body(
     mistakes.unknown("input", model.inputs, _HEATERS)
     if board is not None and rest is None:
         wanted = ", ".join(f'"{name}": 0.0' for name in model.inputs)
-        mistakes.add(
-            f"rest: the board would keep its heaters on when a run ends; state what they are sent, rest={{{wanted}}}"
-        )
+        mistakes.add(f"rest: the board keeps its heaters on after a run; say what they are sent, rest={{{wanted}}}")
     mistakes.raise_if_any()
     body = _Twin(tclab, model, period) if board is None else _Board(tclab, model, period, board)
     return ExternalPlant(body, measures=dict.fromkeys(model.output.elements, "degC"), rest=rest, period=period)

@@ -111,7 +111,7 @@ class Controller(Checked, ABC):
     Concrete controllers are frozen dataclasses. `fpirhc.conformance.check_controller` tests that a controller keeps this contract.
     """
 
-    _LOADED: ClassVar[str] = "controllers[{}] of a loaded problem file"
+    _WRITTEN: ClassVar[str] = "controllers[{}] of a loaded problem file"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     if TYPE_CHECKING:

@@ -84,9 +84,7 @@ class RecedingHorizon(Controller):
         if self.cost is None and problem.cost is None:
             raise InvalidProblem("RecedingHorizon needs Problem(cost=...) or a cost of its own")
         if self.room is not None and self.tracking is None:
-            raise InvalidProblem(
-                "RecedingHorizon: room is what plans leave for `tracking`; give the law, or leave it out"
-            )
+            raise InvalidProblem("RecedingHorizon: room is what plans leave for `tracking`; give the law, or omit it")
         _room(problem, self.room)
         self.optimiser.check(_optimal_control(self.planner.planned(problem)))
 

@@ -82,9 +82,7 @@ class Slotted(Controller):
         period, unit = problem.period, problem.time_unit
         for name, value in self.durations.items():
             if value < period * (1 - 1e-9):
-                mistakes.add(
-                    f"duration of '{name}' is {value:g} {unit}, shorter than one control cycle of {period:g} {unit}"
-                )
+                mistakes.add(f"duration of '{name}' is {value:g} {unit}, below the control cycle of {period:g} {unit}")
         mistakes.raise_if_any()
 
     def _check_names(self, problem: Problem) -> None:
@@ -93,9 +91,7 @@ class Slotted(Controller):
         if not self.slots:
             mistakes.add("there are no slots; give at least one: {coordinate: ComputedTorque(tracking)}")
         if len(plant.inputs) > 1:
-            mistakes.add(
-                f"slots take turns on one input, and the plant has {', '.join(plant.inputs)}; use RecedingHorizon"
-            )
+            mistakes.add(f"slots take turns on one input; the plant has {', '.join(plant.inputs)}; use RecedingHorizon")
         mistakes.unknown("slot", self.slots, plant.followed)
         mistakes.raise_if_any()
         for name in self.slots:

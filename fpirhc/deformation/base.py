@@ -324,9 +324,7 @@ class Identity(Deformation):
         Raises:
             NotSupported: always.
         """
-        raise NotSupported(
-            f"Identity() has no gain, so it cannot take {gain!r}; use Sigmoid(gain=...), the usual choice"
-        )
+        raise NotSupported(f"Identity() has no gain and cannot take {gain!r}; use Sigmoid(gain=...), the usual choice")
 
 
 EXAMPLES = (Identity(),)

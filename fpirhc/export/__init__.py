@@ -297,9 +297,7 @@ def write(device: Device, target: Target, folder: Path) -> list[Path]:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     if taken:
-        raise OutputError(
-            f"'{folder}' is not an empty folder, and nothing in it is replaced; choose another one with --out"
-        )
+        raise OutputError(f"'{folder}' is not an empty folder; nothing in it is replaced; choose another with --out")
     return [folder / name for name in contents]
 
 

@@ -6,6 +6,7 @@ A class that derives from `Checked`, or from a contract that does, gets the chec
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 from abc import ABCMeta
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -135,7 +136,8 @@ class _Arguments:
             extra = described(arguments[len(self.positional)])
             yield f"{name} takes {len(self.positional)} values without a name, got {len(arguments)}; {extra} is too many"
         if missing := [key for key in self.required if key not in by_place and key not in named]:
-            yield f"{name} needs {', '.join(missing)}; write {call_of(self.owner)}"
+            told = re.findall(rf"^ *((?:{'|'.join(missing)}): [^.\n]*)", self.owner.__doc__ or "", re.MULTILINE)
+            yield "; ".join([f"{name} needs {', '.join(missing)}; write {call_of(self.owner)}", *told])
 
 
 def _parameters(owner: type | Callable[..., object]) -> list[inspect.Parameter]:
@@ -208,8 +210,8 @@ def _member(one: type, value: object, text: str) -> str:
     package = import_module(__name__.partition(".")[0])
     if one.__module__.partition(".")[0] != package.__name__:
         return ""
-    if isinstance(value, str) and hasattr(one, "_LOADED"):
-        return f"write {one._LOADED.format(repr(value))}"
+    if hasattr(one, "_WRITTEN") and (isinstance(value, str) or "{}" not in one._WRITTEN):
+        return f"write {one._WRITTEN.replace('{}', repr(value))}"
     if not inspect.isabstract(one):
         _, *first = inspect.signature(getattr(one, "__init__")).parameters  # noqa: B009
         written = call_of(one).replace("()", f"({first[0]}=...)" if first else "()")

@@ -74,9 +74,7 @@ class Horizon(Checked):
                 f"which is 1; got {described(self.lengths)}"
             )
         if self.blocks and sum(self.blocks) != self.stages:
-            raise InvalidValue(
-                f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages} stages"
-            )
+            raise InvalidValue(f"horizon: blocks {self.blocks} add up to {sum(self.blocks)}, expected {self.stages}")
 
     @property
     def relative_lengths(self) -> np.ndarray:
@@ -288,9 +286,7 @@ class Quadratic(Cost):
             "terminal": (terminal, plant.output.elements),
         }
         if self.outputs and self.states:
-            mistakes.add(
-                "states and outputs: both weigh errors of what has a reference; give all weights in one of them"
-            )
+            mistakes.add("states and outputs: both weigh errors of what has a reference; give all weights in one")
         if any(n in plant.state.elements and n not in plant.output.elements for n in self.states):
             mistakes.add(
                 f"states: the states of a plant with outputs have no reference; weigh {', '.join(plant.output.elements)}, "

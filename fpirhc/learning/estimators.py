@@ -159,9 +159,7 @@ class RecursiveLeastSquares(ParameterEstimator):
     def step(self, problem: Problem) -> Correct:
         plant, size = problem.plant, len(self.parameters)
         if self.time < problem.period:
-            raise InvalidValue(
-                f"the time of forgetting is {self.time:g}, shorter than the control cycle of {problem.period:g}"
-            )
+            raise InvalidValue(f"the time of forgetting {self.time:g} is below the control cycle of {problem.period:g}")
         residual, factor = self._residual(plant), math.exp(-problem.period / self.time)
         places = [plant.parameter.elements.index(name) for name in self.parameters]
         lower, upper, deviation = (

@@ -73,9 +73,7 @@ class LyapunovRule(Rule):
         """
         odd = sorted(set(self.gains) ^ set(bounds))
         if odd:
-            raise InvalidValue(
-                f"LyapunovRule: gains and bounds must name the same parameters; only one names '{odd[0]}'"
-            )
+            raise InvalidValue(f"LyapunovRule: gains and bounds must name the same parameters; only one has '{odd[0]}'")
 
     def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
         """Return period Gamma G^T w."""
@@ -120,9 +118,7 @@ class Projection(Rule):
         """
         for name, (lower, upper) in bounds.items():
             if not math.isfinite(upper - lower):
-                raise InvalidValue(
-                    f"Projection: '{name}' needs finite bounds, which scale it; got ({lower:g}, {upper:g})"
-                )
+                raise InvalidValue(f"Projection: '{name}' needs finite bounds, its scale; got ({lower:g}, {upper:g})")
 
     def change(self, evidence: Evidence, bounds: Bounds, period: float) -> Expression:
         del period

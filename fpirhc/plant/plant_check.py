@@ -60,9 +60,7 @@ def _check_names(plant: Plant, mistakes: Mistakes) -> None:
             if not str(name).isidentifier():
                 mistakes.add(f"{what}: '{name}' is not an identifier; use letters, digits and underscores")
     if not plant.time_unit:
-        mistakes.add(
-            f"time_unit is {plant.time_unit!r}; write the unit of time of the equations, such as 's', 'ms' or 'day'"
-        )
+        mistakes.add(f"time_unit is {plant.time_unit!r}; write the time unit of the equations, such as 's' or 'day'")
     for name in sorted({*plant.coordinates, *plant.outputs} & plant.inputs.keys()):
         what = "an output" if name in plant.outputs else f"a {quantities[:-1]}"
         mistakes.add(f"'{name}' names both an input and {what}; rename one")

@@ -156,9 +156,7 @@ def _check_linear(regressor: Regressor) -> None:
         )
     if not entering.all():
         absent = regressor.names[int(np.argmin(entering))]
-        raise InvalidValue(
-            f"Regressor: '{absent}' does not enter the inverse dynamics, so nothing can be learned about it"
-        )
+        raise InvalidValue(f"Regressor: '{absent}' does not enter the inverse dynamics, so nothing is learned about it")
 
 
 def _point(plant: Plant, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

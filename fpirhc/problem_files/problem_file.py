@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import json
 import sys
 import textwrap
 import traceback
@@ -56,7 +57,7 @@ class Task(FoundByName):
         headline_metric: number by which controllers are compared and tuned; None: the relative error.
     """
 
-    _LOADED: ClassVar[str] = "fp.load_problem({})"
+    _WRITTEN: ClassVar[str] = "fp.load_problem({})"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     name: str
@@ -154,8 +155,11 @@ def _check_together(module: ModuleType, facts: dict[str, Any], mistakes: Mistake
     mistakes.unknown(f"{where}headline: controller", headline, controllers)
     pairs = [(pair_of(controllers, name), name) for name, one in controllers.items() if one.deformation.adapts]
     if headline and not mistakes and headline not in pairs:
-        known = ", ".join(str(pair) for pair in pairs if pair[0]) or "none is here, so leave headline out"
-        mistakes.add(f"{where}headline {headline} is no pair of a controller and the same one with adaptation: {known}")
+        mend = ", ".join(str(pair) for pair in pairs if pair[0]) or "none is here, so leave headline out"
+        told = (json.dumps(describe(without_deformation(controllers[n])), indent=1).split("\n") for n in headline)
+        two = next(((a.strip(" ,"), b.strip(" ,")) for a, b in zip(*told, strict=False) if a != b), ())
+        mend = f"{' against '.join(two)}{'; ' * bool(two)}{mend}"
+        mistakes.add(f"{where}headline {headline} is no pair of a controller and the same one with adaptation: {mend}")
     for picture in facts.get("pictures", ()):
         mistakes.unknown(f"picture '{picture.title}': controller", picture.controllers, controllers)
     spans = facts.get("tuning", {})
@@ -166,9 +170,7 @@ def _check_together(module: ModuleType, facts: dict[str, Any], mistakes: Mistake
             with mistakes.caught(f"tuning: controller '{owner}': "):
                 if not is_own(own, path) and number_of_case(facts["problem"], path) is not None:
                     mend = f"; give this one its own, {word}=problem.{word}" if hasattr(own, word) else ""
-                    raise InvalidName(
-                        f"setting '{path}' is the problem's, and a search changes controllers alone{mend}"
-                    )
+                    raise InvalidName(f"setting '{path}' is the problem's; a search changes controllers alone{mend}")
                 current_setting(own, path)
     with mistakes.caught():
         facts["metrics"] = with_own_metrics(facts.get("metrics", ()))

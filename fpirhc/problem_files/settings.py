@@ -88,9 +88,7 @@ def current_setting(owner: Controller | Problem, path: str) -> float:
     """Return the number at a path."""
     value = content_at(owner, path, "the problem" if isinstance(owner, Problem) else "the controller")
     if isinstance(value, bool) or not isinstance(value, int | float):
-        mend = (
-            "give it a number first" if value is None else f"go on with one of: {', '.join(names_in(value)) or 'none'}"
-        )
+        mend = "give it a number first" if value is None else f"go on with: {', '.join(names_in(value)) or 'none'}"
         raise InvalidValue(f"setting '{path}' is {value!r}, not a number; {mend}")
     return value
 

@@ -227,9 +227,7 @@ class VelocityDifference(_OfHighest):
         return 0.0
 
 
-_TIME_CONSTANT = Range(
-    "a positive number of seconds (without a filter use VelocityDifference())", lambda v: 0 < v < math.inf
-)
+_TIME_CONSTANT = Range("a positive number of seconds (or use VelocityDifference())", lambda v: 0 < v < math.inf)
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,7 @@ class KalmanFilter(StateObserver):
         mistakes.unknown("measured: quantity", self.measured, every)
         for name in self.measured:
             if name in every and name not in measured:
-                mistakes.add(
-                    f"measured: no sensor shows '{name}'; those of Sensing(measured=...) are {', '.join(measured)}"
-                )
+                mistakes.add(f"measured: no sensor shows '{name}'; Sensing(measured=...) has {', '.join(measured)}")
         mistakes.unknown("noise: coordinate", self.noise, plant.coordinates)
         mistakes.unknown("start: state", self.start, plant.state.elements)
         mistakes.raise_if_any()

@@ -44,7 +44,7 @@ class Run(FoundByName):
         settings: of problem and controller, as plain data.
     """
 
-    _LOADED: ClassVar[str] = "fp.load_run({})"
+    _WRITTEN: ClassVar[str] = "fp.load_run({})"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     problem: str

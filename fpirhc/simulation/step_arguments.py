@@ -150,11 +150,9 @@ def _view(array: np.ndarray) -> View:
 def numbers_of(name: str, value: object, size: int) -> np.ndarray:
     """Return `value` as float64, shape (size,)."""
     if isinstance(value, np.ma.MaskedArray):
-        raise InvalidValue(
-            f"argument '{name}' is a masked array; a missing number is NaN: {name}.filled(np.nan) skips the cycle"
-        )
+        raise InvalidValue(f"argument '{name}' is a masked array; {name}.filled(np.nan) skips the cycle")
     if isinstance(value, list | tuple) and any(isinstance(v, bool | np.bool_) for v in value):
-        raise InvalidValue(f"argument '{name}' must be made of real numbers, got {described(value)} with a truth value")
+        raise InvalidValue(f"argument '{name}' must be real numbers, got {described(value)} with a truth value")
     try:
         array = np.asarray(value)
     except Exception:  # noqa: BLE001 -- rows of different lengths; an object of a stranger's that raises where numpy asks it
@@ -162,9 +160,7 @@ def numbers_of(name: str, value: object, size: int) -> np.ndarray:
     if array.dtype.kind == "O":
         raise InvalidValue(f"argument '{name}' is not made of numbers, got {described(value)}; expected {size} numbers")
     if array.dtype.kind not in "fiu":
-        raise InvalidValue(
-            f"argument '{name}' must be made of real numbers, got {described(value)} of type '{array.dtype}'"
-        )
+        raise InvalidValue(f"argument '{name}' must be real numbers, got {described(value)} of type '{array.dtype}'")
     if array.size != size or sum(n != 1 for n in array.shape) > 1 or array.ndim == 0:
         raise InvalidValue(f"argument '{name}' has {size} entries (shape ({size},)), got shape {array.shape}")
     return np.ascontiguousarray(array.ravel(), dtype=np.float64)

@@ -95,9 +95,7 @@ class Named:
         try:
             return self.vector[self._elements.index(name)]
         except ValueError:
-            number = (
-                f" Entries have names, such as .{self._elements[0]}, and no numbers." if isinstance(name, int) else ""
-            )
+            number = f" Entries have names, such as .{self._elements[0]}, no numbers." if isinstance(name, int) else ""
             if (of := derivative_of(str(name))) in self._elements:
                 number = f" The derivative of {of} is v.{of}."
             raise InvalidName(f"{self._what} '{name}' is unknown.{number}{nearest(name, self._elements)}") from None

@@ -216,9 +216,7 @@ class _Library:
         except (OSError, RuntimeError) as error:
             if isinstance(error, CompileError):
                 raise
-            raise CompileError(
-                f"the compiled library cannot be kept in '{self.path.parent}' or loaded: {error}"
-            ) from None
+            raise CompileError(f"the compiled code cannot be kept in '{self.path.parent}' or loaded: {error}") from None
 
     def make(self) -> None:
         """Compile it into the cache, its files side by side: its own one, and drivers, whose objects other libraries share."""

@@ -86,9 +86,7 @@ def check_signals(
         for name in plant.outside:
             unit = plant.parameters[name].unit
             if units.setdefault(name, unit) != unit:
-                mistakes.add(
-                    f"signals: '{name}' is in {units[name]} in the model and in {unit} in the reality; write one unit"
-                )
+                mistakes.add(f"signals: '{name}' is in {units[name]} in the model, in {unit} in the reality; write one")
             if name not in signals:
                 mistakes.add(
                     f"signals: '{name}' [{unit}] has no values; add signals={{'{name}': Known(Samples(times, values))}}, or Unknown"

@@ -139,9 +139,7 @@ def _check_interval(name: str, interval: Interval, mistakes: Mistakes) -> None:
     if interval[0] > interval[1]:
         mistakes.add(f"'{name}' has lower {interval[0]} above upper {interval[1]}; swap them")
     elif interval[0] == math.inf or interval[1] == -math.inf:
-        mistakes.add(
-            f"'{name}' has limits {tuple(interval)!r} that no number meets; a free side is -inf below, inf above"
-        )
+        mistakes.add(f"'{name}' has limits {tuple(interval)!r} that no number meets; a free side is -inf or inf")
 
 
 def _bounds(intervals: Mapping[str, Interval], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:

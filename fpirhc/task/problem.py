@@ -63,7 +63,7 @@ class Problem(Checked):
         InvalidProblem: all mistakes together.
     """
 
-    _LOADED: ClassVar[str] = "fp.load_problem({}).problem"
+    _WRITTEN: ClassVar[str] = "fp.load_problem({}).problem"
     """How a value of a name or a file is written, with the name as {}: for who gives the name alone."""
 
     plant: Plant

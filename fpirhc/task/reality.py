@@ -168,9 +168,7 @@ class Reality(Checked):
             "controlled": (tuple(plant.controlled or plant.chains), model.controlled_names),
             "measured": (tuple(self.seen.values()), tuple(self.seen)),
         }
-        differences = [
-            f"{what} {one}, and the controller's are {its}" for what, (one, its) in facts.items() if one != its
-        ]
+        differences = [f"{what} {one}, the controller's are {its}" for what, (one, its) in facts.items() if one != its]
         refuse(
             f"the reality has {one}: it cannot be the exact model of this controller; leave ExactModel out"
             for one in filter(None, [*differences, unlike(plant, model)])

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NoReturn
+from typing import ClassVar, NoReturn
 
 import casadi as ca
 import numpy as np
@@ -48,6 +48,8 @@ class Reference(Checked, ABC):
 
     A horizon of N stages asks for a preview of N + 1 nodes.
     """
+
+    _WRITTEN: ClassVar[str] = 'fp.Trajectory(lambda t: {"NAME": 1.0}) or fp.Setpoint(values={"NAME": 1.0}, rate=1/TIME)'
 
     @abstractmethod
     def coordinates(self, t: Expression) -> Mapping[str, Expression]:
@@ -124,7 +126,7 @@ class Setpoint(Reference):
         values: set-points by coordinate: a number, or pairs (time, set-point), each in force from its time on. The filter begins at
             the first one, at rest. A run may be given others (`simulate(..., setpoints=...)`, `Stepper.step(..., setpoints=...)`);
             what is decided before a run follows these, and a horizon knows none before its time.
-        rate: a, the rate of the filter, per unit of time.
+        rate: a, the rate of the filter, per unit of time, whose time constant is 1/a.
         order: m of every coordinate, at least the plant's order; None: the plant's order. With the plant's order the response jumps
             by a^m (w_new - w_old) at a change, with one more it is continuous.
 
@@ -141,9 +143,7 @@ class Setpoint(Reference):
             pairs(name, steps)
 
     def coordinates(self, t: Expression) -> NoReturn:  # noqa: ARG002
-        raise NotSupported(
-            "the motion towards set-points depends on the orders of a plant; use Setpoint.function(plant)"
-        )
+        raise NotSupported("the motion towards set-points depends on a plant's orders; use Setpoint.function(plant)")
 
     @property
     def set_points(self) -> Mapping[str, Steps]:

@@ -154,13 +154,9 @@ class ShiftPolynomial(LinearLaw):
         outside = [z for z in every if not abs(z) < 1]
         if outside or not every:
             wrong = f"{outside[0]:g} is not inside the unit circle" if outside else "there is none"
-            raise InvalidValue(
-                f"ShiftPolynomial(poles={self.poles!r}): {wrong}; 0 is deadbeat, and a slow mode is below 1"
-            )
+            raise InvalidValue(f"ShiftPolynomial(poles={self.poles!r}): {wrong}; 0 is deadbeat, a slow mode below 1")
         if np.iscomplexobj(np.poly(every)):
-            raise InvalidValue(
-                f"ShiftPolynomial(poles={self.poles!r}): give a complex pole together with its conjugate"
-            )
+            raise InvalidValue(f"ShiftPolynomial(poles={self.poles!r}): give a complex pole with its conjugate")
 
     def gains(self, order: int) -> tuple[float, ...]:
         """Gains of (e_int, e, delta e, ...) with the sum, of (e, delta e, ...) without; lowest difference first.

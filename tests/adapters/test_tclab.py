@@ -92,7 +92,7 @@ def test_the_board_is_asked_when_its_cycle_is_over(monkeypatch):
 
 
 def test_a_board_says_what_its_heaters_are_sent_at_the_end():
-    with pytest.raises(InvalidProblem, match=r'keep its heaters on when a run ends; .* rest={"Q1": 0.0, "Q2": 0.0}'):
+    with pytest.raises(InvalidProblem, match=r'keeps its heaters on after a run; .* rest={"Q1": 0.0, "Q2": 0.0}'):
         tclab_body(LAB, period=PERIOD, board=RealTime())
 
 

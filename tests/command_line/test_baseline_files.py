@@ -163,7 +163,5 @@ def test_pytest_plugin(pytester, blessed, monkeypatch):
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*the problem file changed*", "*CTC*rms_error.y*"])
     assert pytester.runpytest_inprocess("--fpirhc-accept", " ").ret == pytest.ExitCode.USAGE_ERROR
-    pytester.runpytest_inprocess(*quiet, "--fpirhc-accept", "faster", "-k", "CTC").assert_outcomes(
-        passed=1, deselected=1
-    )
+    pytester.runpytest_inprocess(*quiet, "--fpirhc-accept", "new", "-k", "CTC").assert_outcomes(passed=1, deselected=1)
     pytester.runpytest_inprocess(*quiet).assert_outcomes(passed=2)

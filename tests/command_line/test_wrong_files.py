@@ -85,7 +85,7 @@ unit as a name
     line 9): coordinate 'angle' is unknown. Valid: rad.
 entries by number
   q.angle -> q[0]
-    line 9): coordinate '0' is unknown. Entries have names, such as .angle, and no numbers.
+    line 9): coordinate '0' is unknown. Entries have names, such as .angle, no numbers.
 MX in a response
   ca.sin(q.angle) -> ca.sin(ca.MX(1) * q.angle)
     line 9): the symbols here are of the kind SX, which cannot be mixed with MX
@@ -149,10 +149,14 @@ controlled by one name
     Plant.controlled: expected (a text, ...) or None, got the text 'angle'; write ('angle',)
 a search in the cost of the problem
   controllers = { -> tuning = {"RHC": {"cost.deviation.torque": fp.LogSpan(1e-3, 1.0)}}; controllers = {
-    setting 'cost.deviation.torque' is the problem's, and ... changes controllers alone; give this one its own, cost=problem.cost
+    setting 'cost.deviation.torque' is the problem's; ... changes controllers alone; give this one its own, cost=problem.cost
 headline of no pair
   controllers = { -> headline = ("RHC+FPI", "RHC"); controllers = {
     headline ('RHC+FPI', 'RHC') is no pair of a controller and the same one with adaptation: ('RHC', 'RHC+FPI')
+headline of two that differ in a setting
+  controllers = {"RHC": fp.RecedingHorizon(optimiser -> headline = ("RHC", "RHC+FPI"); controllers = {"RHC": fp.RecedingHorizon(plan
+  optimiser = fp -> plan = fp.FixedPoint(); optimiser = fp
+    same one with adaptation: "iterations": null against "iterations": 1; none is here, so leave headline out
 controllers under another name
   controllers = { -> controller = {
     'controller' is one, so call it 'controllers'

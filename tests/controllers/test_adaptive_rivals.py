@@ -210,9 +210,7 @@ def evidence(gradient: Any = None, equation: Any = None, clipped: Any = 0) -> An
 
 def rule_step(rule, bounds, rows):
     matrix, error = ca.SX.sym("G", rows, len(bounds)), ca.SX.sym("h", rows)
-    return ca.Function(
-        "change", [matrix, error], [rule.change(evidence(equation=lambda: (matrix, error)), bounds, 1e-3)]
-    )
+    return ca.Function("rule", [matrix, error], [rule.change(evidence(equation=lambda: (matrix, error)), bounds, 1e-3)])
 
 
 # Bounds and limits in a run.

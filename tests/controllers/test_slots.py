@@ -185,7 +185,7 @@ SLOT = fp.ComputedTorque(fp.Exponential(rate=2.0))
 WRONG: dict[str, tuple[Any, str]] = {
     "never its turn": (({"cart": SLOT, "angle": SLOT}, {"cart": 1.0}), "slot 'angle' is never active; give it time"),
     "unknown": (({"carts": SLOT}, {"carts": 1.0}), "slot 'carts' is unknown. Did you mean 'cart'?"),
-    "too short": (({"cart": SLOT}, {"cart": 1e-3}), "shorter than one control cycle of 0.005 s"),
+    "too short": (({"cart": SLOT}, {"cart": 1e-3}), "below the control cycle of 0.005 s"),
     "none": (({}, {"cart": 1.0}), "give at least one: {coordinate: ComputedTorque(tracking)}"),
     "wrong sign": (
         ({"angle": SLOT.with_deformation(fp.Affine(gain=0.3))}, {"angle": 1.0}),
@@ -208,7 +208,7 @@ def test_wrong_slots_are_refused(given, words):
 def test_slots_are_refused_on_several_inputs_and_where_nobody_judges():
     """One input is taken in turn, and what a slot controls is judged."""
     two = tasks.two_mass.problem
-    assert "take turns on one input, and the plant has" in refused(two, alone("q1", SLOT.tracking, fp.Identity()))
+    assert "take turns on one input; the plant has" in refused(two, alone("q1", SLOT.tracking, fp.Identity()))
     quiet = crane({"cart": -1.0}, judged=("cart",))
     assert "write Problem(..., judged=('cart', 'angle'))" in refused(
         quiet, alone("angle", SLOT.tracking, fp.Identity())

@@ -40,9 +40,7 @@ def test_inputs_arrive_when_they_should():
     run = fp.simulate(delayed, fp.ComputedTorque(LAW), seed=0, compiled=False)
     sent, arrived = run["command"], run["arriving"]
     padded = np.vstack([np.zeros((4, 2)), sent])
-    np.testing.assert_allclose(
-        arrived[:, 0], 0.75 * padded[1:-3, 0] + 0.25 * padded[:-4, 0], rtol=1e-12, equal_nan=False
-    )
+    np.testing.assert_allclose(arrived[:, 0], 0.75 * padded[1:-3, 0] + 0.25 * padded[:-4, 0], 1e-12, equal_nan=False)
     np.testing.assert_array_equal(arrived[:, 1], padded[2:-2, 1])
 
 

@@ -21,9 +21,7 @@ def test_an_arduino_library_replays_in_float(tmp_path):
     (tmp_path / "type.c").write_text(
         '#define Q1 17\n#include "arm.h"\nextern char is_float[sizeof(((arm_command*)0)->Q1) == 4 ? 1 : -1];\n'
     )
-    (tmp_path / "main.c").write_text(
-        (tmp_path / "c" / "main.c").read_text()
-    )  # apart from the header in double beside it
+    (tmp_path / "main.c").write_text((tmp_path / "c" / "main.c").read_text())  # apart from the header in double
     files = [*src.glob("*.c"), tmp_path / "type.c", tmp_path / "main.c"]
     program = tmp_path / "replay"
     command = [
@@ -38,8 +36,6 @@ def test_an_arduino_library_replays_in_float(tmp_path):
         "-lm",
     ]
     subprocess.run(command, check=True, cwd=tmp_path)
-    done = subprocess.run(
-        [str(program), str(tmp_path / "c" / "samples.bin")], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([program, tmp_path / "c" / "samples.bin"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
     assert "2000 cycles" in done.stdout

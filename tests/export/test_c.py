@@ -241,9 +241,7 @@ def test_a_plan_in_float_is_the_plan(tmp_path):
     """Three stages: the line search's rounding is that of the type, so it does not stop at once (8 N off with that of double)."""
     device = exported(tmp_path / "device", of_text(THREE_STAGES, tmp_path), "RHC+FPI")
     program = built(device.folder, "-Dcasadi_real=float")
-    said = subprocess.run(
-        [str(program), str(device.folder / "samples.bin")], capture_output=True, text=True, check=False
-    )
+    said = subprocess.run([program, device.folder / "samples.bin"], capture_output=True, text=True, check=False)
     assert float(said.stdout.split("at most ")[1].split(" ")[0]) < 0.01, said.stdout
 
 

@@ -123,9 +123,7 @@ def test_what_has_no_lab(tmp_path, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_wheel_has_all_that_the_package_reads(tmp_path):
     """Every file of the package and nothing else beside the problems; a lab is written with the wheel's files alone."""
-    builders = pytest.importorskip(
-        "hatchling.builders.wheel", reason="hatchling is not installed: pip install hatchling"
-    )
+    builders = pytest.importorskip("hatchling.builders.wheel", reason="pip install hatchling")
     root = Path(fp.__file__).parents[1]
     listed = subprocess.run(["git", "ls-files", "fpirhc"], cwd=root, capture_output=True, text=True, check=False)
     if listed.returncode:

@@ -21,14 +21,14 @@ own.py ipopt =>
     'ipopt' cannot be exported: it calls a solver that is not written as C, but linked as a library
     (coin-or/IpStdCInterface.h is its header). In place of Ipopt use FixedPoint(iterations=1, tolerance=...), which is C of its own
 two_mass RHC+FPI --to wasm =>
-    the target wasm needs ziglang, which is not installed: pip install 'fpirhc[compiler]'
+    the target wasm needs ziglang, not installed here: pip install 'fpirhc[compiler]'
 two_mass RHC+FPI --to fmu2 =>
-    the target fmu2 needs fmpy, which is not installed: pip install 'fpirhc[fmu]'
+    the target fmu2 needs fmpy, not installed here: pip install 'fpirhc[fmu]'
 two_mass RHC+FPI --to library =>
     a shared library needs a C compiler: compilation is turned off (FPIRHC_CC=none); install gcc or clang, or pip install
     'fpirhc[compiler]'
 two_mass RHC+FPI --out full =>
-    'full' is not an empty folder, and nothing in it is replaced; choose another one with --out
+    'full' is not an empty folder; nothing in it is replaced; choose another with --out
 two_mass RHC+FPI --name 2nd =>
     '2nd' cannot be the name of a controller in C: expected at most 40 letters, digits and underscores, a letter first, and no
     word of C or of the files beside it. Did you mean 'c_2nd'?

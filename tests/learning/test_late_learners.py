@@ -88,9 +88,7 @@ def offset_free(at_once: bool, tracking: Any = None) -> fp.Estimating:
 
 def test_a_new_estimate_changes_the_command_between_plans():
     """Y'' = b u + w: the command is the plan's input minus what w has changed since the plan, over b."""
-    problem = spring(
-        plant=linear(1.0, 0.8), disturbances={"y": fp.Formula(lambda t: 1.0 * ca.sin(2 * np.pi * 3.0 * t))}
-    )
+    problem = spring(plant=linear(1.0, 0.8), disturbances={"y": fp.Formula(lambda t: ca.sin(2 * np.pi * 3.0 * t))})
     result = run(problem, offset_free(at_once=True))
     command, planned, w = result["command"][:, 0], result["planned"][:, 0], result["estimate"][:, 0]
     since = w - np.repeat(w[::10], 10)[: w.size]

@@ -70,7 +70,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "a plant": (lambda: task(reality=pendulum()), "Reality"),
     "no exact model": (
         lambda: run(real(lagged(), start={"F": 0.0}), fp.ExactModel(CONTROLLERS["computed torque"])),
-        "coordinates ('y', 'F'), and the controller's are ('y',): it cannot be the exact model",
+        "coordinates ('y', 'F'), the controller's are ('y',): it cannot be the exact model",
     ),
     "range": (lambda: replace(LEVEL, ranges={"levels": (0.0, 1.0)}), "'levels'"),
     "empty range": (lambda: replace(LEVEL, ranges={"h": (1.0, 0.0)}), "(lowest, highest), got (1.0, 0.0)"),

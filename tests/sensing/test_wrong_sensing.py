@@ -65,7 +65,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     ),
     "filter of what no sensor shows": (
         lambda: task(measured=["y"], observer=fp.KalmanFilter(measured={"y'": 0.1}, noise={"y": 1.0})),
-        "no sensor shows 'y''; those of Sensing(measured=...) are y",
+        "no sensor shows 'y''; Sensing(measured=...) has y",
     ),
     "noise of nobody": (
         lambda: task(measured=["y"], observer=fp.KalmanFilter(measured={"y": 0.1}, noise={"yy": 1.0})),

@@ -372,7 +372,7 @@ def test_a_signal_that_is_not_there_breaks_its_figure_alone():
     several = figures.Nadir("state", name="several")  # its entries have units of their own
     metrics = fp.measure(problem(), run(0.0), [figures.Largest("comand.u"), figures.Nadir("command.u"), several])
     assert metrics["nadir"][""] == 0.0
-    assert "name one of them, such as 'state.y'" in metrics.broken["several"]
+    assert "name one, such as 'state.y'" in metrics.broken["several"]
     assert "metric 'largest'" in metrics.broken["largest"]
     assert "Did you mean 'command.u'?" in metrics.broken["largest"]
 

@@ -36,9 +36,7 @@ def case(name: str) -> tuple[fp.Stepper, np.ndarray]:
 
 def stepped(stepper: fp.Stepper, row: np.ndarray, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The stepper's own cycle with one row of what it reads."""
-    measured = row[stepper.reads.slice("time").stop :][
-        : len(stepper.measures)
-    ]  # samples come first, in the order of `measures`
+    measured = row[stepper.reads.slice("time").stop :][: len(stepper.measures)]  # samples come first, as in `measures`
     return stepper.step_measured(row[stepper.reads.slice("time")][0], measured, memory)
 
 

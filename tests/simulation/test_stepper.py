@@ -148,8 +148,8 @@ def misuses(memory: np.ndarray) -> dict[str, tuple[type[FpirhcError], str, tuple
     """What a caller may get wrong: error, words of the message, arguments."""
     x, r = np.zeros(4), np.zeros(2)
     return {
-        "truth value": (InvalidValue, "'state' must be made of real numbers", (0.0, True, r, memory)),
-        "text": (InvalidValue, "'state' must be made of real numbers", (0.0, "5", r, memory)),
+        "truth value": (InvalidValue, "'state' must be real numbers", (0.0, True, r, memory)),
+        "text": (InvalidValue, "'state' must be real numbers", (0.0, "5", r, memory)),
         "no memory": (InvalidValue, "'memory' is not made of numbers", (0.0, x, r, None)),
         "short state": (InvalidValue, "'state' has 4 entries", (0.0, x[:3], r, memory)),
         "matrix": (InvalidValue, "'state' has 4 entries", (0.0, x.reshape(2, 2), r, memory)),

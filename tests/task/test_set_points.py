@@ -82,9 +82,7 @@ def test_every_controller_follows_a_set_point_as_the_trajectory_of_the_filter(na
         assert np.ptp(states[1], axis=0).max() > 1e-3, controller  # it does move
         scale = np.maximum(1.0, np.abs(states[1]).max())
         assert np.abs(states[0] - states[1]).max() < 1e-12 * scale, controller
-        np.testing.assert_allclose(
-            runs[0]["reference"], runs[1]["reference"], rtol=0, atol=1e-12, err_msg=repr(controller)
-        )
+        np.testing.assert_allclose(runs[0]["reference"], runs[1]["reference"], 0, 1e-12, err_msg=repr(controller))
         costs = [fp.measure(p, run)["cost"] for p, run in zip((ours, theirs), runs, strict=True)]
         assert costs[0] == pytest.approx(costs[1], rel=1e-6)
 

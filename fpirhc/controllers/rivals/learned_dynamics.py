@@ -148,9 +148,7 @@ class SlotineLi(Controller):
         self._learning.check(problem, inverts=self._deforms)
         odd = sorted(set(self.damping) ^ set(problem.plant.names))
         if odd:
-            raise InvalidValue(
-                f"SlotineLi: damping must name every coordinate and no other; '{odd[0]}' is on one side only"
-            )
+            raise InvalidValue(f"SlotineLi: damping must name every coordinate and no other; '{odd[0]}' is on one side")
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
         regressor = self._learning.regressor(built.plant)

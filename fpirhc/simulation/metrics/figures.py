@@ -100,9 +100,7 @@ def _figure(
         values = numbers(run, what)
         if values.ndim > 1 and values.shape[1] > 1:
             named = f", such as '{what}.{run.layout[what].elements[0]}'" if isinstance(what, str) else ""
-            raise InvalidValue(
-                f"expected one number in every cycle, got {values.shape[1]} of {what!r}; name one of them{named}"
-            )
+            raise InvalidValue(f"expected one number a cycle, got {values.shape[1]} of {what!r}; name one{named}")
         return float(figure(values[measured_cycles(problem, run)], problem.period))
 
     whole = partial(_of_whole_runs, function)
