@@ -31,6 +31,7 @@ class Column:
     head: str  # its heading
     short: str | None = ""  # its heading where there is little room; '': the same one; None: the column is not there
     left: bool = False  # whether its texts stand on the left
+    note: str = ""  # what its numbers are
 
 
 @dataclass(frozen=True)

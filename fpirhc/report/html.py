@@ -191,6 +191,8 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
     for e in entries:
         for c in e.run.layout["desired"].elements:
             lines = [(what, e.run[f"{signal}.{c}"]) for what, signal in responses_of(e.run.layout).items()]
+            aim = e.run[f"desired.{c}"]  # what lies on it everywhere is not drawn too
+            lines = [(n, v) for n, v in lines if n in ("desired", "realised") or not np.array_equal(v, aim)]
             chart = _chart(f"{e.name}: responses of {c}", e.run.unit(f"desired.{c}"), lines, edges)
             charts.append({**chart, "only": e.name})
     real = [e for e in entries if "reality_state" in e.run.layout]

@@ -97,13 +97,13 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         alike, in_words = len(by_text) == 1 < len(table.rows), table.columns[k].left and table.names == 1
         if alike or in_words:  # one name tells a row from others
             most = max(by_text, key=lambda text: len(by_text[text]))
-            apart = [f"{text} ({', '.join(names)})" for text, names in by_text.items() if text != most]
-            below.append(f"{table.columns[k].head}: {'; '.join([*apart, 'else ' * bool(apart) + (most or '-')])}")
+            apart = [f"{table.columns[k].head} of {', '.join(n)}: {t}" for t, n in by_text.items() if t != most]
+            below += [*apart, f"{table.columns[k].head}{' of the others' * bool(apart)}: {most or '-'}"]
         elif len(_parts(table.of([*range(table.names), *kept, k]), width)) == 1:
             kept.append(k)
         else:
             more.append(table.columns[k].head)
-    show_table(table.of([*range(table.names), *kept]), console) if kept else None
+    show_table(replace(table.of([*range(table.names), *kept]), caption=""), console) if kept else None
     if more:
         below.append(f"more columns by --verbose: {', '.join(more)}")
     for text in below:

@@ -16,7 +16,7 @@ from fpirhc.contraction.spectrum import ContractionReport, assess_gain
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.built import checked
 from fpirhc.controllers.contract import resolved
-from fpirhc.errors import FpirhcError, InvalidName, Mistakes, NotContractive, nearest
+from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, Mistakes, NotContractive, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.chain import response_names
@@ -34,7 +34,7 @@ from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
-from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, findings, follows, objective
+from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, by_reason, findings, follows, objective
 from fpirhc.summary import Column, Table, number, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compile_all
@@ -82,17 +82,13 @@ class Contraction:
         near = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1]) ** 2, axis=0))
         named = zip(run.layout["desired"].elements, near, strict=True)
         each = (f"{n} {written_out(v)}{with_space(run.unit(f'desired.{n}'))}" for n, v in named)
-        one, factor = self.report, "No factor is measured: the response is late, or does not move in every direction"
+        one, text = self.report, "No factor is measured: the response is late, or does not move in every direction"
         if np.isfinite(self.measured):  # a fit is right within two hundredths
             wrong = one.converging and self.measured > one.predicted + 0.02
-            factor = (
-                f"Measured factor {written_out(self.measured)}{': the bound does not hold in this run' * bool(wrong)}"
-            )
+            text = f"Measured factor {written_out(self.measured)}{': the bound does not hold here' * bool(wrong)}"
         if one.converging and run.controller not in lost:
-            factor = (
-                f"The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review. {factor}"
-            )
-        return f"{one.text}. {factor}; realised - desired, rms: {', '.join(each)}."
+            text = f"The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review. {text}"
+        return f"{one.text}. {text}; realised - desired, rms: {', '.join(each)}."
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,9 +151,17 @@ class Comparison(Study):
         done = [e.metrics for e in self.entries if e.name in self.rivals]
         best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.main}
         best = {c: number for c, number in best.items() if number is not None}
-        heads = [Column(c.heading, c.short if c.metric.main else None) for c in shown]
-        heads = [Column("controller"), *heads, Column("cycle / 99 % / longest [us]"), Column("status", left=True)]
-        table = Table(self.title, heads)
+        said = {
+            c.metric: (c.metric.function.__doc__ or "").partition("\n")[0].removeprefix("Return ").rstrip(".")
+            for c in shown
+        }
+        heads = [Column(c.heading, c.short if c.metric.main else None, note=said[c.metric]) for c in shown]
+        heads = [Column("controller"), *heads, Column("cycle / 99 % / longest [us]"), Column("cycles", left=True)]
+        table = Table(
+            self.title,
+            heads,
+            "; ".join(f"{m.short or m.heading}: {text}" for m, text in said.items() if m.main and text),
+        )
         for e in self.entries:
             numbers = [(c, c.number(e.metrics)) for c in shown]
             marked = [k for k, (c, v) in enumerate(numbers, 1) if e.name in self.rivals and v == best.get(c, np.nan)]
@@ -206,7 +210,7 @@ def compare(
         controllers: names; None: all.
         compiled: whether loops run as compiled C; None: where runs are long.
         command: that reproduces the comparison.
-        progress: called with (controller, cycles done, cycles in all).
+        progress: called with (controller or 'compiling', cycles done, cycles in all).
     """
     begin, selected = time.perf_counter(), select(task, controllers)
     check_gains(task, selected)
@@ -218,7 +222,12 @@ def compare(
             rows.compose(name)
         except FpirhcError as error:
             skipped[name] = str(error)
+    if not rows.composed:
+        raise InvalidProblem("; ".join(f"{', '.join(names)}: {why}" for why, names in by_reason(skipped).items()))
+    tell = progress if progress and rows.wanted else lambda *_: None
+    tell("compiling", 0, 1)
     compile_all(rows.wanted)
+    tell("compiling", 1, 1)
     for name in rows.composed:
         try:
             entries.append(rows.entry(name, progress and partial(progress, name)))

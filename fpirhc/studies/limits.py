@@ -16,7 +16,7 @@ import pandas as pd
 from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import AboveZero, Seed
-from fpirhc.problem_files.problem_file import Task
+from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.sensing.sensing import Sensor
 from fpirhc.simulation.metrics import Metric, measured_cycles
 from fpirhc.simulation.ranges import hard_limits
@@ -25,8 +25,8 @@ from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import Kept, Row, Runner, header_of
 from fpirhc.studies.variants import Draws, Variant
-from fpirhc.studies.verdict import ranges
-from fpirhc.summary import Column, Table, in_percent, number
+from fpirhc.studies.verdict import AT_LIMITS, HELPS, Objective, chatter, ranges
+from fpirhc.summary import Column, Table, in_percent, number, written_out
 from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
 
@@ -35,6 +35,7 @@ PLANTS = 100  # drawn for every percent of 'plants'
 _NEAR, _HALVINGS = 1.05, 14
 _OUTSIDE = 0.02  # of a limit's range: what is farther outside has left it
 _FARTHEST = 128  # cycles of latency
+_MEASURED = "rms_error", "total_variation", "effort", "at_limit"
 
 
 @dataclass(frozen=True)
@@ -156,12 +157,14 @@ class Limits(Study):
         table: a row per controller and quantity: unit, holds (NaN where the problem as it stands fails), error (largest relative
             one there), fails (infinite where nothing does), and why.
         fails: relative error from which a run has failed.
-        tried: by quantity and controller the values that were tried, each with the largest relative error there.
+        tried: by quantity and controller the values that were tried, each with the row of the run with the largest error there.
+        beats: by quantity what is said of each that adapts: up to which of these it beats its partner.
     """
 
     table: pd.DataFrame
     fails: float
-    tried: Mapping[str, Mapping[str, Sequence[tuple[float, float]]]]
+    tried: Mapping[str, Mapping[str, Mapping[float, Row]]]
+    beats: Mapping[str, Sequence[str]]
 
     @property
     def view(self) -> View:
@@ -172,33 +175,35 @@ class Limits(Study):
         for row in rows:
             share = row.unit.startswith("of ")  # of the range, of the samples
             holds, fails = (number(100 * value if share else value) for value in (row.holds, row.fails))
-            unit = f"{'% ' if share else ''}{row.unit}"
-            where = f"at {fails} {unit}"
+            where = f"at {_with_unit(row.fails, row.unit)}"
             if math.isnan(row.holds):
                 holds, fails, where = "none", "as it stands" if row.unit else fails, "as it stands"
             elif row.fails > 1e300:
                 fails, where = "none tried", "nowhere that is tried"
-            what = f"{row.quantity} [{unit}]" if row.unit else row.quantity
+            what = f"{row.quantity} [{'% ' * share}{row.unit}]" if row.unit else row.quantity
             there = "" if math.isnan(row.error) else in_percent(row.error)
             shown.add([row.controller, what, holds, there, fails, row.why])
             if row.unit:
                 grown[row.quantity] = what, 100 if share else 1
-                borne.setdefault(f"{row.quantity}".capitalize(), []).append(f"{row.controller} fails {where}")
+                borne.setdefault(row.quantity, [*self.beats[row.quantity]]).append(f"{row.controller} fails {where}")
         grows = " ".join(f"{name.capitalize()}: {_GROWS[name]}." for name in dict.fromkeys(self.table.quantity))
         about = (
             f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
-            "reference's range. What holds may have a large error."
+            "reference's range. What holds may have a large error. One beats another by a tenth of its error, with "
+            "a command neither chattering nor at limits."
         )
         for what, (head, times) in grown.items():
-            known = {name: dict(pairs) for name, pairs in self.tried[what].items()}
+            known = self.tried[what]
             values = sorted(set.intersection(*map(set, known.values())))  # at which all controllers were tried
             columns = [Column(text) for text in ("controller", *(number(times * v) for v in values))]
             tables.append(Table(f"error at {head}", columns))
-            for name, errors in known.items():
-                tables[-1].add([name, *(in_percent(errors[v]) if math.isfinite(errors[v]) else "none" for v in values)])
+            for name, tried in known.items():
+                tables[-1].add([name, *(Objective().text(tried[v]["error"]) for v in values)])
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
-        return View(self, [(f"{q}: {', '.join(some)}.", None) for q, some in borne.items()], about, tables, facts)
+        return View(
+            self, [(f"{q.capitalize()}: {'; '.join(some)}.", None) for q, some in borne.items()], about, tables, facts
+        )
 
 
 @checked_call
@@ -239,7 +244,7 @@ def limits(
     wanted = list(over or QUANTITIES)
     for name in [one for one in wanted if one not in QUANTITIES]:
         raise InvalidName(f"quantity '{name}' is unknown.{nearest(name, QUANTITIES)}")
-    metrics = [*(m for m in task.metrics if m.name == "rms_error"), Metric("outside", _outside)]
+    metrics = [*(m for m in task.metrics if m.name in _MEASURED), Metric("outside", _outside)]
     header = header_of(replace(task, controllers=chosen), {"kind": "limits", "fails": fails, "seed": seed}, metrics)
     with Kept(folder and folder / "limits.jsonl", header) as kept:
         rows = {(row["controller"], row["quantity"]): row for row in kept.rows}
@@ -252,9 +257,33 @@ def limits(
                     kept.append(found)
                 if progress:
                     progress(name, done, len(wanted))
-    tried = {what: {name: rows[name, what].pop("tried", ()) for name in chosen} for what in wanted}
+    tried = {what: {name: dict(rows[name, what].pop("tried", ())) for name in chosen} for what in wanted}
     table = pd.DataFrame([rows[name, what] for name in chosen for what in wanted])
-    return Limits(table=table, fails=fails, tried=tried, **circumstances(task, chosen, command, begin))
+    pairs = [(name, plain) for name in chosen if (plain := pair_of(chosen, name)) not in (None, name)]
+    told = {what: [_beats(task.problem, pair, rows[pair[0], what], tried[what]) for pair in pairs] for what in wanted}
+    return Limits(table=table, fails=fails, tried=tried, beats=told, **circumstances(task, chosen, command, begin))
+
+
+def _beats(problem: Problem, pair: tuple[str, str], row: Row, tried: Mapping[str, Mapping[float, Row]]) -> str:
+    """Up to which value that both were tried at a controller beats its partner, and what it has at the next one."""
+    upto, why, (name, partner) = "", "", pair
+    for value in sorted(tried[name].keys() & tried[partner].keys()):
+        own, plain, where = tried[name][value], tried[partner][value], _with_unit(value, row["unit"])
+        if not own["error"] < HELPS * plain["error"]:
+            why = f"error of {Objective().text(own['error'])} against {Objective().text(plain['error'])}"
+        elif times := chatter(own, plain, problem):
+            why = f"it chatters, {written_out(times)} times the total variation"
+        elif own["at_limit"] > AT_LIMITS:
+            why = f"its command is at a limit in {in_percent(own['at_limit'])} of cycles"
+        if why:
+            return f"{name} {f'beats {partner} up to {upto}, and not' if upto else f'does not beat {partner}'} at {where}: {why}"
+        upto = where
+    return f"{name} beats {partner} up to {upto}"
+
+
+def _with_unit(value: float, unit: str) -> str:
+    share = unit.startswith("of ")
+    return f"{number(100 * value if share else value)} {'% ' * share}{unit}"
 
 
 def _outside(problem: Problem, run: Run) -> float:
@@ -273,13 +302,13 @@ def _why(row: Row, fails: float) -> str:
 
 
 def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float) -> Mapping[str, object]:
-    reasons, errors = dict[float, str](), dict[float, float]()
+    reasons, worst = dict[float, str](), dict[float, Row]()
 
     def failed(value: float) -> bool:
         if value not in reasons:
             try:
                 rows = [*runner.rows(quantity.at(value))]
-                errors[value] = max(row["error"] for row in rows)
+                worst[value] = max(rows, key=lambda row: float(row["error"]))
                 reasons[value] = next(filter(None, map(partial(_why, fails=fails), rows)), "")
             except FpirhcError as error:
                 if value <= quantity.first:
@@ -293,8 +322,9 @@ def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float)
         holds, ends = (math.nan, quantity.start) if start else bracket(failed, quantity)
     except FpirhcError as error:
         return {"unit": "", "holds": math.nan, "error": math.nan, "fails": math.nan, "why": f"not tried: {error}"}
-    row = {"unit": quantity.unit, "holds": holds, "error": errors.get(holds, math.nan), "fails": ends}
-    return row | {"why": reasons.get(ends, ""), "tried": [*errors.items()]}
+    there = worst[holds]["error"] if holds in worst else math.nan
+    row = {"unit": quantity.unit, "holds": holds, "error": there, "fails": ends}
+    return row | {"why": reasons.get(ends, ""), "tried": [*worst.items()]}
 
 
 def bracket(failed: Callable[[float], bool], of: Quantity) -> tuple[float, float]:

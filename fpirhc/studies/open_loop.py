@@ -206,9 +206,7 @@ def first_plans(task: Task, controllers: Sequence[str] | None) -> list[Solved]:
     own = {name: task.controllers[name].planner for name in controllers or task.controllers}
     planners = {name: one for name, one in own.items() if one is not None}
     if problem.horizon is None or not planners:
-        raise InvalidProblem(
-            f"problem '{task.name}' has no horizon, or none of {', '.join(own)} plans with an optimiser"
-        )
+        raise InvalidProblem(f"problem '{task.name}' has no horizon, or none of {', '.join(own)} plans by an optimiser")
     alike: dict[object, list[str]] = {}
     for name, one in planners.items():
         alike.setdefault(identity((one.optimiser, one.cost)), []).append(name)

@@ -287,14 +287,10 @@ class Kept:
             head, *self.rows = map(json.loads, lines) if lines else (first,)
             other = {key for key in first if key in head and head[key] != first[key]}
         except (ValueError, TypeError, AttributeError):
-            raise OutputError(
-                f"'{path}' holds no rows of a study; give another folder with --out, or remove it"
-            ) from None
+            raise OutputError(f"'{path}' holds no rows of a study; give another --out, or remove it") from None
         if other:
             said = ", ".join(f"{key} was {head[key]}, is {first[key]}" for key in first if key in other)
-            raise OutputError(
-                f"'{path}' holds rows of another study ({said}); give another folder with --out, or remove the file"
-            )
+            raise OutputError(f"'{path}' holds rows of another study ({said}); give another --out, or remove the file")
         with writing(self._path, "--out"):
             path.write_text("".join(f"{line}\n" for line in (json.dumps(head | first), *lines[1:])), encoding="utf-8")
             self._file = path.open("a", encoding="utf-8")

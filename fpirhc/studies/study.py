@@ -20,7 +20,7 @@ from fpirhc.studies import Progress, Study, View, circumstances
 from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import run_variants
 from fpirhc.studies.variants import CasesOf, Draws, Variants
-from fpirhc.studies.verdict import STILL, TO_AND_FRO, WILD, Objective, Outcome, objective
+from fpirhc.studies.verdict import Objective, Outcome, chatter, objective
 from fpirhc.summary import Column, Table, in_percent, written_out
 
 _TAIL, _MOVES = 0.025, "total_variation."  # on either side of an interval; the metric of movement
@@ -68,7 +68,11 @@ class VariantStudy(Study):
             "chatter": self.chatter,
             "versions": self.versions,
         }
-        shares = "" if self.figure.metric else " Errors are rms, in % of the range of the reference."
+        shares = (
+            ""
+            if self.figure.metric
+            else " Errors are rms, in % of the range of the reference; points are percent of it."
+        )
         lists = {"Worst runs": [*_commands(self)]}
         return View(self, [*_sentences(self)], f"{self.variants}.{shares}", tables, facts, lists)
 
@@ -138,11 +142,8 @@ def _chatter(table: pd.DataFrame, task: Task) -> dict[str, dict[str, float]]:
     pairs, found = {name: pair_of(task.controllers, name) for name, _ in good}, dict[str, dict[str, float]]()
     for (name, variant), own in good.items():
         plain = good.get((pairs[name], variant))
-        for column in map(str, table.filter(like=_MOVES)) if plain else ():
-            moved, size = own[column], own[column.replace(_MOVES, "effort.")]
-            before, time = max(plain[column], STILL * size), task.problem.duration - task.problem.measure_from
-            if moved > WILD * before and moved * time >= TO_AND_FRO * size:
-                found.setdefault(name, {})[variant] = moved / before
+        if plain and (times := chatter(own, plain, task.problem)):
+            found.setdefault(name, {})[variant] = times
     return found
 
 
@@ -210,13 +211,14 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     than, most = ("smaller", "smallest") if aim.sign > 0 else ("larger", "largest")
     for row in _rows(summary.iloc[1:]):
         medians = f"in the median {aim.text(summary['median'].iloc[0])} -> {aim.text(row.median)}"
-        share = f"{than} in {row.better} of {row.variants}, {medians}.{''.join(_moved(result, row.controller))}"
+        share = f"in {row.better} of {row.variants}, {medians}.{''.join(_moved(result, row.controller))}"
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
         better = Outcome.DOUBTFUL if row.controller in result.chatter else Outcome.BETTER
         clear = better if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
-        few = math.isnan(row.low)  # for an interval
-        said = "against" if few else _CLEAR.get(clear, "is not clearly different from")
-        yield f"{row.controller} {said} {summary.index[0]} by {aim.column}: {share}", None if few else clear
+        said = f"{_CLEAR.get(clear, 'is not clearly different from')} {summary.index[0]} by {aim.column}: {than}"
+        if few := math.isnan(row.low):  # for an interval
+            said = f"has a {than} {aim.column} than {summary.index[0]}"
+        yield f"{row.controller} {said} {share}", None if few else clear
     axes = getattr(result.variants, "axes", {})
     for name, some in result.table.groupby("controller", sort=False) if axes else ():
         good = some.loc[some.outcome == "finished"]
@@ -268,8 +270,6 @@ def _commands(result: VariantStudy) -> Iterator[str]:
 
 def figure_of(result: VariantStudy) -> Any:
     """Return the picture of a study: lines or maps over the settings of a grid, else the sorted values of every controller."""
-    from matplotlib.ticker import LogFormatter
-
     from fpirhc.simulation.drawing import PALETTE, draw_legend, literal, new_figure
 
     axes, table = getattr(result.variants, "axes", {}), result.table
@@ -302,7 +302,8 @@ def figure_of(result: VariantStudy) -> Any:
         axis.plot(across, own.shown if axes else np.sort(own.shown), ".-", color=colours[name], label=literal(name))
     if shown.shown.min() > 0:
         axis.set_yscale("log")
-        axis.yaxis.set(major_formatter="{x:g}", minor_formatter=LogFormatter(minor_thresholds=(2, 1)))
+        few = shown.shown.max() < 20 * shown.shown.min()  # ticks, which all have their numbers
+        axis.yaxis.set(major_formatter="{x:g}", minor_formatter="{x:g}" if few else "")
     axis.set(xlabel="share of the variants [%]", ylabel=with_unit[column])
     for name, values in axes.items():
         axis.set_xlabel(literal(with_unit[name]))

@@ -103,7 +103,8 @@ class Draws(Variants):
 
     def __str__(self) -> str:
         within = f"exact parameters and dead times within {self.percent:g} % of the problem's"
-        return f"{self.count} plants of seed {self.seed}, {within if self.percent else 'drawn in noise and stated spreads alone'}"
+        alone = "which differ in noise and stated spreads alone (--mismatch P draws parameters too)"
+        return f"{self.count} plants of seed {self.seed}, {within if self.percent else alone}"
 
     @property
     def same(self) -> Mapping[str, object]:

@@ -64,7 +64,7 @@ class Objective:
 
     def difference(self, value: float) -> str:
         """Return a difference of two numbers as text."""
-        return f"{100 * value:+.3g} %" if self.metric is None else f"{value:+.3g}{self._unit}"
+        return f"{100 * value:+.3g} points" if self.metric is None else f"{value:+.3g}{self._unit}"
 
     @property
     def _unit(self) -> str:
@@ -143,8 +143,9 @@ class Finding:
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
-STILL = 1e-6  # of the rms command per unit of time: what moves less stands still
+STILL = 1e-5  # of the limits' range, or of the rms command, in a cycle: what moves less stands still
 WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own span: chatter
+AT_LIMITS = 0.2  # of the cycles: a command that is at a limit more often
 SWING = 0.05  # of the limits' range: as a sine from end to end in 11 cycles, or jumps between the ends every 10
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
 _SAMPLES = 2000
@@ -232,10 +233,26 @@ def _growth(pair: Pair) -> float:
 
 def _moves(pair: Pair, ways: float = 0.0) -> float:
     """How many times as much an input moves, of those that move `ways` times their span; what stands still moves by STILL."""
-    before, after = (e.metrics.total_variation for e in (pair.plain, pair.adaptive))
-    size, run = pair.adaptive.metrics["effort"], pair.adaptive.run
+    (before, after), run = (e.metrics.total_variation for e in (pair.plain, pair.adaptive)), pair.adaptive.run
+    still = _still(pair.yard.problem, pair.adaptive.metrics["effort"])
     moved = [n for n in after if after[n] > 0 and np.abs(np.diff(c := run[f"command.{n}"])).sum() >= ways * np.ptp(c)]
-    return max((after[n] / max(before[n], STILL * size[n]) for n in moved), default=math.nan)
+    return max((after[n] / max(before[n], still[n]) for n in moved), default=math.nan)
+
+
+def _still(problem: Problem, effort: Mapping[str, float]) -> dict[str, float]:
+    low, high = problem.limits.input_bounds(problem.plant)
+    ranges = dict(zip(problem.plant.inputs, (high - low).tolist(), strict=True))
+    return {n: STILL / problem.period * (ranges[n] if math.isfinite(ranges[n]) else size) for n, size in effort.items()}
+
+
+def chatter(own: Mapping[str, Any], plain: Mapping[str, Any], problem: Problem) -> float:
+    """Return how many times as much as its partner's a command moves, by rows of runs; 0 where none goes to and fro."""
+    effort, times = {n: own[f"effort.{n}"] for n in problem.plant.inputs}, [0.0]
+    for name, still in _still(problem, effort).items():
+        moved, before = (row[f"total_variation.{name}"] for row in (own, plain))
+        if moved * (problem.duration - problem.measure_from) >= TO_AND_FRO * effort[name]:
+            times.append(moved / max(before, still))
+    return max(times) if max(times) > WILD else 0.0
 
 
 _chatters = partial(_moves, ways=TO_AND_FRO)
@@ -286,11 +303,11 @@ class Flag:
 
 NULL = "its own model as the plant, the problem's sensors and no disturbances"
 FLAGS = (
-    Flag(_left_alone, 1.0, "its rms error is {value} times that of the plant whose inputs are held", True),
+    Flag(_left_alone, 1.0, "doing nothing is as good: rms error {value} times that of the plant whose inputs are held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
     Flag(lambda pair: pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles, 0.05,
          "{value:%} of its plans did not converge: give the optimiser more iterations", True),
-    Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], 0.2,
+    Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], AT_LIMITS,
          "its command is at a limit of {at}, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
     Flag(_swing, SWING, "both commands swing: on average each is {value:%} of its limits' range off the mean of the one before and "
          "the one after", True),
@@ -394,7 +411,7 @@ def findings(
     aim: Objective,
     causes: Sequence[str],
 ) -> tuple[Finding, ...]:
-    """Return the verdict: the headline pair first, then the others, what the file says, the best row, and what was not run."""
+    """Return the verdict: what the file says, the headline pair, then the others, the best row, and what was not run."""
     by_name = {e.name: e for e in entries}
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
     pairs.sort(key=lambda p: ((p[0].name, p[1].name) != headline, "solve" not in p[1].run.layout))
@@ -406,7 +423,7 @@ def findings(
         judged[0] = replace(judged[0], text=f"{left} {judged[0].text}")
     elif left:
         judged.append(Finding(left, Outcome.LEAVES))
-    judged += map(Finding, causes)
+    judged[0] = replace(judged[0], text=" ".join([*causes, judged[0].text]))
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 

@@ -65,9 +65,7 @@ def test_the_unit_moves_as_the_same_equation_does(unit):
     outside = fmu_body(unit, TANK, period=0.05, measures={"h": "level"}, inputs={"q": "inflow"})
     one, other = (fp.simulate(problem(reality), law, seed=0, compiled=False) for reality in (outside, None))
     assert one.stop is None
-    assert one["foreign"][:, 0] == pytest.approx(
-        other["plant_state"][:, 0], abs=2e-4
-    )  # Euler's method of 100 steps a cycle
+    assert one["foreign"][:, 0] == pytest.approx(other["plant_state"][:, 0], abs=2e-4)  # Euler's steps, 100 a cycle
 
 
 def test_a_parameter_is_set_and_a_run_begins_anew(unit):

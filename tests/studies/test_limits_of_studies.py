@@ -1,6 +1,7 @@
 """Where controllers fail: limits that theory gives exactly, and what is said of them."""
 
 import math
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -131,8 +132,16 @@ def test_a_state_that_leaves_its_limits_has_failed():
 
 
 def test_what_each_bears_is_told():
-    task = tasks.made(pump(1.2), {"law": LAW, "law+FPI": ADAPTIVE})
-    one = fp.limits(task, over=["mismatch"], compiled=False)
-    each = ", ".join(f"{row.controller} fails at {row.fails:.4g} times the file's" for row in one.table.itertuples())
-    assert one.view.sentences == [(f"Mismatch: {each}.", None)]
+    """Beside what fails up to where adaptation is better: a comparison with the same noise says so too."""
+    wave = fp.Trajectory(lambda t: {"y": ca.sin(t)})
+    task = tasks.made(pump(1.2, reference=wave, duration=40.0, measure_from=10.0), {"law": LAW, "law+FPI": ADAPTIVE})
+    one = fp.limits(task, over=["noise"], compiled=False)
+    each = "; ".join(f"{r.controller} fails at {100 * r.fails:.4g} % of the range" for r in one.table.itertuples())
+    [(text, _)] = one.view.sentences
+    assert text.startswith("Noise: law+FPI beats law up to ")
+    assert text.endswith(f": {one.beats['noise'][0].rpartition(': ')[2]}; {each}.")
+    two = [float(value) / 100 for value in re.findall(r"([\d.]+) % of the range(?=[,:])", one.beats["noise"][0])]
+    noisy = [replace(task.problem, sensing=fp.Sensing({"y": fp.Sensor(noise=fp.Noise(2 * v))})) for v in two]
+    outcomes = [str(fp.compare(replace(task, problem=p), seed=0, compiled=False).outcome) for p in noisy]
+    assert outcomes[0] == "better" != outcomes[1]
     assert [[row.cells[0] for row in table.rows] for table in one.view.tables] == [["law", "law+FPI"]] * 2

@@ -79,7 +79,10 @@ def test_a_drawn_plant_is_its_number(task):
     assert len({seed for seed, _ in more}) == len({exact for _, exact in more}) == 20
     assert [seed for seed, _ in drawn(task, percent=10.0)] == [seed for seed, _ in some]
     assert all(one.problem is task.problem for one in fp.Draws(3).of(task))  # noise alone
-    assert str(fp.Draws(3)) == "3 plants of seed 0, drawn in noise and stated spreads alone"
+    assert (
+        str(fp.Draws(3))
+        == "3 plants of seed 0, which differ in noise and stated spreads alone (--mismatch P draws parameters too)"
+    )
 
 
 def test_factors_are_log_uniform():
@@ -262,7 +265,7 @@ def test_a_summary_is_that_of_the_rows(task):
     assert text.endswith(f"smaller in {(apart < 0).sum()} of 12, in the median {before} -> {after}. {told}")
     turned = ["CTC+FPI", "CTC"]
     few = fp.study(task, fp.Draws(4, 20.0, 5), compiled=False, controllers=turned)
-    assert "CTC against CTC+FPI by error: smaller in 0 of 4, in the median" in few.view.sentences[0][0]  # it moves less
+    assert "CTC has a smaller error than CTC+FPI in 0 of 4, in the median" in few.view.sentences[0][0]  # it moves less
     mine = fp.Metric("largest", lambda problem, run: float(abs(run["command.u"]).max()), unit="N", main=True)
     own = replace(task, headline=("CTC+FPI", "CTC"), metrics=[*task.metrics, mine])
     headed = fp.study(own, fp.Draws(1), compiled=False)
@@ -311,7 +314,7 @@ def test_a_study_speaks_of_the_headline_metric(task):
     assert found.summary["median"].to_dict() == pytest.approx(own.median().to_dict())
     assert found.summary.worst.to_dict() == own.min().to_dict()
     assert found.summary.better["CTC+FPI"] == (own["CTC+FPI"] > own["CTC"]).sum()
-    assert sentences(found)[0].startswith("CTC+FPI against CTC by nadir: larger in ")
+    assert sentences(found)[0].startswith("CTC+FPI has a larger nadir than CTC in ")
     before = Path("out/runs.jsonl").read_bytes()
     again = fp.study(task, fp.CasesOf(), folder=Path("out"), metric="rms_error.y", compiled=False)
     assert Path("out/runs.jsonl").read_bytes() == before

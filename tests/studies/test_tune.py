@@ -18,9 +18,7 @@ TUNING = """tuning = {
     "CTC+FPI": {"deformation.gain": fp.LogSpan(-6.0, -0.05)},
 }
 """
-LINE = line_text(
-    "period=5e-3, duration=1.5, measure_from=0.5", "fp.Sigmoid(gain=-0.1, scale=20.0)", more=EXACT + TUNING
-)
+LINE = line_text("period=5e-3, duration=1.5, measure_from=0.5", "fp.Sigmoid(gain=-0.1, scale=20)", more=EXACT + TUNING)
 
 
 @pytest.fixture
