@@ -125,7 +125,7 @@ BAD = {
         r"2 poles are given, .* relative order 2 has 3 modes with the sum",
     ),
     "outside": (lambda: fp.ShiftPolynomial(1.0, step=T), r"1 is not inside the unit circle"),
-    "conjugate": (lambda: fp.ShiftPolynomial((0.5 + 0.1j,), step=T), "together with its conjugate"),
+    "conjugate": (lambda: fp.ShiftPolynomial((0.5 + 0.1j,), step=T), "with its conjugate"),
     "fractional": (lambda: fp.Fractional(rate=0.2, order=0.8), r"has the pole z = -1 and does not decay"),
 }
 
