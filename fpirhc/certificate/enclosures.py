@@ -114,8 +114,7 @@ def _curved(
         least, largest = (
             0.5 * a.radius**2 * end for end in (np.minimum(np.minimum(*bends), 0), np.maximum(np.maximum(*bends), 0))
         )
-        steep = slope(a.centre)
-        centre = value(a.centre) + 0.5 * (least + largest)
+        steep, centre = slope(a.centre), value(a.centre) + 0.5 * (least + largest)
         return _form(centre, steep * a.slopes, np.abs(steep) * a.spread + 0.5 * (largest - least))
 
     return rule

@@ -278,5 +278,4 @@ def embedded(name: str, composite: Composite, feeds: dict[str, Signal]) -> Block
         remembered = {f"{m}_next": v for m, v in composite.memory.split(next_memory).items()}
         return {**composite.trace.split(trace), **remembered}
 
-    inside = composite.trace, step, composite.memory, composite.opaque
-    return Block(name, Layout(reads), *inside)
+    return Block(name, Layout(reads), composite.trace, step, composite.memory, composite.opaque)

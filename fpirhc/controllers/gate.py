@@ -164,8 +164,7 @@ class Gate:
             fits, column = before(now, own, clock)
             told = self.stored.split(column)
             sample = [told[r] if r in told and self.inner.opaque else getattr(s, r) for r in self.inner.reads.names]
-            memory = self.controller_memory.join(vars(s))
-            usable = expression(True)
+            memory, usable = self.controller_memory.join(vars(s)), expression(True)
             if not self.simulated:
                 failed = is_trial(getattr(s, FAILED))
                 usable = ca.logic_and(finite(memory, opaque=self.inner.opaque), ca.logic_not(failed))

@@ -177,8 +177,7 @@ def _estimate_block(
 
     outputs = (pairs.seen,) * pairs.with_outputs
     reads = Layout((pairs.state, *outputs, plant.response_signal("realised"), plant.parameter, acted))
-    writes = Layout((believed, estimate))
-    return Block("estimate", reads, writes, step, own, opaque=True)
+    return Block("estimate", reads, Layout((believed, estimate)), step, own, opaque=True)
 
 
 def examples(inner: Controller) -> tuple[Controller, ...]:

@@ -182,8 +182,7 @@ def _recovery(problem: Problem, law: Tracking | None) -> float:
 
 def _largest_error(problem: Problem) -> float:
     """Largest |r^N - response(x^N, 0)| of the model along the reference, over the samples where it is finite."""
-    plant = problem.plant
-    times = np.linspace(0.0, problem.duration, _INSTANTS)
+    plant, times = problem.plant, np.linspace(0.0, problem.duration, _INSTANTS)
     states = reference_states(problem, _INSTANTS)
     wanted = np.asarray(nominal_motion(problem).map(_INSTANTS)(times[None, :])[1].full())
     model, still = np.repeat(plant.approximate[:, None], _INSTANTS, axis=1), np.zeros((plant.input.size, _INSTANTS))

@@ -63,8 +63,7 @@ class _Queued(Wrapper):
         desired_then = ca.if_else(memory["queue_filled"] < 0.5, request, memory["queue_now"])
         requests = queue.pushed(memory["queue_requests"], request)
         undeformed = queue.pushed(memory["queue_desired"], desired_then)
-        valid = memory["queue_filled"] >= queue.length - 1
-        size = desired.numel()
+        valid, size = memory["queue_filled"] >= queue.length - 1, desired.numel()
         request, then = (queue.delayed(past, size) for past in (requests, undeformed))
         increments = self.form.compares == "increment"
         next_request, next_memory = self.map.step(request, response, then if increments else desired, inner)

@@ -89,8 +89,7 @@ class RFPTVector(_Transformation):
     ) -> tuple[Expression, dict[str, Expression]]:
         """Return r + B_c [tanh(A_c s) / s] (n r + K_c h); s is |h| rounded off above zero, n is |h| and zero at h = 0."""
         del memory
-        error = response - desired
-        floor = _FLOOR / abs(self.gain)
+        error, floor = response - desired, _FLOOR / abs(self.gain)
         size = smooth_norm(error, floor)
         vanishing = ca.sumsqr(error) / (size + floor)
         slope = self.sign * ca.tanh(self.gain * size) / size

@@ -72,8 +72,7 @@ class Rotation(Deformation):
         rounded = chord2 + _FLOOR
         half_angle = ca.asin(0.5 * ca.sqrt(rounded))
         half_turn = self.fraction * half_angle
-        sine2 = rounded * (1 - 0.25 * rounded)
-        half_sine = ca.sin(half_turn)
+        sine2, half_sine = rounded * (1 - 0.25 * rounded), ca.sin(half_turn)
         return 2 * half_sine * ca.cos(half_turn) / ca.sqrt(sine2), 2 * half_sine**2 / sine2
 
 

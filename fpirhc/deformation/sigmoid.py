@@ -96,8 +96,7 @@ class Sigmoid(Deformation):
             InvalidValue: the scale is still to be chosen.
         """
         del memory
-        scale = self._chosen_scale()
-        error = response - desired
+        scale, error = self._chosen_scale(), response - desired
         size = smooth_norm(error, _FLOOR * scale)
         saturated = ca.tanh((self.gain / scale) * size)
         y = self._tanh_fixed_point

@@ -60,8 +60,7 @@ class Device:
     @cached_property
     def inputs(self) -> Layout:
         """What a step is given: the time and the sample."""
-        stays = {*self.data.names, *self.settings.names}
-        return self._read(lambda name: name not in stays)
+        return self._read(lambda name: name not in {*self.data.names, *self.settings.names})
 
     @cached_property
     def settings(self) -> Layout:
@@ -333,8 +332,7 @@ class Library:
 
 def shared_library(files: Mapping[str, str]) -> Library | None:
     """Return C files as a shared library; None where there is no compiler."""
-    own = find_compiler()
-    machine = platform.machine().lower()
+    own, machine = find_compiler(), platform.machine().lower()
     here = f"{_MACHINES.get(machine, machine)}-{_SYSTEMS.get(sys.platform, sys.platform)}"
     return None if own is None else Library(here, _compiled(files, [*command_of(own), *_SHARED], here))
 

@@ -187,8 +187,7 @@ class _ReferenceExpansion:
     def least_curvature(self) -> float:
         """Smallest eigenvalue of a stage's cost Hessian, relative to its largest."""
         blocks = np.block([[self.q, self.s.transpose(0, 2, 1)], [self.s, self.r]])
-        values = np.linalg.eigvalsh(blocks)
-        ends = np.linalg.eigvalsh(self.final)
+        values, ends = np.linalg.eigvalsh(blocks), np.linalg.eigvalsh(self.final)
         size = max(np.abs(values).max(), np.abs(ends).max(), 1e-300)
         return float(min(values.min(), ends.min()) / size)
 

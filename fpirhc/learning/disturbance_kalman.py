@@ -96,8 +96,7 @@ class DisturbanceKalman(ParameterEstimator):
         import scipy.linalg
 
         a, noise_input, c = self._matrices(problem)
-        model = problem.plant
-        used = self._corrected(problem, a, c)
+        model, used = problem.plant, self._corrected(problem, a, c)
         noise = np.array([self.noise.get(n, 0.0) for n in model.names])
         walk = problem.period * np.array(list(self.drift.values())) ** 2
         q = scipy.linalg.block_diag((noise_input * noise**2) @ noise_input.T, np.diag(walk))

@@ -343,8 +343,7 @@ def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Col
 def _of_two_starts(ocp: OptimalControl, one: ca.Function, memory: Layout) -> ca.Function:
     """Function like the step `one`: its result, or that from the start of its memory where that is solved and cheaper."""
     arguments = [ca.MX.sym(one.name_in(k), *one.size_in(k)) for k in range(one.n_in())]
-    warm = one(*arguments)
-    cold = one(*arguments[:4], ca.MX(ca.DM(memory.start())))
+    warm, cold = one(*arguments), one(*arguments[:4], ca.MX(ca.DM(memory.start())))
     solved = [result[1][4] == int(Status.OK) for result in (warm, cold)]
     # The cost of a plan does not count what its violations of priced limits cost, which its optimum does.
     price = paid(ocp)

@@ -235,8 +235,7 @@ def _converged(
     symbols = Anchor(*(ca.MX.sym(name, *v.shape) for name, v in zip(Anchor._fields, anchor, strict=True)))
     count, plain, ended = counts = [ca.MX.sym(name) for name in ("count", "plain", "ended")]
     tried, plan = search.tried(symbols, arguments)
-    looked = search.looked(tried, plan, arguments)
-    tolerance = settings.tolerance
+    looked, tolerance = search.looked(tried, plan, arguments), settings.tolerance
     residual = stationarity(ocp, looked.inputs, looked.slope, arguments.lower, arguments.upper)
     solved = ca.logic_and(
         looked.value < line_search.UNTRIED, ca.logic_and(residual <= tolerance, looked.sent <= tolerance)

@@ -322,9 +322,7 @@ class ReducedGradient(Optimiser):
 
 def _part(ocp: OptimalControl, state: ca.MX, k: int) -> ca.MX:
     size = ocp.input.size * ocp.stages
-    ends = [0]
-    for width in (size, _HISTORY, 1, size, 1, size):
-        ends.append(ends[-1] + width)
+    ends = np.cumsum([0, size, _HISTORY, 1, size, 1, size]).tolist()
     return state[ends[k] : ends[k + 1]]
 
 

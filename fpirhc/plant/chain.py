@@ -49,8 +49,7 @@ def operator(plant: Plant, symbols: Symbols) -> Callable[[Expression], Expressio
     """Return D of expressions of these symbols."""
     x, u, p, w = symbols
     if plant.step is None:
-        rate = plant.equations.forced_rate(x, u, p, w)
-        return lambda y: ca.jtimes(y, x, rate)
+        return lambda y: ca.jtimes(y, x, plant.equations.forced_rate(x, u, p, w))
     after, cycle = plant.equations.next(x, u, p, w), sampling(plant)
     return lambda y: (ca.substitute(ca.SX(y), x, after) - y) / cycle
 

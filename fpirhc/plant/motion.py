@@ -63,8 +63,7 @@ def sampling(plant: Plant) -> float:
 
 def with_exact_parameters(plant: Plant, exact: np.ndarray) -> Plant:
     """Return the same with other exact parameters, shape (np,); both share the Functions derived from the symbols."""
-    parameters = with_exact_values(plant.parameters, exact)
-    other = copy(plant)
+    parameters, other = with_exact_values(plant.parameters, exact), copy(plant)
     # No other cached property depends on the exact values.
     other.__dict__.pop("exact", None)
     object.__setattr__(other, "parameters", parameters)
@@ -73,8 +72,7 @@ def with_exact_parameters(plant: Plant, exact: np.ndarray) -> Plant:
 
 def controlled_places(plant: Plant) -> list[int]:
     """Return the places of the controlled quantities among all outputs, or without any among all coordinates."""
-    names = list(plant.followed)
-    return [names.index(c) for c in plant.controlled_names]
+    return [list(plant.followed).index(c) for c in plant.controlled_names]
 
 
 def places(plant: Plant, derivative: int) -> list[int]:

@@ -114,8 +114,7 @@ class Span(Checked):
 
     def number(self, share: float) -> float:
         """Return the number at `share` (0 to 1) of the way from low to high."""
-        value = self._between(share)
-        return min(max(float(f"{value:.{_DIGITS}g}"), self.low), self.high)
+        return min(max(float(f"{self._between(share):.{_DIGITS}g}"), self.low), self.high)
 
     def _between(self, share: float) -> float:
         return self.low + share * (self.high - self.low)

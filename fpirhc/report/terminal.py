@@ -265,7 +265,8 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
                 whole = f"{one.question} {one.evidence}".strip() + f" ({every})" * bool(every)
                 what = f"{len(rows)} questions" if brief else whole
                 say(f"  {one.verdict:7s} {what}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
-            say(f"          -> {change}", "bold") if change else None
+            these = f"For these {len(rows)}: " * (len(rows) > 1 and not brief)
+            say(f"          -> {these}{change}", "bold") if change else None
     advised = {one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}
     first = "Take one advice at a time, the uppermost first, and ask again after each.\n" * (len(advised) > 1)
     say(first + ", ".join(found.counts()) + ("" if verbose else "; --verbose has every answer"))

@@ -36,7 +36,7 @@ GROWS = "a push leaves {largest_factor:5} of itself a cycle later"
 MOVES = "commands change by {mean_step:%} of their range in a cycle"
 RINGS = "it swings with a period of {period} {time}, and a swing leaves {swing:%} of the last"
 BEST = "| {error_without:%} without adaptation| {error_recommended:%} at {recommended_gain:4}"
-BUSIER = "the total variation of {of} is {movement:r}| {movement_without:r} without adaptation"
+BUSIER = "the changes of {of} add up to {movement:r}| to {movement_without:r} without adaptation"
 RESERVE = "the relative error is {error:%}| {error_at_twice:%} at twice the gain" + BEST
 SAID = {1.0: "error", -1.0: "error_turned", 0.5: "error_at_half", 2.0: "error_at_twice", 4.0: "error_at_four_times"}
 Numbers = Mapping[str, float]
@@ -98,6 +98,21 @@ def _ranges(case: Case) -> Fact | None:
     return Fact(Verdict("caution" if free else "yes"), numbers, ", ".join(free)) if case.outside else None
 
 
+def _noiseless(case: Case) -> Fact | None:
+    sensing = case.problem.sensing
+    draws, names = [sensing.table(np.arange(9.0), k).T for k in (0, 1)], [n for s in sensing.drawn for n in s.elements]
+    noisy = {n.removesuffix(" noise") for n, a, b in zip(names, *draws, strict=True) if (a != b).any()}  # and no bias
+    noisy -= {n.rstrip("'") for n in sensing.sensors if "'" in n}
+    found = [n for n in sensing.measures(case.problem.plant) if "'" in n and n.rstrip("'") in noisy]
+    return Fact(Verdict.CAUTION, {"without": len(found)}, ", ".join(found)) if found else None
+
+
+def _sizes(case: Case) -> Fact | None:
+    told, _, asks = slip(case.problem).partition(": i")
+    numbers = {"apart": len(apart(case.problem))}
+    return Fact(Verdict.CAUTION, numbers, told, f"I{asks} Then mend it first.") if told else None
+
+
 def _follows(case: Case) -> Fact:
     bench, (name, share) = case.bench, case.bench.worst(case.bench.nominal)
     planner = bench.controller.planner  # whose cost may weigh no error
@@ -109,7 +124,7 @@ def _follows(case: Case) -> Fact:
     numbers |= {"mean_error": abs(column.mean())} if offset else {}  # of a wrong model in the prediction
     turned = bool(share > BAD and bench.share(bench.run(gain=-np.ones(len(case.problem.plant.inputs)))) <= NEAR)
     verdict = Verdict.NO if far else Verdict.CAUTION if offset or share > NEAR else Verdict.YES
-    return Fact(verdict, numbers, name, f"{TURNED} {slip(case.problem)}".strip() * turned, root=turned)
+    return Fact(verdict, numbers, name, TURNED * turned, root=turned)
 
 
 def _saturates(case: Case) -> Fact | None:
@@ -131,9 +146,13 @@ def _saturates(case: Case) -> Fact | None:
     at = int((stands if held > SATURATED else np.nan_to_num(needs)).argmax())
     numbers = {"at_a_limit": held} | ({"at_a_limit_without_noise": calm} if drawn else {})
     if np.isfinite(needs[at]) and not plant.equations.hidden:
-        least, most, ends = asked[:, at].min(), asked[:, at].max(), limits[:, at]
-        numbers |= {"needed": needs[at]}
-        numbers |= {"needed_least": least, "needed_most": most} if most > least else {"needed_always": most}
+        ends, known = limits[:, at], case.problem.reality is None and not case.outside
+        both = [(one[:, at].min(), one[:, at].max()) for one in wanted]
+        own = not known or bool(np.abs(np.diff(both, axis=0)).max() > NEAR * np.abs(both).max())  # the model's
+        numbers["needed"] = needs[at]
+        for by, (least, most) in [("", both[1])] * known + [("_by_model", both[0])] * own:
+            needed = {"least": least, "most": most} if most > least else {"always": most}
+            numbers |= {f"needed_{name}{by}": value for name, value in needed.items()}
         numbers |= {"lower": ends[0], "upper": ends[1]} if np.isfinite(ends).all() else {}
     once = max(np.abs(np.diff(one[:, at])).mean() for one in wanted) / case.problem.period
     moves, short = plain.moves(plain.nominal)[at], 2 * calm >= held and numbers.get("needed", 0.0) > ROOM
@@ -255,8 +274,7 @@ def _inner(case: Case) -> Fact | None:
     same = run["plant_state"].shape[1] == plant.state.size and run.cycles
     require(same, "What moves has other states than the model.")
     at = np.linspace(0, run.cycles - 1, 9).astype(int)
-    rate = max(zero_dynamics(plant, run["plant_state"][k], run["command"][k]) for k in at)
-    left = bench.back.left
+    rate, left = max(zero_dynamics(plant, run["plant_state"][k], run["command"][k]) for k in at), bench.back.left
     rate = 0.0 if abs(rate) * problem.duration < ROUNDING else rate
     held = Verdict.CAUTION if left <= 1 and bench.share(bench.nominal) <= 1 else Verdict.NO  # by the loop
     numbers = {"rate_with_outputs_held": rate}
@@ -375,8 +393,7 @@ def _model(case: Case) -> Fact:
     cured, error = case.plain.errors(case.plain.nominal)[name], numbers["error_with"]
     no = not case.outside and spoils(harms, numbers["added"], error, cured)
     caution = harms > WORSE and (case.outside or error > cured)
-    verdict = Verdict.NO if no else Verdict.CAUTION if caution else Verdict.YES
-    return Fact(verdict, numbers, name)
+    return Fact(Verdict.NO if no else Verdict.CAUTION if caution else Verdict.YES, numbers, name)
 
 
 def _pays(case: Case) -> Fact:
@@ -385,32 +402,38 @@ def _pays(case: Case) -> Fact:
     name, numbers, harms = _added(case, case.plain.errors(case.plain.nominal), case.bench.errors(case.bench.nominal))
     numbers["divided_by"] = plain / max(own, TINY)
     verdict = Verdict.YES if own < max(plain, SLIGHT) else Verdict.CAUTION  # a small one is nothing to mend
-    verdict = Verdict.NO if harms > WORSE or own > BAD else verdict
-    return Fact(verdict, numbers, name)
+    return Fact(Verdict.NO if harms > WORSE or own > BAD else verdict, numbers, name)
 
 
 QUESTIONS = (
-    Question("inside", "Do start and reference keep the hard limits of states?", _inside, "{of}", "Move them inside, or widen the "
-             "limits.", of="problem"),
+    Question("inside", "Do start and reference keep the hard limits of states?", _inside, "{of}", "Move them inside, or widen "
+             "the limits.", of="problem"),
     Question("turns", "Does an angle of the reference go on without jumps of a whole turn?", _turns, "{jumps} of {of}",
              "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its error.", of="problem"),
     Question("posed", "Has the reference finite commands?", _posed, "by the model in {share_finite:%} of the cycles",
              "Give it the derivatives that the plant's order needs, away from singular states.", of="problem"),
     Question("ranges", "Is it stated what working sensors show?", _ranges, "not for {of}", "State it, so that a failed sensor is "
              "not believed: Sensor(range=(lower, upper)).", of="problem"),
+    Question("sizes", "Have the parameters of plant and model one sign, and similar sizes?", _sizes, "{of}", "", of="problem"),
+    Question("noiseless", "Has what is derived from a noisy quantity noise, too?", _noiseless, "noise is stated of a quantity, "
+             "and none of what is derived from it: {of}", "State an estimator that computes it from the noisy samples: "
+             "Sensing(sensors, SavitzkyGolay(15, degree=2)). Or state its own sensor.", of="problem"),
     Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} of them did not converge| with 8 times the "
              "iterations the relative error is {error_with_more_iterations:%} in place of {error:%}", "Give the optimiser more "
              "iterations, or a smaller tolerance, before anything else."),
-    Question("input_limits", "Do the input limits fit the task?", _saturates, "the loop swings with a period of {period} "
-             "{time} without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| in "
-             "{at_a_limit_without_noise:%} without noise| and the reference needs {needed_least} to {needed_most:u} of {of}| and "
-             "the reference needs {needed_always:u} of {of}| whose limits are {lower} to {upper:u}", "",
-             "model gain rate weight estimator Predicted limits speed"),
-    Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}" + BEST, "No gain that was "
-             "run helps, is calm, and has reserve.", "model filter form lag Predicted estimator sensors without", "adaptive"),
+    Question("input_limits", "Do the input limits fit the task?", _saturates, "the loop swings with a period of {period} {time} "
+             "without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| in "
+             "{at_a_limit_without_noise:%} without noise| on the plant the reference needs {needed_least} to {needed_most:u} of "
+             "{of}| on the plant the reference needs {needed_always:u} of {of}| on the model the reference needs "
+             "{needed_least_by_model} to {needed_most_by_model:u} of {of}| on the model the reference needs "
+             "{needed_always_by_model:u} of {of}| and its limits are {lower} to {upper:u}", "", "model gain rate weight "
+             "estimator Predicted limits speed"),
+    Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}" + BEST,
+             "No gain that was run helps, is calm, and has reserve.", "model filter form lag Predicted estimator sensors without",
+             "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
              "motion| in the mean {mean_error:u}", "", "residual_time deviation model gain lag without rate weight estimator "
-             "Predicted rival limits speed"),
+             "Predicted learning limits speed"),
     Question("returns", "Does it come back from a push?", _returns, "{left:%} of the push is left after {pushed}", "",
              "model gain lag rate weight estimator Predicted form without limits"),
     Question("horizon", "Is the horizon long enough?", _horizon, "the relative error is {error:%}| "
@@ -422,17 +445,17 @@ QUESTIONS = (
     Question("latency", "Does it bear half a cycle of latency?", _latency, "the relative error is then {error:%}| "
              "{error_without:%} without adaptation| {left:%} of a push is left", "Run it where no command is late.",
              "gain form rate weight estimator", of="loop"),
-    Question("limits", "Do states, rates and paths keep their limits?", _left, "a limit of {of} is left in {share_of_cycles:%} of "
-             "the cycles| by at most {excess:u}", "A command keeps limits of inputs and their rates alone: leave room to the "
+    Question("limits", "Do states, rates and paths keep their limits?", _left, "a limit of {of} is left in {share_of_cycles:%} "
+             "of the cycles| by at most {excess:u}", "A command keeps limits of inputs and their rates alone: leave room to the "
              "others.", "gain rate weight speed"),
     Question("inner", "Are the zero dynamics stable?", _inner, "the largest real part is {rate_with_outputs_held} 1/{time}",
              "States without a task go off: weigh them in the cost, or control another output."),
-    Question("noise", "Is the chatter from noise small?", _noise, "noise moves {of} by {rms_step:%} of its range in a cycle| "
-             "its total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with less "
-             "noise.", "gain filter estimator rate weight"),
-    Question("model", "Would it do little harm if the model were right?", _model, "the rms error of {of} is then "
-             "{error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides, where it may cure more.",
-             "form estimator gain without", "adaptive"),
+    Question("noise", "Is the chatter from noise small?", _noise, "noise changes {of} by {rms_step:%} of its range from cycle to "
+             "cycle| its changes add up to {movement:r}| to {movement_without_noise:r} without noise", "Measure the response "
+             "with less noise.", "gain filter estimator rate weight"),
+    Question("model", "Would it do little harm if the model were right?", _model, "then, without noise, the rms error of {of} is "
+             "{error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides, where it may cure "
+             "more.", "form estimator gain without", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "the rms error of {of} is {error_without:u} "
              "without adaptation| {error_with:u} with it", "", "gain form lag estimator Predicted sensors without", "adaptive"),
 )  # fmt: skip

@@ -221,8 +221,7 @@ def with_true_response(problem: Problem, sense: Block, motion: Signal, response:
 
     `motion`: signal of the state, or of the outputs where the plant has some.
     """
-    period = problem.period
-    orders = problem.plant.response_orders
+    period, orders = problem.period, problem.plant.response_orders
     if not any(problem.plant.differences.values()):
         return sense
     places = {c: problem.plant.output.elements.index(c) for c in orders}

@@ -105,8 +105,7 @@ def _derivatives(ocp: OptimalControl) -> tuple[ca.Function, ca.Function]:
     gradient = reduced_gradient(ocp)
     nu, n = ocp.input.size, ocp.stages
     point = [ca.MX.sym(gradient.name_in(k), gradient.sparsity_in(k)) for k in range(4)]
-    direction = ca.MX.sym("d", nu, n)
-    slope = gradient(*point)[1]
+    direction, slope = ca.MX.sym("d", nu, n), gradient(*point)[1]
     along = ca.jtimes(slope, point[1], direction)
     product = ca.Function("fpirhc_hessian_times", [*point, direction], [ca.vec(along)])
     columns = product.map("fpirhc_hessian_columns", "serial", nu * n, [0, 1, 2, 3], [])

@@ -255,8 +255,7 @@ def every(block: Block, cycles: int) -> Block:
         values[f"{phase.name}_next"] = ca.if_else(next_phase > cycles - 0.5, 0, next_phase)
         return values
 
-    name = f"{block.name}_every_{cycles}"
-    return Block(name, block.inputs, block.writes, step, own, opaque=True)
+    return Block(f"{block.name}_every_{cycles}", block.inputs, block.writes, step, own, opaque=True)
 
 
 def _branches(block: Block, held: Layout) -> tuple[ca.Function, ca.Function]:

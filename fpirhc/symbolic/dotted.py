@@ -51,8 +51,7 @@ def content_at(owner: object, path: str, what: str = "the controller") -> object
     """Return what stands at a path."""
     value, names = owner, path.split(".")
     for k, name in enumerate(names):
-        every = [*levels(value)]
-        value = mapped(value, name)
+        every, value = [*levels(value)], mapped(value, name)
         if name not in names_in(value):
             where = f"'{'.'.join(names[:k])}' of {what}" if k else what
             kinds = " around ".join(type(one).__name__ for one in every)

@@ -206,9 +206,7 @@ class Layout:
 
     def split(self, flat: Matrix) -> dict[str, Matrix]:
         """CasADi column -> expressions by name."""
-        if not self.signals:
-            return {}
-        return dict(zip(self.names, ca.vertsplit(flat, self._ends), strict=True))
+        return dict(zip(self.names, ca.vertsplit(flat, self._ends), strict=True)) if self.signals else {}
 
     def join(self, expressions: Mapping[str, Matrix]) -> Matrix:
         """CasADi expressions by name -> column, in the layout's order."""

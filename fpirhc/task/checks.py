@@ -243,8 +243,7 @@ _STAGES: Latest[Mistakes] = Latest(8)
 
 
 def _of_stage(plant: Plant, cost: Cost | None, limits: Limits) -> Mistakes:
-    mistakes = Mistakes("stage")
-    view = view_of_symbols(plant)
+    mistakes, view = Mistakes("stage"), view_of_symbols(plant)
     parts = (view.state, view.output, view.reference, view.input, view.input_before, view.feedforward, view.parameters)
     symbols = (*(part.vector for part in parts), view.time)
     if cost is not None:

@@ -189,8 +189,7 @@ class Problem(Checked):
     @property
     def real_parameters(self) -> np.ndarray:
         """Parameters of the plant that a run moves in its first cycle: the exact ones, with the real values of signals."""
-        plant = self.real_plant
-        middle = self.period / 2 / self.signal_steps
+        plant, middle = self.real_plant, self.period / 2 / self.signal_steps
         return rows_of(real_values(plant, self.signals), np.array([middle]), plant.exact)[0]
 
     @cached_property

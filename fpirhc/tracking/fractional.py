@@ -95,8 +95,7 @@ class Fractional(IntegralLaw):
         def step(s: Signals) -> dict[str, Expression]:
             weights, stiffness = column[:cycles], column[cycles]
             error = s._target - getattr(s, plant.output.name)
-            errors = error_chains(plant, error)
-            running = s.warm_up > 0.5
+            errors, running = error_chains(plant, error), s.warm_up > 0.5
             integral = ca.if_else(running, s._integral_before, 0)
             measured, drift = self._decaying(integral, errors)
             last = s.decay_first + ca.vertcat(*(s.decay_past[cycles * k] for k in range(size)))
@@ -143,8 +142,7 @@ class Fractional(IntegralLaw):
         """S, and its derivative without e^(n)."""
         decaying, drift = [], []
         for k, chain in enumerate(errors):
-            gains = decay_gains(self.rate, len(chain))
-            whole = [integral[k], *chain]
+            gains, whole = decay_gains(self.rate, len(chain)), [integral[k], *chain]
             decaying.append(whole[-1] + sum(g * e for g, e in zip(gains, whole, strict=False)))
             drift.append(sum(g * e for g, e in zip(gains, chain, strict=True)))
         return ca.vertcat(*decaying), ca.vertcat(*drift)

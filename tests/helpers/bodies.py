@@ -52,8 +52,7 @@ def cycle(gains: tuple[tuple[float, ...], ...], lag: float) -> ca.Function:
 def body_problem(gains: float | list[list[float]], dead: int = 0, lag: float = 0.0, noise: float = 0.0) -> fp.Problem:
     """Return the task of such a body, with the model of one or two masses."""
     body = Body(np.atleast_2d(np.array(gains, dtype=float)), dead, lag, noise)
-    names = ["q", "p"][: len(body.gains)]
-    inputs = ["u", "w"][: len(body.gains)]
+    names, inputs = ["q", "p"][: len(body.gains)], ["u", "w"][: len(body.gains)]
     model = fp.Plant(
         dict.fromkeys(names, "m"),
         dict.fromkeys(inputs, "m/s^2"),

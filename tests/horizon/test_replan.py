@@ -43,8 +43,7 @@ def planning(optimiser=CONVERGED, deformation=None):
 
 def own_plan(problem, time, state, before, *, rate=0.0, fastest=np.inf, between=PERIOD, lengths=(1.0,) * STAGES):
     """First input of the horizon that begins at this time, by a program of its own and IPOPT."""
-    p = problem.plant.approximate
-    rate_of = problem.plant.equations.rate
+    p, rate_of = problem.plant.approximate, problem.plant.equations.rate
     opti = ca.Opti()
     u: Any = opti.variable(STAGES)
     x: Any = ca.DM(state)

@@ -29,8 +29,7 @@ def carriage(mass: float = 1.0, believed: float = 1.3) -> fp.Problem:
 
 def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
     """On the bound less the margin where the limit is active, like IPOPT's plan with the same margin."""
-    margin = 0.13
-    problem = carriage()
+    margin, problem = 0.13, carriage()
     horizon = replace(problem.horizon, margins={"q": margin})
     ocp, _, data = posed(replace(problem, horizon=horizon), time=0.3)
     first = np.asarray(ocp.start([0.55, 1.4], [0.0]).full()).ravel()

@@ -112,8 +112,7 @@ def linear_horizon():
     cost = fp.Quadratic(states={"x1": 1.0, "x2": 0.3}, effort={"u1": 0.1, "u2": 0.3})
     limits = fp.Limits(inputs={"u1": (-1.0, 1.0), "u2": (-0.7, 0.9)}, states={"x1": (-0.5, 0.6), "x2": (-0.8, 0.5)})
     reference = fp.Trajectory(lambda t: {"x1": 0.7 * ca.sin(2 * t), "x2": 0.6 * ca.cos(3 * t)})
-    horizon = fp.Horizon(stages=12, step=0.1)
-    start = {"x1": 0.0, "x2": 0.0}
+    horizon, start = fp.Horizon(stages=12, step=0.1), {"x1": 0.0, "x2": 0.0}
     problem = fp.Problem(plant, reference, start, 0.1, 0.1, limits=limits, horizon=horizon, cost=cost)
     ocp, optimiser = posed(problem)[0], fp.FixedPoint(iterations=1, tolerance=1e-9)
     return problem, compiled(optimiser.converging(ocp)), optimiser.memory(ocp).start()

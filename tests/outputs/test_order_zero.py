@@ -136,8 +136,7 @@ def test_the_integral_of_order_zero_removes_a_constant_error() -> None:
     still = replace(element(), response=lambda x, u, p: {"theta": 0 * u.u}, inverse=element().inverse)
     problem = replace(problem, plant=still)
     run = simulated(problem, fp.ComputedTorque(fp.Exponential(rate=0.5, bumpless=False)))
-    share = 14.0 / (COLD * (1 + WARMER * 100.0))
-    error = run["error.power"]
+    share, error = 14.0 / (COLD * (1 + WARMER * 100.0)), run["error.power"]
     assert error[3:60] == pytest.approx(error[2:59] - 0.5 * 0.1 * share * error[1:58], abs=1e-9)
 
 

@@ -11,8 +11,7 @@ import fpirhc as fp
 
 def _after(integrator, period, cycles):
     plant = pendulum()
-    step = integrator.step(plant, period)
-    x = np.array([1.0, 0.5])
+    step, x = integrator.step(plant, period), np.array([1.0, 0.5])
     for _ in range(cycles):
         x = step(x, [0.3], plant.exact, [0.0]).full().ravel()
     return x

@@ -25,8 +25,7 @@ def parameter(exact: float, spread: Any, **changes) -> fp.Parameter:
 
 def test_distributions_are_those_of_scipy():
     """Quantiles of the uniform, and of the normal and log-normal cut off at two standard deviations."""
-    shares = np.linspace(0.02, 0.98, 15)
-    cut = stats.truncnorm(-2.0, 2.0)
+    shares, cut = np.linspace(0.02, 0.98, 15), stats.truncnorm(-2.0, 2.0)
     for spread, known in (
         (fp.Uniform(absolute=0.4), stats.uniform(2.6, 0.8).ppf(shares)),
         (fp.Normal(absolute=0.3), 3.0 + 0.3 * cut.ppf(shares)),

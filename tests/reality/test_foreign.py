@@ -179,8 +179,7 @@ def test_a_made_body_is_new_in_every_run_and_has_its_seed():
     """The function is called once per run, with the seed of the run and the exact values."""
     seeds: list[int] = []
     problem = made(task(), seeds)
-    first = run(problem)
-    weaker = run(problem.with_exact(np.array([1.0])))
+    first, weaker = run(problem), run(problem.with_exact(np.array([1.0])))
     assert seeds == [0, 0]
     assert np.array_equal(first["plant_state"], run(outside(task()))["plant_state"])
     assert not np.array_equal(first["plant_state"], weaker["plant_state"])

@@ -64,13 +64,6 @@ def test_the_plants_of_the_box_are_drawn_by_its_mismatch():
     assert one["returns"] == none["returns"]
 
 
-def test_a_controller_that_does_not_fit_is_a_no_with_its_reason():
-    task = fp.load_problem("crane_slots")
-    wrong = replace(task.controllers["slots+FPI"], durations={"cart": 1.0})
-    found = fp.review(task.problem, {"it": wrong}, mismatch=0.0, seed=0)
-    assert [(a.key, bool(a.change), found.ready) for a in found.answers["it"]] == [("fits", True, False)]
-
-
 def noisy(size: float, name: str = "q''") -> fp.Problem:
     return mass(limits=LIMITS, sensing=fp.Sensing({name: fp.Sensor(noise=fp.Noise(size))}), measure_from=2.0)
 

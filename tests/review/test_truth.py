@@ -102,7 +102,7 @@ CASES: dict[str, Case] = {
     "a heater that would have to cool": Case(
         lambda: (reviewed.heater(), {"it": fp.ComputedTorque(fp.Exponential(3.0, integral=False))}),
         {("it", "input_limits"): "caution"},
-        {("it", "input_limits", f"needed_{end}"): (u, 1e-3) for end, u in (("least", 1 - 5**0.5), ("most", 3.5324))},
+        {("it", "input_limits", f"needed_{end}"): (u, 1e-3) for end, u in (("least", -1.13238), ("most", 3.53238))},
         changes={("it", "input_limits"): "Slow the reference to a quarter of its speed."},
     ),
     "a map that swings while plans converge": Case(
@@ -177,7 +177,7 @@ CASES: dict[str, Case] = {
     ),
     "a mass that is another one": Case(
         lambda: (biased(0.0).with_exact(np.array([1 / 10.5])), plans()),
-        changes={("RHC", "follows"): "In the model mass is 10.5 times the plant's: is it a slip of units?"},
+        changes={("RHC", "follows"): "Mend mass of the model."},
     ),
     "tanks that leak, whose plans end elsewhere": Case(
         shipped("leaking_tanks", "RHC+FPI"),

@@ -138,10 +138,8 @@ def _over(column: str, summary: Callable[[np.ndarray], np.floating]) -> Function
 
 
 def plans(problem: Problem, run: Run) -> int | None:  # noqa: ARG001 -- every metric is given the problem
-    """Return the number of different plans."""
-    if "solve" not in run.layout or not run.cycles:
-        return None
-    return len(np.unique(run["solve"], axis=0))  # a plan that is held for several cycles counts once
+    """Return the number of different plans: one that is held for several cycles counts once."""
+    return len(np.unique(run["solve"], axis=0)) if "solve" in run.layout and run.cycles else None
 
 
 _SHORTEST = 10  # cycles from which a run is long enough for a factor
