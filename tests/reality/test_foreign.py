@@ -126,8 +126,7 @@ def test_an_implausible_answer_is_a_skipped_cycle():
 @pytest.mark.parametrize("kind", BAD)
 def test_bad_answers_are_held_as_stated(kind):
     """Two bad answers are bridged with the last good one and marked; the third ends the run."""
-    problem = task()
-    bad = BAD[kind][0]
+    problem, bad = task(), BAD[kind][0]
     two = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad, range(100, 102)), MEASURES, holds=2)))
     assert two.stop is None
     assert np.flatnonzero(two["foreign_held"]).tolist() == [100, 101]
