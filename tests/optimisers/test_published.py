@@ -51,9 +51,8 @@ def rate(optimiser, ocp, data, first, iterations=25):
 @pytest.mark.parametrize("kind", [fp.FullSpaceFixedPoint, fp.GradientFixedPoint])
 def test_a_call_goes_on_where_the_one_before_ended(kind):
     """Two calls are one with twice the iterations, however small the states are."""
-    ocp, data = pendulum_problem()
-    (*_, twice), (once,) = (repeated(kind(k, tolerance=1e-6), ocp, data, FIRST / 10, 40 // k) for k in (20, 40))
-    np.testing.assert_array_equal(twice[0], once[0])
+    (*_, two), (one,) = (repeated(kind(k, 1e-6), *pendulum_problem(), FIRST / 10, 40 // k) for k in (20, 40))
+    np.testing.assert_array_equal(two[0], one[0])
 
 
 def test_the_baseline_is_orders_of_magnitude_slower_and_scaling_helps():
