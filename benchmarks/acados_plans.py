@@ -45,7 +45,7 @@ def version() -> str:
     """Which acados this is: the commit of its sources, or the wheel."""
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         return f"comma-deps-acados {importlib.metadata.version('comma-deps-acados')}"
-    command = ["git", "-C", os.environ.get("ACADOS_SOURCE_DIR", "."), "rev-parse", "--short=8", "HEAD"]
+    command = ["git", "-C", os.environ.get("ACADOS_SOURCE_DIR", os.devnull), "rev-parse", "--short=8", "HEAD"]
     return f"acados {subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip() or 'unknown'}"
 
 
