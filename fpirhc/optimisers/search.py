@@ -377,7 +377,7 @@ def solve_free(hessian: ca.SX, free: ca.SX, right: ca.SX) -> ca.SX:
 
     A pivot that is not positive is replaced by the size of its diagonal entry, so that the result is still a descent direction.
     """
-    n = hessian.shape[0]
+    n = free.numel()
     lower, pivots = ca.SX.eye(n), list[ca.SX]()
     for j in range(n):
         known = sum((lower[j, k] ** 2 * pivots[k] for k in range(j)), start=ca.SX(0))
