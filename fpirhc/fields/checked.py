@@ -136,7 +136,7 @@ class _Arguments:
             extra = described(arguments[len(self.positional)])
             yield f"{name} takes {len(self.positional)} values without a name, got {len(arguments)}; {extra} is too many"
         if missing := [key for key in self.required if key not in by_place and key not in named]:
-            told = re.findall(rf"^ *((?:{'|'.join(missing)}): [^.\n]*)", self.owner.__doc__ or "", re.MULTILINE)
+            told = re.findall(rf"^ *((?:{'|'.join(missing)}): (?:[^.\n]|\.\S)*)", self.owner.__doc__ or "", re.M)
             yield "; ".join([f"{name} needs {', '.join(missing)}; write {call_of(self.owner)}", *told])
 
 

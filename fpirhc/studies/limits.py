@@ -95,7 +95,7 @@ def _latency(problem: Problem, seed: int) -> Quantity:
         inputs = {n: times.inputs.get(n, 0.0) + value for n in problem.plant.inputs}
         late = {"inputs": inputs} if problem.moves.simulated else {"measurement": times.measurement + value}
         later = replace(problem, dead_time=replace(times, **late))
-        return _one(later, seed, value, later, problem)
+        return _one(later, seed, ("latency", value), later, problem)
 
     most = min(_FARTHEST, max(problem.cycles // 4, 1))
     return Quantity(problem.time_unit, 0.0, period, period * most, at, whole=True)
@@ -109,7 +109,7 @@ def _sensed(
     def at(value: float) -> list[Variant]:
         sensors = {n: change(sensing.sensors.get(n, Sensor()), n, value) for n in sensing.measures(problem.plant)}
         sensed = replace(problem, sensing=replace(sensing, sensors={**sensing.sensors, **sensors}))
-        return _one(sensed, seed, value, sensed, problem)
+        return _one(sensed, seed, (change.__name__, value), sensed, problem)
 
     return at
 

@@ -140,13 +140,7 @@ def test_overflowing_models_are_told_and_survived():
 
 def test_a_plan_is_begun_anew_where_no_input_leaves_the_model():
     """Y' = u - 2 sqrt(y) from 0.2 m: without inflow the plan is empty in 0.45 s, and no number comes back from there."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "m/s"},
-        order=1,
-        response=lambda q, u, p: {"y": p.gain * u.u - 2 * ca.sqrt(q.y)},
-        parameters={"gain": fp.Parameter(1.0, 1.0, "1")},
-    )
+    plant = fp.Plant({"y": "m"}, {"u": "m/s"}, GAIN, lambda q, u, p: {"y": p.b * u.u - 2 * ca.sqrt(q.y)}, order=1)
     reference = fp.Trajectory(lambda t: {"y": 0.3 + 0 * t})
     cost, horizon = fp.Quadratic(states={"y": 1.0}, effort={"u": 0.01}), fp.Horizon(stages=20, step=0.05)
     ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits(inputs={"u": (0.0, 3.0)}))
@@ -162,13 +156,7 @@ def test_a_plan_is_begun_anew_where_no_input_leaves_the_model():
 
 def test_feedback_keeps_unstable_plants_together():
     """An unstable plant over a long horizon, warm-started from a disturbed state: without the remembered feedback it overflows."""
-    plant = fp.Plant(
-        coordinates={"y": "m"},
-        inputs={"u": "N"},
-        order=1,
-        response=lambda q, u, p: {"y": 3 * q.y + 0.5 * q.y**3 + u.u * p.gain},
-        parameters={"gain": fp.Parameter(1.0, 1.0, "1")},
-    )
+    plant = fp.Plant({"y": "m"}, {"u": "N"}, GAIN, lambda q, u, p: {"y": 3 * q.y + 0.5 * q.y**3 + u.u * p.b}, order=1)
     reference = fp.Trajectory(lambda t: {"y": 0 * t})
     cost, horizon = fp.Quadratic(states={"y": 1.0}, effort={"u": 0.1}), fp.Horizon(stages=60, step=0.1)
     ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits())

@@ -45,6 +45,14 @@ def near(one: Any, value: float, share: float = 0.03) -> bool:
     return one.holds * (1 - share) <= value <= one.fails * (1 + share) and one.fails <= 1.051 * one.holds
 
 
+@pytest.mark.parametrize("order", [["latency", "lost"], ["lost", "latency"]])
+def test_quantities_that_are_asked_together_have_the_limits_of_each_alone(order):
+    problem = pump(duration=8.0, measure_from=2.0)
+    task = tasks.made(problem, {"law": LAW})
+    together = fp.limits(task, over=order, compiled=False).table.fails
+    assert [*together] == [limit_of(one, problem).fails for one in order]
+
+
 def test_mismatch_is_limited_by_the_sampled_law():
     """e+ = (1 - T b rate) e: stable up to b = 2 / (T rate); the mismatch f makes it 2^f."""
     assert near(limit_of("mismatch", pump(2.0)), math.log2(2 / (PERIOD * RATE)))
