@@ -448,12 +448,12 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows.get(e.name, math.inf))}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
-        above = "" if any(follows(e, yard) for e in entries) else "No controller follows. "
+        above = "" if any(follows(e, yard) for e in entries) else "No controller follows; fpirhc review says why. "
         among = " with the wrong model" * any(e.exact for e in entries)
         yield f"{above}Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows.get(exact.name, math.inf)]
-        if beaten:
+        if beaten and any(follows(e, yard) for e in entries):
             yield f"{exact.name} is no lower bound: errors are smaller with {', '.join(beaten)}."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:

@@ -215,7 +215,8 @@ def test_what_counts_and_what_comes_first():
     far = fp.compare(tasks.made(problem(), {"far": Played("far", Facts(2.5, 0.2), Facts())}), seed=0, compiled=False)
     assert far.verdict == (
         "No controller is here both with and without adaptation.",
-        "No controller follows. Smallest rms error: far, 101 % of the range of the reference (t = 0.5 to 4 s).",
+        "No controller follows; fpirhc review says why. Smallest rms error: far, 101 % of the range of the reference "
+        "(t = 0.5 to 4 s).",
         "far does not follow its reference: the rms error of y is larger than the motion.",
     )
     broken = fp.Metric("mine", lambda problem, run: 1 / 0)
