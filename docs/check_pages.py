@@ -25,10 +25,22 @@ def blocks(page: Path) -> list[str]:
 
 
 def run_code(page: Path) -> None:
-    """Run the blocks of a page one after the other, as a reader would paste them, in an empty folder."""
-    code, nowhere = compile("\n".join(blocks(page)), str(page), "exec"), io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(nowhere):
-        exec(code, {"__name__": "__main__"})
+    """Run the blocks of a page one after the other, as a reader would paste them, in an empty folder.
+
+    Where a block has `from NAME import *`, the blocks since the last file are NAME.py.
+    """
+    pasted: list[str] = []
+    names: dict[str, object] = {"__name__": "__main__"}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
+        sys.path.insert(0, folder)
+        for block in blocks(page):
+            for name in re.findall(r"^from (\w+) import \*$", block, re.MULTILINE):
+                if not Path(f"{name}.py").exists():
+                    Path(f"{name}.py").write_text("\n".join(pasted), encoding="utf-8")
+                    pasted = []
+            pasted.append(block)
+            exec(compile(block, str(page), "exec"), names)
+        sys.path.remove(folder)
 
 
 def wrong_commands(page: Path) -> Iterator[str]:
