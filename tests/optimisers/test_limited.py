@@ -259,7 +259,7 @@ def test_horizons_with_limits_of_inputs_only_are_rescued(start):
     call = first, data, ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start()
     plain, plan = optimiser.converging(ocp)(*call), fp.solve(ocp, optimiser, first, data)
     solved, numbers, memory = optimiser.improve(ocp, call)
-    assert plan.iterations == numbers[3, 0] > float(plain[1][3])
+    assert plan.iterations == int(numbers[3, 0]) > float(plain[1][3])
     np.testing.assert_allclose(optimiser.step(ocp)(*call[:4], memory)[0].full(), solved, rtol=1e-9)
     other = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data, calls=2)
     assert int(plain[1][4]) != fp.Status.OK
