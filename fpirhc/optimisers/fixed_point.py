@@ -196,8 +196,8 @@ def _guess(ocp: OptimalControl) -> ca.Function:
 
 
 def _row(values: np.ndarray) -> str:
-    """A C initialiser; infinities become numbers beyond every finite one."""
-    texts = (repr(v) if abs(v) <= FINITE else "-10 * FINITE" if v < 0 else "10 * FINITE" for v in values.tolist())
+    """A C initialiser; what is infinite, a limit that is absent, becomes a number beyond every finite one."""
+    texts = (repr(v) if abs(v) <= FINITE else "10 * FINITE" for v in values.tolist())
     return "{" + ", ".join(texts) + "}"
 
 
