@@ -87,7 +87,7 @@ def _library(ocp: OptimalControl, settings: PlainSettings) -> ca.Function:
     """The driver alone as a library, whose last argument says whether a call stops where the plan is converged."""
     converging = f"({LAST} > 0)"
     stops: dict[str, object] = {
-        "STOP_EARLY": converging if settings.iterations else 1,
+        "STOP_EARLY": converging if settings.iterations else "1",
         "CONVERGING": converging,
         "ITERATIONS": f"({converging} ? {MOST} : {settings.iterations or CAP})",
     }

@@ -262,9 +262,8 @@ def test_horizons_with_limits_of_inputs_only_are_rescued(start):
     assert plan.iterations == int(numbers[3, 0]) > float(plain[1][3])
     np.testing.assert_allclose(optimiser.step(ocp)(*call[:4], memory)[0].full(), solved, rtol=1e-9)
     other = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data, calls=2)
-    assert int(plain[1][4]) != fp.Status.OK
+    assert int(plain[1][4]) != fp.Status.OK == plan.status
     assert float(plain[1][0]) > 100 * known(plan.cost)
-    assert plan.status == fp.Status.OK
     assert known(plan.cost) <= known(other.cost) * (1 + 3e-5)
     assert Judge(ocp)(plan.inputs, first, data).residual <= 1e-6
 

@@ -49,6 +49,12 @@ def test_all_find_the_same_stationary_plan(optimiser, limits):
     assert np.all(plan.inputs.max(axis=1) <= ocp.input_upper)
 
 
+def test_a_time_limit_ends_a_solve():
+    """What is found until then is not called solved."""
+    ocp, data, first = two_mass(None)
+    assert fp.solve(ocp, fp.Ipopt(time_limit=1e-6), first, data, calls=1).status == fp.Status.NOT_CONVERGED
+
+
 def test_bounds_of_the_plan_are_shifted_by_the_correction():
     """The deformation takes part of the actuator, so the plan gets the rest: planned + correction stays inside."""
     tight = replace(
