@@ -7,9 +7,10 @@ Theory: docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -25,7 +26,7 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals
 from fpirhc.symbolic.layout import Expression, Layout, Signal, vector
 from fpirhc.task.dead_time import Queue, delay_block
-from fpirhc.task.disturbance import Disturbance
+from fpirhc.task.disturbance import Disturbance, Noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +61,25 @@ class Sensor(Checked):
         return self.noise is not None or self.quantum is not None or self.dropout > 0
 
 
+class Fault(NamedTuple):
+    """What can grow in all sensors of a problem."""
+
+    told: str  # what grows, in words
+    unit: str
+    first: float  # the smallest value that is of interest
+    most: float
+    of: Callable[[Sensor, float, float, int], Sensor]  # (sensor, value, range of what it shows, number of sensors)
+
+
+FAULTS = {
+    "noise": Fault(
+        "all that is measured has white noise of this deviation, up to 410 % of the range of the reference",
+        "of the range", 1e-3, 4.096,
+        lambda sensor, value, size, _: replace(sensor, noise=Noise(value * size)) if value * size else sensor),
+    "lost": Fault(  # a cycle in which one sensor loses its sample has none
+        "samples are lost at random, up to 98 %", "of the samples", 0.02, 0.98,
+        lambda sensor, value, _, count: replace(sensor, dropout=1 - (1 - value) ** (1 / count))),
+}  # fmt: skip
 _DIGITS = 9  # decimals of a delay in cycles, so that half a cycle is one
 _STREAM = 1  # separates the sensors' random series from the series of disturbances
 

@@ -17,7 +17,7 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidValue, nearest
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import AboveZero, Seed
 from fpirhc.problem_files.problem_file import Task, pair_of
-from fpirhc.sensing.sensing import Sensor
+from fpirhc.sensing.sensing import FAULTS, Sensor
 from fpirhc.simulation.metrics import Metric, measured_cycles
 from fpirhc.simulation.ranges import hard_limits
 from fpirhc.simulation.run import Run
@@ -27,7 +27,6 @@ from fpirhc.studies.runs import Kept, Row, Runner, header_of
 from fpirhc.studies.variants import Draws, Variant
 from fpirhc.studies.verdict import AT_LIMITS, HELPS, Objective, chatter, ranges
 from fpirhc.summary import Column, Table, in_percent, number, written_out
-from fpirhc.task.disturbance import Noise
 from fpirhc.task.problem import Problem
 
 FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
@@ -101,35 +100,16 @@ def _latency(problem: Problem, seed: int) -> Quantity:
     return Quantity(problem.time_unit, 0.0, period, period * most, at, whole=True)
 
 
-def _sensed(
-    problem: Problem, seed: int, change: Callable[[Sensor, str, float], Sensor]
-) -> Callable[[float], list[Variant]]:
-    sensing = problem.sensing
+def _sensed(word: str, problem: Problem, seed: int) -> Quantity:
+    fault, sizes, sensing = FAULTS[word], ranges(problem)[0], problem.sensing
+    names = sensing.measures(problem.plant)
 
     def at(value: float) -> list[Variant]:
-        sensors = {n: change(sensing.sensors.get(n, Sensor()), n, value) for n in sensing.measures(problem.plant)}
-        sensed = replace(problem, sensing=replace(sensing, sensors={**sensing.sensors, **sensors}))
-        return _one(sensed, seed, (change.__name__, value), sensed, problem)
+        own = {n: fault.of(sensing.sensors.get(n, Sensor()), value, sizes.get(n, 0.0), len(names)) for n in names}
+        sensed = replace(problem, sensing=replace(sensing, sensors={**sensing.sensors, **own}))
+        return _one(sensed, seed, (word, value), sensed, problem)
 
-    return at
-
-
-def _noise(problem: Problem, seed: int) -> Quantity:
-    sizes = ranges(problem)[0]
-
-    def noisier(sensor: Sensor, name: str, value: float) -> Sensor:
-        return replace(sensor, noise=Noise(value * sizes[name])) if name in sizes and value else sensor
-
-    return Quantity("of the range", 0.0, 1e-3, 4.096, _sensed(problem, seed, noisier))
-
-
-def _lost(problem: Problem, seed: int) -> Quantity:
-    count = len(problem.sensing.measures(problem.plant))  # a cycle in which one of them loses its sample has none
-
-    def losing(sensor: Sensor, _: str, value: float) -> Sensor:
-        return replace(sensor, dropout=1 - (1 - value) ** (1 / count))
-
-    return Quantity("of the samples", 0.0, 0.02, 0.98, _sensed(problem, seed, losing))
+    return Quantity(fault.unit, 0.0, fault.first, fault.most, at)
 
 
 def _plants(problem: Problem, seed: int) -> Quantity:
@@ -139,14 +119,12 @@ def _plants(problem: Problem, seed: int) -> Quantity:
     return Quantity("% around the exact parameters", 0.0, 8.0, _existing(at, 1e-3, 99.0), at)
 
 
-_GROWS = {
-    "mismatch": "all parameters are this many times as far from the model as in the file, up to 64",
-    "plants": f"{PLANTS} plants are drawn within this width, none of which may fail, up to 99 %",
-    "latency": f"commands come later by whole cycles, up to {_FARTHEST}",
-    "noise": "all that is measured has white noise of this deviation, up to 410 % of the range of the reference",
-    "lost": "samples are lost at random, up to 98 %",
+QUANTITIES: Mapping[str, tuple[Callable[[Problem, int], Quantity], str]] = {  # and what grows, in words
+    "mismatch": (_mismatch, "all parameters are this many times as far from the model as in the file, up to 64"),
+    "plants": (_plants, f"{PLANTS} plants are drawn within this width, none of which may fail, up to 99 %"),
+    "latency": (_latency, f"commands come later by whole cycles, up to {_FARTHEST}"),
+    **{word: (partial(_sensed, word), fault.told) for word, fault in FAULTS.items()},
 }
-QUANTITIES = {"mismatch": _mismatch, "plants": _plants, "latency": _latency, "noise": _noise, "lost": _lost}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -186,7 +164,7 @@ class Limits(Study):
             if row.unit:
                 grown[row.quantity] = what, 100 if share else 1
                 borne.setdefault(row.quantity, [*self.beats[row.quantity]]).append(f"{row.controller} fails {where}")
-        grows = " ".join(f"{name.capitalize()}: {_GROWS[name]}." for name in dict.fromkeys(self.table.quantity))
+        grows = " ".join(f"{name.capitalize()}: {QUANTITIES[name][1]}." for name in dict.fromkeys(self.table.quantity))
         about = (
             f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
@@ -317,7 +295,7 @@ def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float)
         return bool(reasons[value])
 
     try:
-        quantity = QUANTITIES[what](problem, seed)
+        quantity = QUANTITIES[what][0](problem, seed)
         start = failed(quantity.start)
         holds, ends = (math.nan, quantity.start) if start else bracket(failed, quantity)
     except FpirhcError as error:
