@@ -32,7 +32,7 @@ _SENSORS, _HEATERS = ("T1", "T2"), ("Q1", "Q2")
 class RealTime:
     """The time of a run by the clock on the wall, for a device that moves by itself.
 
-    A cycle that ends more than a period late is a bad answer (`ExternalPlant(holds=...)`): no burst of commands makes up for it.
+    A cycle that ends more than a period late raises: no burst of commands makes up for it.
 
     Args:
         clock: function that returns the wall time, s.
@@ -59,20 +59,15 @@ class RealTime:
         try:
             yield
         finally:
-            late = self._late(self._zero + time + period, period)
+            end = self._zero + time + period
+            self.sleep(max(end - self.clock(), 0.0))
+            late = self.clock() - end
+            if late > period:  # commands until now would else go out at one instant
+                self._zero += late
         require(
             late <= period,
             f"the cycle of {period:g} s ended {late:.3g} s late; choose a longer period, or a quicker bus or controller",
         )
-
-    def _late(self, end: float, period: float) -> float:
-        """Wait for the end; where it is missed by a period, commands until now would else go out at one instant."""
-        assert self._zero is not None
-        self.sleep(max(end - self.clock(), 0.0))
-        late = self.clock() - end
-        if late > period:
-            self._zero += late
-        return late
 
 
 @adapter

@@ -22,7 +22,7 @@ from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.plant.chain import response_names
 from fpirhc.sensing.base import backward_difference, combine
 from fpirhc.simulation.moved import Mover, acting_blocks, moving, outside_blocks, real_signals
-from fpirhc.simulation.replay import gated_blocks
+from fpirhc.simulation.replay import answer_blocks, gated_blocks
 from fpirhc.simulation.tables import disturbance_signal
 from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
@@ -47,7 +47,8 @@ def closed_loop(built: Built) -> Composite:
     judging = [block for block in seeing if "reference" in block.reads]  # along the reference that the controller had
     seeing = [block for block in seeing if block not in judging]
     clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(mover, disturbed)
-    around = [clock, *outside_blocks(mover, built.model), *seeing, *gated_blocks(mover, inner), *judging, *actuating]
+    outside = [clock, *outside_blocks(mover, built.model), *answer_blocks(mover)]
+    around = [*outside, *seeing, *gated_blocks(mover, inner), *judging, *actuating]
     constants = [Delay(signal, signal.name) for signal in open_settings(around)]
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
     delays = [*mover.delays, Delay(built.model.parameter, "parameters"), *constants]

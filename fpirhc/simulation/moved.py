@@ -16,13 +16,14 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.contract import PlantModel
+from fpirhc.errors import InvalidProblem
 from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.integrators import own_step
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.tables import LOGGED, added, by_place, disturbance_signal
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, expression
-from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, vector
 from fpirhc.task.dead_time import Queue, delay_block
 from fpirhc.task.exogenous import model_values, real_values
 from fpirhc.task.external_plant import ExternalPlant
@@ -30,7 +31,7 @@ from fpirhc.task.problem import Problem
 
 REALITY_STATE = "reality_state"  # signal of the state of a reality, in its own coordinates
 SENT = "_acting"  # signal of the inputs that a foreign reality is sent
-_RAW, NO_ANSWER = "_foreign", "_foreign_held"  # what it answers, and whether it does not
+ANSWER = "foreign"  # what it answers; as it comes, with an underscore before it
 
 
 def acting_blocks(mover: Mover, disturbed: tuple[Signal, ...]) -> list[Block]:
@@ -60,9 +61,9 @@ class Mover(ABC):
     def begin(self, read: Sequence[np.ndarray], seed: int) -> None:  # noqa: B027
         """Fill in what the first cycle of a run reads beside memory and tables: nothing, where what moves is inside."""
 
-    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:  # noqa: ARG002
-        """Return why the run ends after this cycle, and what to do; None where it goes on."""
-        return None
+    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> str:  # noqa: ARG002
+        """Return why the run ends after this cycle; empty where it goes on."""
+        return ""
 
     def end(self) -> None:  # noqa: B027
         """Leave what moves as it is to be left, however the run ended."""
@@ -201,24 +202,21 @@ class Body(Mover):
 
     def __init__(self, problem: Problem, body: ExternalPlant) -> None:
         super().__init__(problem)
-        self._body, self._bridged, self._cycles = body, 0, 0
+        self._body, self._cycles = body, 0
         units = quantities(problem.plant)
         self.measures = {name: units[name] for name in body.measures}
 
     def begin(self, read: Sequence[np.ndarray], seed: int) -> None:
-        self._answer, self._held = read
-        self._held[0] = 0.0
+        [self._answer] = read
         self._answer[:] = self._body.first(seed)
 
-    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> tuple[str, str] | None:
+    def after(self, cycle: int, sent: Sequence[np.ndarray]) -> str:
         self._cycles = cycle + 1
-        answer = self._body.read(cycle * self.problem.period, sent[0].copy())
-        bad = self._held[0] = isinstance(answer, str)
-        self._bridged = self._bridged + 1 if bad else 0
-        if not isinstance(answer, str):
-            self._answer[:] = answer
-            return None
-        return (answer, self._body.remedy) if self._bridged > self._body.holds else None
+        try:
+            self._answer[:] = self._body.read(cycle * self.problem.period, sent[0].copy())
+        except InvalidProblem as error:
+            return str(error)
+        return ""
 
     def end(self) -> None:
         self._body.end(self._cycles * self.problem.period, self.problem.plant.inputs)
@@ -235,27 +233,25 @@ class Body(Mover):
 
     @property
     def reads(self) -> tuple[Signal, ...]:
-        return vector(_RAW, tuple(self.measures), tuple(self.measures.values())), scalar(NO_ANSWER)
+        return (vector(f"_{ANSWER}", tuple(self.measures), tuple(self.measures.values())),)
 
     @property
     def delays(self) -> list[Delay]:
         return []
 
     def sense(self, motion: Sequence[Signal], response: Signal) -> Block:
-        """Block (answer) -> motion and response in the model's order, and the answer as it came; what is not measured is zero."""
+        """Block (answer) -> motion and response in the model's order; what is not measured is zero."""
         names, answered = list(self.measures), response_names(self.problem.plant)
         wanted = {**{signal.name: signal.elements for signal in motion}, response.name: answered}
 
         def step(s: Signals) -> dict[str, Expression]:
-            answer = s._foreign
-            shown = {
+            answer = getattr(s, ANSWER)
+            return {
                 signal: ca.vertcat(*(answer[names.index(n)] if n in names else 0 for n in elements))
                 for signal, elements in wanted.items()
             }
-            return {**shown, "foreign": answer, "foreign_held": s._foreign_held}
 
-        writes = (*motion, response, like(self.reads[0], "foreign"), scalar("foreign_held"))
-        return Block("sense", Layout(self.reads), Layout(writes), step)
+        return Block("sense", Layout((like(self.reads[0], ANSWER),)), Layout((*motion, response)), step)
 
     def advance(self, disturbed: tuple[Signal, ...], arriving: Signal) -> Block:
         """Block (arriving command, disturbances of inputs) -> the inputs that it is sent."""

@@ -43,8 +43,8 @@ class Range(NamedTuple):
 class Ranges:
     """What ends a run: the physical ranges of what moves, and errors beyond all sense; one absurd sample of a body is none."""
 
-    def __init__(self, problem: Problem, trace: Layout) -> None:
-        every = [*_of_states(problem, trace), *(_of_errors(problem, trace) if problem.moves.simulated else ())]
+    def __init__(self, problem: Problem, trace: Layout, more: Sequence[Range] = ()) -> None:
+        every = [*_of_states(problem, trace), *(_of_errors(problem, trace) if problem.moves.simulated else ()), *more]
         self.columns = np.array([one.column for one in every], dtype=int)
         self.lower, self.upper = np.array([one.lower for one in every]), np.array([one.upper for one in every])
         self._words = [one.words for one in every]

@@ -20,13 +20,15 @@ import numpy as np
 
 from fpirhc.controllers.gate import AGAIN, FAILED, HELD, INNER, LOST, MISSING, MOST_MISSING, REPLAYS, Gate
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
-from fpirhc.simulation.moved import NO_ANSWER, Mover, moving
+from fpirhc.simulation.moved import ANSWER, Mover, moving
+from fpirhc.simulation.ranges import Range
 from fpirhc.simulation.run import Run
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite
+from fpirhc.symbolic.driver import every_finite
 from fpirhc.symbolic.evaluate import Evaluator
 from fpirhc.symbolic.expression import FINITE, Signals, nan_where
-from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
+from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
 
@@ -39,7 +41,7 @@ _RESOLVED = 2.0**42  # periods from zero within which a period is resolved to a 
 _PATIENCE = 20
 BRIDGED, BY_DIFFERENCES = 5, 20  # cycles: the longest gap that is replayed as it was; behind differences of positions
 _OBSERVED, _SETTLES = "observed_state", 30  # state of a learner, and the steps in which it follows the samples
-_LOST_QUEUE = "lost_samples_queue"
+_LOST_QUEUE, _SILENT = "lost_samples_queue", scalar("no_answer")
 _CHUNK = 500  # cycles of a compiled call: long enough to hide Python, short enough for progress and Ctrl-C
 _SHORT = 25  # of the virtual machine, for which a longer chain takes longer than it saves
 _FORGOTTEN = 1e-7  # of a sample from before a long gap
@@ -115,22 +117,39 @@ def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
     return 1 if loses else _CHUNK if compiled else _SHORT
 
 
+def answer_blocks(mover: Mover) -> list[Block]:
+    """Block (answer of a plant outside) -> its last finite one, and for how many cycles there has been none; [] where none is."""
+    if not mover.reads:
+        return []
+    [raw] = mover.reads
+    last, count = like(raw, f"{ANSWER}_last"), Signal(f"{_SILENT.name}_before")
+
+    def step(s: Signals) -> dict[str, Expression]:
+        now = getattr(s, raw.name)
+        there = every_finite(now)
+        shown = ca.if_else(there, now, getattr(s, last.name))
+        silent = ca.if_else(there, 0, getattr(s, count.name) + 1)
+        return {ANSWER: shown, _SILENT.name: silent, f"{last.name}_next": shown, f"{count.name}_next": silent}
+
+    return [Block("answer", Layout((raw,)), Layout((like(raw, ANSWER), _SILENT)), step, Layout((last, count)))]
+
+
 def _lost_blocks(mover: Mover) -> list[Block]:
     """Blocks that say whether the sample that a controller is given is lost, `LOST`; none where none can be."""
-    problem = mover.problem
-    drawn, held = problem.sensing.drawn, [one for one in mover.reads if one.name == NO_ANSWER]
-    if not held and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
+    problem, silent = mover.problem, [_SILENT] * bool(mover.reads)
+    drawn = problem.sensing.drawn
+    if not silent and problem.sensing.lost(ca.SX.zeros(sum(one.size for one in drawn))) is None:
         return []
     late = problem.dead_time.measurement_wait(problem.period) or Queue(0.0)
 
     def step(s: Signals) -> dict[str, Expression]:
         lost = problem.sensing.lost(ca.vertcat(*(getattr(s, one.name) for one in drawn)))
-        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) for one in held)))
+        now = ca.mmax(ca.vertcat(*([] if lost is None else [lost]), *(getattr(s, one.name) > 0 for one in silent)))
         arrived, remembered = late.arrived(s, _LOST_QUEUE, now)
         return {LOST.name: arrived, **remembered}
 
     memory = Layout(late.memory(_LOST_QUEUE, ("sample",), (0.0,)))
-    return [Block("lose", Layout((*drawn, *held)), Layout((LOST,)), step, memory)]
+    return [Block("lose", Layout((*drawn, *silent)), Layout((LOST,)), step, memory)]
 
 
 def raw_measurements(run: Run) -> np.ndarray:
@@ -294,3 +313,11 @@ def replaying(problem: Problem, loop: Composite, evaluator: Evaluator) -> Callab
         return replay.after(bound, evaluator.failure)
 
     return again
+
+
+def silence(problem: Problem, loop: Composite) -> list[Range]:
+    """Return what ends the run of a plant outside: more cycles in a row without an answer than a replay bridges."""
+    if _SILENT.name not in loop.trace:
+        return []
+    words = "the plant outside gave no answer in", "cycles in a row"
+    return [Range(loop.trace.slice(_SILENT.name).start, 0, Replay.of(problem, loop).bridged, words)]

@@ -22,7 +22,7 @@ from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.loop import closed_loop, plans_exactly, start_memory
 from fpirhc.simulation.moved import moving
 from fpirhc.simulation.ranges import Dropped, Ranges
-from fpirhc.simulation.replay import cycles_per_call, replaying
+from fpirhc.simulation.replay import cycles_per_call, replaying, silence
 from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
 from fpirhc.simulation.tables import run_tables
@@ -250,7 +250,7 @@ def run_cycles(
     """
     cycles, trace, dropped, padded = problem.cycles, loop.trace, Dropped(loop), _padded(problem, patches)
     count = evaluator.results[1].size // trace.size  # a call
-    log, ranges = np.empty((padded, trace.size)), Ranges(problem, trace)
+    log, ranges = np.empty((padded, trace.size)), Ranges(problem, trace, silence(problem, loop))
     memory, *read, run = evaluator.arguments
     windows = [(argument.reshape(count, -1), table) for argument, table in zip(read, tables, strict=False)]
     after, sent = evaluator.results[0], evaluator.results[2:]
@@ -284,7 +284,7 @@ def run_cycles(
             memory[:] = after
             ended = mover.after(end - 1, sent)
             if ended and end < cycles:
-                return log[:end].copy(), stopped(problem, end, ended[0]) + ended[1]
+                return log[:end].copy(), stopped(problem, end, ended)
             if progress:
                 progress(end, cycles)
         return log[:cycles], None

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from fpirhc.errors import FpirhcError, InvalidProblem, Mistakes, NotSupported, require
 from fpirhc.fields.checked import Checked
-from fpirhc.fields.kinds import CountOrZero, Finite, NotNegative, Positive
+from fpirhc.fields.kinds import Finite, NotNegative, Positive
 from fpirhc.plant.chain import quantities
 from fpirhc.plant.integrators import Integrator
 from fpirhc.plant.maps import against_lags
@@ -49,10 +49,8 @@ class ExternalPlant(Checked):
         body: object with `reset(seed)` and `step(time, command)`, see `Body`; None: `make` makes it.
         measures: names of what it measures -> unit, in the order of its answers: elements of the state ("q1",
             "q1'"), outputs and their derivatives, and, where the response is measured, highest derivatives of what is controlled
-            ("q1''"). Units are those of the model.
-        holds: consecutive bad answers that are bridged with the last good one; the next one ends the run. 0: the first ends it.
-            A bad answer is an exception, another shape, or a number that is not finite: a body that has measured nothing in a
-            cycle, or waited for it too long, returns NaN.
+            ("q1''"). Units are those of the model. A body that has measured nothing in a cycle, or waited for it too long, returns
+            NaN: the cycle is skipped. An exception, or an answer of another shape, ends the run.
         rest: by input, what is sent when a run ends, however it ends: complete, stopped, by an exception or Ctrl-C. Every input of
             the model; {}: nothing is sent. A body with a method `close` is a real plant, which would keep its last command: it
             must say, and is closed.
@@ -68,7 +66,6 @@ class ExternalPlant(Checked):
 
     body: Body | None = None
     measures: Mapping[str, str] = field(default_factory=dict)
-    holds: CountOrZero = 0
     rest: Mapping[str, Finite] | None = None
     lag: Mapping[str, NotNegative] = field(default_factory=dict)
     make: Make | None = None
@@ -91,13 +88,6 @@ class ExternalPlant(Checked):
     def name(self) -> str:
         """What messages and tables call the body."""
         return type(self._present[0]).__name__.lstrip("_") if self._present else "the body that make returns"
-
-    @property
-    def remedy(self) -> str:
-        """What bridges bad answers."""
-        if not self.holds:
-            return "; ExternalPlant(holds=1) bridges a bad answer with the last good one"
-        return f", after {self.holds} in a row that were held; ExternalPlant(holds={self.holds + 1}) bridges one more"
 
     def with_exact(self, exact: np.ndarray) -> ExternalPlant:
         """Return it with other exact parameters, shape (number of parameters,)."""
@@ -151,12 +141,19 @@ class ExternalPlant(Checked):
                 raise InvalidProblem(f"reality: make returned {mistake}")
             self._present[:] = [body]
         answer = self._answer(lambda: self._present[0].reset(seed), "reset")
-        if isinstance(answer, str):
-            raise InvalidProblem(f"reality: {answer}")
+        for name, value in zip(self.measures, answer, strict=True):
+            if not np.isfinite(value):
+                raise InvalidProblem(
+                    f"reality: reset of {self.name} returned {name} = {value}, expected a finite number"
+                )
         return answer
 
-    def read(self, time: float, command: np.ndarray) -> np.ndarray | str:
-        """Return the answer to a command, or why it is bad."""
+    def read(self, time: float, command: np.ndarray) -> np.ndarray:
+        """Return the answer to a command.
+
+        Raises:
+            InvalidProblem: the body raised, or its answer is no row of so many numbers.
+        """
         return self._answer(lambda: self._present[0].step(time, command), "step")
 
     def end(self, time: float, inputs: Iterable[str]) -> None:
@@ -165,9 +162,9 @@ class ExternalPlant(Checked):
         for body in self._present:
             try:
                 if resting is not None:
-                    answer = self._answer(partial(body.step, time, resting), "step")
-                    if isinstance(answer, str):
-                        warnings.warn(f"reality: the inputs at rest may not have arrived: {answer}", stacklevel=2)
+                    self._answer(partial(body.step, time, resting), "step")
+            except InvalidProblem as error:
+                warnings.warn(f"the inputs at rest may not have arrived: {error}", stacklevel=2)
             finally:
                 close = getattr(body, "close", None)
                 if callable(close):
@@ -190,22 +187,17 @@ class ExternalPlant(Checked):
     def _present(self) -> list[Body]:
         return [] if self.body is None else [self.body]
 
-    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str) -> np.ndarray | str:
-        who, expected = f"{method} of {self.name}", f"{len(self.measures)} numbers: {', '.join(self.measures)}"
+    def _answer(self, ask: Callable[[], npt.ArrayLike], method: str) -> np.ndarray:
+        who, expected = f"reality: {method} of {self.name}", f"{len(self.measures)} numbers: {', '.join(self.measures)}"
         try:
             returned = ask()
             values = np.ma.filled(returned, np.nan)  # what lies under a mask is no measurement
         except FpirhcError as error:  # those of an adapter say it all
-            return f"{who}: {error}"
+            raise InvalidProblem(f"{who}: {error}") from None
         except Exception as error:  # noqa: BLE001  # a stranger's object may raise anything
-            return f"{who} raised {_words(error)}"
-        if values.dtype.kind not in "iuf":
-            return f"{who} returned {reprlib.repr(returned)}, expected {expected}"
-        if values.shape != (len(self.measures),):
-            return f"{who} returned the shape {values.shape}, expected {expected}"
-        if not np.isfinite(values).all():
-            place = int(np.argmin(np.isfinite(values)))
-            return f"{who} returned {list(self.measures)[place]} = {values[place]}, expected a finite number"
+            raise InvalidProblem(f"{who} raised {_words(error)}") from None
+        if values.dtype.kind not in "iuf" or values.shape != (len(self.measures),):
+            raise InvalidProblem(f"{who} returned {reprlib.repr(returned)}, expected {expected}")
         return values.astype(float)
 
 

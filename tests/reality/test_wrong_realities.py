@@ -89,7 +89,6 @@ WRONG: dict[str, tuple[Any, str]] = {
     "not measured": (lambda: body(measures={"y": "m", "y'": "m/s"}), "y'' (m/s^2), which the sensing"),
     "unknown measure": (lambda: body(measures={**MEASURES, "yy": "m"}), "'yy' is unknown. Did you mean 'y'?"),
     "measured unit": (lambda: body(measures={**MEASURES, "y": "mm"}), "measures y in mm, the model has it in m"),
-    "half a hold": (lambda: loose(holds=1.5), "holds: expected a whole number of at least 0, got 1.5"),
     "an option": (lambda: loose(rests={}), "no field 'rests'. Did you mean 'rest'?"),
     "a lag of nothing": (lambda: loose(lag=0.002), "lag: expected {name: a finite number of at least 0}"),
     "a negative lag": (lambda: body(lag={"u": -0.1}), "lag['u']: expected a finite number of at least 0, got -0.1"),
