@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import casadi as ca
 import numpy as np
@@ -14,7 +14,7 @@ from fpirhc.controllers.base import clip
 from fpirhc.status import Status
 from fpirhc.symbolic.block import Block, Composite
 from fpirhc.symbolic.driver import every_finite, finite, kept_if_finite
-from fpirhc.symbolic.expression import Signals, expression
+from fpirhc.symbolic.expression import FINITE, Signals, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
@@ -59,17 +59,39 @@ def is_trial(failed: Expression) -> Expression:
     return failed == PATIENCE
 
 
-def was_skipped(status: Expression) -> Expression:
-    """Return whether a cycle of this status was skipped: its sample, its time or its step was not good."""
-    bad = ca.logic_or(status == int(Status.BAD_SAMPLE), status == int(Status.NON_FINITE))
-    return ca.logic_or(bad, status == int(Status.BAD_TIME))
+def behind_gate(block: Block, status: str) -> Block:
+    """Return the block with the number of skipped cycles, in which its memory stays; numbers that are not finite begin anew at 0.
+
+    A cycle was skipped where its sample, its time or its step was not good, by the signal `status`.
+    """
+    before = Signal(f"{SKIPPED}_before")
+    memory = block.memory + Layout((before,))
+
+    def step(s: Signals) -> dict[str, Expression]:
+        own = {n: ca.if_else(ca.fabs(getattr(s, n)) <= FINITE, getattr(s, n), 0) for n in memory.names}
+        bad = Status.BAD_SAMPLE, Status.NON_FINITE, Status.BAD_TIME
+        skips = reduce(ca.logic_or, (getattr(s, status) == int(one) for one in bad))
+        values = block.step(Signals({**vars(s), **own}))
+        kept = {f"{n}_next": ca.if_else(skips, own[n], values[f"{n}_next"]) for n in block.memory.names}
+        count = own[before.name] + skips
+        return {**values, **kept, SKIPPED: count, f"{before.name}_next": count}
+
+    return replace(block, writes=block.writes + Layout((scalar(SKIPPED),)), memory=memory, step=step)
 
 
+SKIPPED = "skipped"  # number of skipped cycles since the start
 HELD = "held_command"  # in the memory: the command that a skipped cycle repeats
 REPLAYS = Signal("replays")  # in the memory of a loop: whether its sample is that of `replayed_...`
 LOST = scalar("lost_sample")  # whether a simulated sample is lost, which on a real plant is one that is not finite
 _SAMPLE = ("state", "output", "realised", "measured", "arrived", LOST.name)
 INNER = "controller_memory"  # in the memory: that of the controller as one signal
+
+
+def named_memory(step: Composite) -> tuple[Composite, Layout]:
+    """Return the controller's step inside a step with a gate, and the memory of that, the controller's under its signals' names."""
+    inner = next(block.inside for block in step.blocks if block.inside is not None)
+    whole = {INNER: inner.memory.signals}
+    return inner, Layout(tuple(s for signal in step.memory.signals for s in whole.get(signal.name, (signal,))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,11 +167,6 @@ class Gate:
         """The controller's memory as one signal, because a graph copies every signal of a long memory one by one."""
         memory = self.inner.memory
         return Layout((Signal(INNER, memory.columns, memory.units, tuple(map(float, memory.start()))),))
-
-    def named(self, memory: Layout) -> Layout:
-        """Return a layout with the controller's memory under the names of its signals."""
-        whole = {INNER: self.inner.memory.signals}
-        return Layout(tuple(s for signal in memory.signals for s in whole.get(signal.name, (signal,))))
 
     def block(self) -> Block:
         """Return the step behind the gate as one block: (sample, parameters) -> the controller's trace."""

@@ -12,11 +12,10 @@ from importlib import resources
 
 import numpy as np
 
-from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING
+from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING, SKIPPED
 from fpirhc.errors import InvalidValue, NotInstalled
 from fpirhc.export import Device, Target, identifiers, in_comment, literal, recorded, shared_library
 from fpirhc.plant.motion import SECONDS
-from fpirhc.simulation.machine import SKIPPED
 from fpirhc.simulation.replay import CLOCK_MEMORY, LONGEST
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type

@@ -18,7 +18,7 @@ from typing import Self
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.gate import AGAIN, FAILED, HELD, INNER, LOST, MISSING, MOST_MISSING, REPLAYS, Gate
+from fpirhc.controllers.gate import AGAIN, FAILED, HELD, LOST, MISSING, MOST_MISSING, REPLAYS, Gate, named_memory
 from fpirhc.controllers.seeing import seeing_blocks, sensor_ranges
 from fpirhc.simulation.moved import ANSWER, Mover, moving
 from fpirhc.simulation.ranges import Range
@@ -223,10 +223,7 @@ class Replay:
     @classmethod
     def of(cls, problem: Problem, step: Composite, bridged: int | None = None) -> Self:
         """Return the replay of a step that has the gate inside; `bridged`: None: as is usual for the problem."""
-        inner = next(block.inside for block in step.blocks if block.inside is not None)
-        memory = Layout(
-            tuple(s for one in step.memory.signals for s in (inner.memory.signals if one.name == INNER else (one,)))
-        )
+        inner, memory = named_memory(step)
         plant, estimator = problem.plant, problem.sensing.estimator
         shortest = all(max(estimator.fills(plant.chains[n]), 1) == plant.chains[n] for n in plant.controlled_names)
         usual = BY_DIFFERENCES if problem.sensing.estimates and shortest else BRIDGED

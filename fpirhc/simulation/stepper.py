@@ -12,12 +12,12 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import name_in_task, plant_model
-from fpirhc.controllers.gate import HELD
+from fpirhc.controllers.gate import HELD, SKIPPED, named_memory
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue, require
 from fpirhc.fields.checked import ByName, Checked
 from fpirhc.fields.kinds import named_entries
-from fpirhc.simulation.machine import FINGERPRINT, SKIPPED, composed_step
+from fpirhc.simulation.machine import FINGERPRINT, machine_step
 from fpirhc.simulation.replay import CLOCK_MEMORY, Bound, Replay, missed_cycles
 from fpirhc.simulation.step_arguments import (
     NOT_WRITTEN,
@@ -72,8 +72,10 @@ class ComposedStep:
         planner = settings.controller.planner
         why = planner.optimiser.unbounded if bounded and planner is not None else ""
         require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a real plant")
-        composite, memory = composed_step(settings.composed, problem, settings.controller, saturated_after)
-        return cls(settings, composite, memory, Replay.of(problem, composite, bridged))
+        composite = settings.composed(
+            lambda built: machine_step(problem, settings.controller, built.step, saturated_after)
+        )
+        return cls(settings, composite, named_memory(composite)[1], Replay.of(problem, composite, bridged))
 
 
 class Stepper(Checked):
