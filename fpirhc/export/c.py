@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import struct
 from collections.abc import Mapping
 from importlib import resources
 
@@ -14,9 +15,10 @@ import numpy as np
 
 from fpirhc.controllers.gate import HELD, MISSING, MOST_MISSING, SKIPPED
 from fpirhc.errors import InvalidValue, NotInstalled
-from fpirhc.export import Device, Target, identifiers, in_comment, literal, recorded, shared_library
+from fpirhc.export import Device, Target, identifiers, in_comment, literal, shared_library
 from fpirhc.plant.motion import SECONDS
 from fpirhc.simulation.replay import CLOCK_MEMORY, LONGEST
+from fpirhc.simulation.simulate import simulate
 from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
 from fpirhc.symbolic.layout import Layout
@@ -346,6 +348,77 @@ def _library_files(device: Device) -> Mapping[str, str | bytes]:
 def _listed(layout: Layout) -> str:
     """Names and units in their order."""
     return ", ".join(f"`{name}` [{unit}]" for name, unit in zip(layout.columns, layout.units, strict=True))
+
+
+_OFFSET, _PRIME, _MASK = 0xCBF29CE484222325, 0x100000001B3, (1 << 64) - 1
+_NAN = 0x7FF8000000000000
+_CYCLES = 2000  # of a record
+
+
+def recorded(device: Device) -> bytes:
+    """Return the file: a head of four 32-bit numbers (cycles, numbers given, commands, whether bits count), and the cycles.
+
+    Bits do not count where there is no compiler and a plan was solved by the virtual machine, which rounds in another order.
+
+    Samples are those of a run, again from its beginning where it is too short; a plant outside is not run, but its model is.
+    """
+    stepper = device.stepper
+    rows = _with_faults(_samples(device), device.problem.period)
+    exact = stepper.compiled or stepper.function.is_a("SXFunction")
+    head = struct.pack("<4i", len(rows), rows.shape[1], device.problem.plant.input.size, exact)
+    memory, parts = stepper.start(), [head]
+    for k, row in enumerate(rows):
+        damaged = memory.size - 3 if k == _DAMAGED else -1
+        if damaged >= 0:
+            memory = memory.copy()
+            memory[damaged] = np.nan
+        command, memory = stepper.step_measured(row[0], row[1:], memory)
+        trace = np.concatenate([value.ravel() for value in stepper.trace().values()])
+        hashes = struct.pack("<2Q", _digest(memory), _digest(trace))
+        parts += [row.tobytes(), struct.pack("<d", damaged), command.tobytes(), hashes]
+    return b"".join(parts)
+
+
+_GAPS = ((150, 3), (220, 30), (300, 700))  # first cycle behind a gap, and the number of missing ones
+_DAMAGED = 95  # cycle before which an entry of the memory becomes NaN
+
+
+def _with_faults(rows: np.ndarray, period: float) -> np.ndarray:
+    """Samples with what a device meets: no numbers, outliers, a plant that jumped, and cycles that are missing.
+
+    Behind a gap the samples are those of its end, as the reference is: others would keep the commands at their limits.
+    """
+    place = np.arange(_CYCLES)
+    for first, missing in _GAPS:
+        place[first:] += missing
+    rows = rows[place % len(rows)]
+    rows[:, 0] = period * place
+    # main.c knows the first outlier, that of cycle 40.
+    faults: dict[int, tuple[int, float]] = {
+        20: (1, np.nan), 25: (-1, np.inf), 30: (-1, -np.inf), 35: (0, np.nan), 40: (1, 1e9), 41: (1, 1e9), 42: (1, 1e9),
+        50: (-1, 1e200), 52: (0, 1e18), 53: (1, -np.inf),
+    }  # fmt: skip
+    for k, (entry, value) in faults.items():
+        rows[k, entry] = value
+    rows[60:85, 1] += 1e4
+    rows[350, 0] = rows[349, 0]  # a cycle twice
+    return rows
+
+
+def _digest(values: np.ndarray) -> int:
+    """FNV-1a of the bits of the numbers, eight bytes at a time."""
+    bits = np.where(np.isnan(values), np.uint64(_NAN), values.view(np.uint64))
+    total = _OFFSET
+    for one in bits.tolist():
+        total = ((total ^ one) * _PRIME) & _MASK
+    return total
+
+
+def _samples(device: Device) -> np.ndarray:
+    """What the step is given in a run."""
+    run = simulate(device.problem.of_equations, device.controller, seed=0)
+    parts = (run.time if name == "time" else run[name] for name in device.inputs.names)
+    return np.hstack([np.asarray(part, dtype=float).reshape(len(run.time), -1) for part in parts])
 
 
 _ATANH = (

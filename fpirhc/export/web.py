@@ -20,15 +20,15 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, package, require
-from fpirhc.export import Device, Target, c_of, literal, recorded, web_module
-from fpirhc.export.c import data_of, filled, layout_of, sources, template
+from fpirhc.export import Device, Target, c_of, literal, web_module
+from fpirhc.export.c import data_of, filled, layout_of, recorded, sources, template
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.ranges import Ranges
-from fpirhc.simulation.replay import cycles_per_call
+from fpirhc.simulation.replay import needs_driver
 from fpirhc.simulation.run import judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.simulation.tables import run_tables
@@ -124,14 +124,8 @@ class LabLoop:
 def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: Path) -> None:
     """Write the page of some controllers of a task, which `fpirhc.load_problem` finds by `file`."""
     problem = task.problem
-    require(
-        problem.moves.simulated,
-        "a lab runs the plant's equations in the page; a plant outside Python's equations has none",
-    )
-    require(
-        cycles_per_call(problem, compiled=True) > 1,
-        "a page steps its loop without the driver that runs missing cycles afterwards; leave dropout and range out of sensors",
-    )
+    driven = needs_driver(problem)
+    require(not driven, f"a page has no driver between the cycles of its loop; leave out {driven}")
     package("ziglang", "compiler", "a lab")
     loops = []
     for name, controller in controllers.items():

@@ -111,10 +111,15 @@ def gated_blocks(mover: Mover, inner: Composite) -> list[Block]:
     return [*lost, gate.block()]
 
 
-def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
-    """Return how many cycles one call of the loop runs: one where samples may be lost, as those of a body outside, and replayed."""
+def needs_driver(problem: Problem) -> str:
+    """Return what to leave out so that the cycles of a loop follow each other by themselves; empty where they do."""
     loses = bool(_lost_blocks(moving(problem)) or sensor_ranges(problem))
-    return 1 if loses else _CHUNK if compiled else _SHORT
+    return "the plant outside, and dropout and range of sensors" * loses
+
+
+def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
+    """Return how many cycles one call of the loop runs."""
+    return 1 if needs_driver(problem) else _CHUNK if compiled else _SHORT
 
 
 def answer_blocks(mover: Mover) -> list[Block]:

@@ -107,10 +107,11 @@ def test_what_has_no_lab(tmp_path, monkeypatch, capsys):
     Path("far.py").write_text(PROBLEM + OUTSIDE)
     lossy = 'problem = replace(problem, sensing=fp.Sensing({"q1": fp.Sensor(dropout=0.1)}))\n'
     Path("lossy.py").write_text(PROBLEM + lossy)
+    no_driver = "no driver between the cycles of its loop; leave out the plant outside, and dropout and range"
     refused = {
-        "lossy.py RHC": "without the driver that runs missing cycles afterwards",
+        "lossy.py RHC": no_driver,
         "own.py RHC --live deformation.gain": "a lab has sliders of parameters, gains and limits of inputs, no others",
-        "far.py RHC": "a plant outside Python's equations has none",
+        "far.py RHC": no_driver,
     }
     for words, said in refused.items():
         assert main(["export", *words.split(), "--to", "lab"]) == 2
