@@ -18,7 +18,7 @@ from fpirhc.deformation.model_referenced import ModelReferenced
 from fpirhc.errors import InvalidValue, Mistakes
 from fpirhc.plant.chain import response_names
 from fpirhc.probing.identification import require_cycles
-from fpirhc.simulation.replay import raw_measurements
+from fpirhc.simulation.replay import raw_measurements, where_given
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import simulate
 from fpirhc.symbolic.layout import Expression, Layout, scalar
@@ -120,12 +120,11 @@ def excited(
         # All lateness is identified, the stated one too.
         at_once = ModelReferenced(Excitation(amplitude, cycles, seed), cycles=0.0, lag=0.0)
         run = simulate(short, bare.with_deformation(at_once), seed=seed, compiled=False)
-        plant, raw = problem.plant, raw_measurements(run)
-        seen = dict(zip(response_names(plant), run["realised"].T, strict=True))
+        plant = problem.plant
+        seen = dict(zip(response_names(plant), where_given(run, run["realised"]).T, strict=True))
         if problem.sensing.spreads(plant):
             measures = problem.sensing.measures(plant)
-            seen = _preferred(dict(zip(measures, raw.T[-len(measures) :], strict=True)), seen)
-        seen = {name: np.where(np.isnan(raw).any(axis=1), np.nan, column) for name, column in seen.items()}
+            seen = _preferred(dict(zip(measures, raw_measurements(run).T[-len(measures) :], strict=True)), seen)
         record = _record(problem, "probe", run.time, run["state"], run["command"], seen, run.stop or "")
         return run, replace(record, amplitude=amplitude)
 

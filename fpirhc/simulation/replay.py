@@ -113,8 +113,7 @@ def gated_blocks(mover: Mover, inner: Composite) -> list[Block]:
 
 def needs_driver(problem: Problem) -> str:
     """Return what to leave out so that the cycles of a loop follow each other by themselves; empty where they do."""
-    loses = bool(_lost_blocks(moving(problem)) or sensor_ranges(problem))
-    return "the plant outside, and dropout and range of sensors" * loses
+    return "the plant outside, and dropout and range" * bool(_lost_blocks(moving(problem)) or sensor_ranges(problem))
 
 
 def cycles_per_call(problem: Problem, *, compiled: bool) -> int:
@@ -170,10 +169,12 @@ def raw_measurements(run: Run) -> np.ndarray:
         # A state that is logged before the measurements is not made from them.
         state_measured = "output" in run.layout and run.layout.names.index("state") < run.layout.names.index(shown)
         names = ["state", shown] if state_measured else [shown]
-    rows = np.hstack([run[name].reshape(run.cycles, -1) for name in names])
-    if LOST.name in run.layout:
-        rows[run[LOST.name].ravel() > 0] = np.nan
-    return rows
+    return where_given(run, np.hstack([run[name].reshape(run.cycles, -1) for name in names]))
+
+
+def where_given(run: Run, rows: np.ndarray) -> np.ndarray:
+    """Return rows of what a controller saw, shape (cycles, n), with NaN where its sample was lost."""
+    return np.where(run[LOST.name] > 0, np.nan, rows) if LOST.name in run.layout else rows
 
 
 def shares(first: int, missing: int, known: int) -> np.ndarray:

@@ -69,12 +69,10 @@ class ComposedStep:
     ) -> Self:
         """Return the step of a controller; arguments as of `Stepper`."""
         settings = live_settings(problem, controller, live)
-        planner = settings.controller.planner
+        ready, planner = settings.controller, settings.controller.planner
         why = planner.optimiser.unbounded if bounded and planner is not None else ""
         require(not why, f"{why}; Stepper(..., bounded=False) accepts it away from a real plant")
-        composite = settings.composed(
-            lambda built: machine_step(problem, settings.controller, built.step, saturated_after)
-        )
+        composite = settings.composed(lambda built: machine_step(problem, ready, built.step, saturated_after))
         return cls(settings, composite, named_memory(composite)[1], Replay.of(problem, composite, bridged))
 
 

@@ -125,6 +125,12 @@ def test_an_excited_run_finds_what_suits_the_plant():
     assert ("cycles=0" in unstated.lines) == ("do not state dead_time" in " ".join(unstated.notes))
 
 
+def test_lost_samples_are_in_no_estimate():
+    """A value that is held in the place of a lost one would be taken for noise."""
+    problem = replace(body_problem(1.6, 2, 0.03, 0.1), sensing=fp.Sensing({"q''": fp.Sensor(dropout=0.2)}))
+    assert fp.probe(problem, RHC, cycles=150, amplitude=2.0, trials=False).noise["q"] == pytest.approx(0.1, rel=0.1)
+
+
 def error(problem: fp.Problem, deformation: Deformation | None) -> float:
     assert deformation is not None
     run = fp.simulate(problem, replace(RHC, deformation=deformation), seed=1, compiled=False)
