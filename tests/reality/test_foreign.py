@@ -42,10 +42,8 @@ BAD: dict[str, tuple[Any, str]] = {
     "ragged": (lambda a: [a, 1.0], "raised ValueError"),
 }
 SILENT: dict[str, Any] = {
-    "no number": lambda a: a * [1, np.nan, 1],
-    "masked": lambda a: np.ma.masked_array(a, [True, False, False]),
-    "infinite": lambda a: a * np.inf,
-}
+    "no number": lambda a: a * [1, np.nan, 1], "masked": lambda a: np.ma.masked_array(a, [True, False, False]),
+    "infinite": lambda a: a * np.inf}  # fmt: skip
 
 
 def outside(problem: fp.Problem, **settings) -> fp.Problem:
@@ -105,9 +103,7 @@ def test_bad_answer_ends_the_run_and_loses_nothing(kind):
     bad, message = BAD[kind]
     problem = task()
     result = run(replace(problem, reality=fp.ExternalPlant(Faulty(problem, bad), MEASURES)))
-    assert result.stop is not None
-    assert re.search(message, result.stop)
-    assert "at t = 0.1 s (cycle 100)" in result.stop
+    assert re.search(f"{message}.* at t = 0.1 s .cycle 100.", str(result.stop))
     assert result.cycles == 100
     assert np.array_equal(result["command"], run(outside(problem))["command"][:100])
 
@@ -227,9 +223,8 @@ def test_run_ends_where_the_level_is_below_zero():
     assert 100 < first < 500
     assert checked.cycles == first
     assert np.array_equal(checked["state.level"], free["state.level"][:first])
-    assert checked.stop is not None
-    assert checked.stop.startswith("state 'level' is -")
-    assert f"outside its physical range of 0 to inf m at t = {first * 1e-3:g} s (cycle {first})" in checked.stop
+    words = rf"state 'level' is -.*outside its physical range of 0 to inf m at t = {first * 1e-3:g} s \(cycle {first}\)"
+    assert re.match(words, str(checked.stop))
     assert free.stop is None
 
 
