@@ -164,9 +164,6 @@ def test_slotine_li_and_its_demand_are_one_law():
         np.testing.assert_allclose(demanded, direct, rtol=1e-10)
 
 
-# Rules by themselves.
-
-
 @pytest.mark.parametrize("gain", [0.1, 1.0, 1.9])
 @pytest.mark.parametrize("widths", [(1.0, 1.0, 1.0, 1.0), (1.0, 10.0, 0.1, 5.0)])
 def test_projection_shrinks_the_parameter_error(gain, widths):
@@ -211,9 +208,6 @@ def evidence(gradient: Any = None, equation: Any = None, clipped: Any = 0) -> An
 def rule_step(rule, bounds, rows):
     matrix, error = ca.SX.sym("G", rows, len(bounds)), ca.SX.sym("h", rows)
     return ca.Function("rule", [matrix, error], [rule.change(evidence(equation=lambda: (matrix, error)), bounds, 1e-3)])
-
-
-# Bounds and limits in a run.
 
 
 def test_mass_matrix_stays_positive_definite():
