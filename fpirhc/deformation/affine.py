@@ -23,7 +23,7 @@ class Affine(Deformation):
     It is eq. (6) of Khan, Tar and Rudas with the kernel zeta(x) = x / 2 + D, whose fixed point x* = 2 D cancels D.
 
     Args:
-        gain: A_c, negative where the model has the sign of the plant's input effect right.
+        gain: A_c; negative, because the correction acts against the error (the model has the right sign of the input's effect).
         weights: W of coupled responses, by which the gain becomes a matrix: a tuple with one number per controlled coordinate, or
             one of rows. None: the one matrix, every response corrects its own request.
 

@@ -35,8 +35,8 @@ class Sigmoid(Deformation):
     change of the desired response in one cycle; apart from that S does not matter.
 
     Args:
-        gain: A_c, dimensionless; negative where the model has the sign of the plant's input effect right. With the shift of 0.3 the
-            effective gain is -0.397 A_c.
+        gain: A_c, dimensionless; negative, because the correction acts against the error (the model has the right sign of the
+            input's effect). With the shift of 0.3 the effective gain is -0.397 A_c.
         shift: D, dimensionless, |D| <= 5. Give it the sign opposite to A_c, or the largest step shrinks (for |D| = 0.3
             from 0.81 S to 0.29 S).
         scale: S, in units of the response; None leaves the choice to the controller.

@@ -209,7 +209,7 @@ _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
 @dataclass(frozen=True)
 class FixedPoint(Optimiser):
-    """Fixed-point iteration in place of the reduced gradient.
+    """Plans by fixed-point iteration on their inputs, with the model alone. The adaptation (FPI) is a deformation.
 
     Args:
         iterations: per call without limits of states. None: a call ends where its plan is solved, after at most 50; it takes at
