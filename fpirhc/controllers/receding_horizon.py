@@ -30,7 +30,6 @@ from fpirhc.symbolic.driver import plans_are_compiled
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import Signals, Value, expression, graph
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar
-from fpirhc.symbolic.open import numbers
 from fpirhc.task.checks import cycles_per_plan
 from fpirhc.task.exogenous import model_values
 from fpirhc.task.problem import Problem
@@ -120,7 +119,6 @@ _PLANS: Latest[Block] = Latest(8)  # controllers that differ in their deformatio
 
 
 def _optimal_control(problem: Problem) -> OptimalControl:
-    """The horizon; open numbers of cost and limits are among its settings."""
     assert problem.horizon is not None
     assert problem.cost is not None
     ahead, limits, start = model_values(problem.plant, problem.signals), problem.limits, problem.start_state
@@ -169,13 +167,11 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     data_of = ocp.data_of(previewed=preview is not None)
     memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))
     solve = built(optimiser, ocp, optimiser.step)
-    low, high = problem.limits.input_ends(plant)
 
     def step(s: Signals) -> dict[str, Value]:
         own = [getattr(s, one.name) for one in problem.own_signals]
         motion = () if preview is None else preview(s.time, *own)
-        rows = [numbers(ocp.settings, s.parameters)] if ocp.settings else []
-        data = data_of(s.time, *motion, s.parameters, *rows)
+        data = data_of(s.time, *motion, s.parameters)
         for seen in plant.beside if restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=corrected)
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
@@ -184,11 +180,11 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         if room is None:
             # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
             first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
-            lower, upper = _minus(low, s._command_shift_last), _minus(high, s._command_shift_last)
+            lower, upper = problem.limits.shifted_ends(plant, s._command_shift_last, s._command_shift_last)
         else:
-            own_room, planned_before = ca.DM(room), getattr(s, _PLANNED_BEFORE)
+            own_room, planned_before = ca.MX(ca.DM(room)), getattr(s, _PLANNED_BEFORE)
             first = ocp.start(s._plan_state, planned_before)
-            lower, upper = (_minus(ends, expression(shift)) for ends, shift in ((low, -own_room), (high, own_room)))
+            lower, upper = problem.limits.shifted_ends(plant, expression(-own_room), expression(own_room))
         before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)
@@ -219,11 +215,6 @@ def _plan_reads(problem: Problem, room: np.ndarray | None) -> Layout:
     outputs = (*outputs, plant.state) if problem.horizon.measured else outputs
     start = like(plant.state, "_plan_state")
     return Layout((plant.time, start, *outputs, plant.parameter, *last, *own))
-
-
-def _minus(ends: Sequence[float], shift: Expression) -> Expression:
-    """Limits, which may be open, minus a column."""
-    return numbers(ends, shift) - shift
 
 
 def _command_shift_block(problem: Problem, deformation: Deformation) -> Block:

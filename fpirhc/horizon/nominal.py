@@ -216,15 +216,13 @@ def stage_data(
     reference: Reference,
     horizon: Horizon,
     cost: Cost,
-    settings: int = 0,
     signals: ca.Function | None = None,
     *,
     previewed: bool = False,
 ) -> ca.Function:
     """Function (time, parameters) -> data of all stages, shape (ntheta, N + 1), along the nominal motion.
 
-    With `settings` rows of open numbers, (time, parameters, these rows) -> data that end with them. With
-    `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where the reference is
+    With `signals`, a Function (time, parameters) -> parameters, every stage has those of its middle. Where the reference is
     `previewed`, its states (nx, N + 1) and responses (n, N + 1) follow the time as arguments.
     """
     looked_up = signals is not None and not signals.is_a("SXFunction")
@@ -239,7 +237,6 @@ def stage_data(
     start, parameters, count = ca.MX.sym("t"), ca.MX.sym("p", plant.parameter.size), horizon.stages + 1
     columns = dict(zip(("states", "responses"), motion, strict=False))
     tables = [ca.MX.sym(name, m.numel(), count) for name, m in columns.items()]
-    given = [ca.MX.sym("settings", settings)] if settings else []
     lasting = np.append(np.diff(horizon.nodes), horizon.last) if horizon.lengths else np.full(count, horizon.step)
     times, halves = start + ca.DM(horizon.nodes).T, ca.DM(0.5 * lasting).T
     rows: list[np.ndarray] = []
@@ -250,10 +247,8 @@ def stage_data(
     table = ca.vertcat(
         one.map(count)(times, halves, ca.repmat(parameters, 1, count), *tables),
         *(ca.DM(row.astype(float)) for row in rows),
-        *(ca.repmat(v, 1, count) for v in given),
     )
-    names = ["t", *columns, "p", *(["settings"] if settings else [])]
-    return ca.Function("fpirhc_horizon_data", [start, *tables, parameters, *given], [table], names, ["data"])
+    return ca.Function("fpirhc_horizon_data", [start, *tables, parameters], [table], ["t", *columns, "p"], ["data"])
 
 
 def shifted_reference(plant: Plant, layout: Layout, nodes: int, *, corrected: bool) -> ca.Function:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -34,7 +35,7 @@ class OptimalControl:
         state: signal of s_i.
         input: signal of u_i.
         data: layout of theta_i.
-        data_of: returns the Function (time, parameters, settings) -> theta of all stages; `previewed`: as `stage_data` says.
+        data_of: returns a function (time, parameters) -> theta of all stages; `previewed`: as `stage_data` says.
         dynamics: (s, u, theta) -> s_next.
         stage_cost: (s, u, theta) -> (l, terms).
         terminal_cost: (s, theta) -> T.
@@ -53,7 +54,6 @@ class OptimalControl:
         state_price: cost of a violation of a state's bounds per unit and node, shape (ns,); infinite where they are hard.
         node_times: of s_0 ... s_N from the start, shape (N + 1,), s.
         shares: times from plan to plan per stage's length, shape (N,); ones where every plan follows one stage later.
-        settings: the open settings, whose numbers are among the data.
         runaway: function that returns the factors by which the stages along the reference make a motion grow that decays in the
             plant, shape (N,).
         functions: Functions that were built for it; problems that differ in numbers of settings only share them.
@@ -64,7 +64,7 @@ class OptimalControl:
     state: Signal
     input: Signal
     data: Layout
-    data_of: Callable[..., ca.Function]
+    data_of: Callable[..., Callable[..., Any]]
     dynamics: ca.Function
     stage_cost: ca.Function
     terminal_cost: ca.Function
@@ -82,7 +82,6 @@ class OptimalControl:
     state_price: np.ndarray
     node_times: np.ndarray
     shares: np.ndarray
-    settings: tuple[ca.SX, ...] = ()
     runaway: Callable[[], np.ndarray] = lambda: np.ones(1)
     functions: dict[object, ca.Function] = field(default_factory=dict, repr=False)
 

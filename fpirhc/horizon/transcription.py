@@ -7,9 +7,8 @@ optimiser that keeps bounds of states keeps these limits too, and they are verif
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, cast
 
 import casadi as ca
@@ -27,7 +26,7 @@ from fpirhc.plant.motion import sampling
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Layout, Signal
-from fpirhc.symbolic.open import number_of, open_in
+from fpirhc.symbolic.open import numbers, open_in
 from fpirhc.task.limits import Limits, PathConstraint
 from fpirhc.task.reference import Reference
 
@@ -70,10 +69,13 @@ def _transcribed(
     same = plant.equations, reference, cost, whole
     stage = _STAGES.of(same, (horizon,), lambda: _stage(plant, reference, horizon, cost, limits))
     binding, free = stage.binding, stage.before
-    data_of = partial(stage_data, plant, reference, horizon, cost, len(stage.settings), signals)
-    settings = [list(map(number_of, stage.settings))] if stage.settings else []
     rows = (Signal("settings", tuple(one.name() for one in stage.settings)),) if stage.settings else ()
-    table = np.asarray(data_of()(0.0, plant.approximate, *settings).full())
+
+    def data_of(*, previewed: bool = False) -> Callable[..., Any]:
+        function = stage_data(plant, reference, horizon, cost, signals, previewed=previewed)
+        return _with_rows(function, stage.settings) if rows else function
+
+    table = np.asarray(data_of()(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     bounds = limits.input_bounds(plant)
     _check_finite_limits(stage, nodes)
@@ -105,7 +107,6 @@ def _transcribed(
         along=along,
         written=len(binding),
         state_price=state_prices(limits, state, plant, horizon.step),
-        settings=stage.settings,
         state_of=lambda outputs: plant.equations.state_of(outputs, ca.SX(nodes[0][:, -1])),
         runaway=lambda: spurious_growth(
             plant,
@@ -119,6 +120,16 @@ def _transcribed(
         shares=horizon.share / horizon.relative_lengths,
         functions=functions,
     )
+
+
+def _with_rows(function: ca.Function, settings: tuple[ca.SX, ...]) -> Callable[..., Any]:
+    """Function of the same arguments -> data that end with rows of the open numbers; of numbers those of the build."""
+
+    def data(*arguments: Any) -> Any:
+        table = function(*arguments)
+        return ca.vertcat(table, ca.repmat(numbers(settings, table), 1, table.size2()))
+
+    return data
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from types import FunctionType
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -24,7 +24,6 @@ from fpirhc.symbolic.layout import Expression, Signal
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 SETTINGS = "settings"  # the signal of all open numbers of a loop
-Value = TypeVar("Value", ca.SX, ca.MX)
 _LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
 _OPEN: dict[int, Opened] = {}  # of every symbol of both kinds
 
@@ -113,15 +112,17 @@ def nominal(value: Any) -> Any:
     return type(value)([*changed.values()]) if isinstance(value, tuple | list) else copied(value, changed)
 
 
-def expressed(value: float | ca.SX, beside: Value) -> Value:
-    """Return a number as an expression of the kind of another one; a number that is not open stays as it is."""
-    if not isinstance(value, ca.SX) or not isinstance(beside, ca.MX):
-        return cast(Value, value)
+def _expressed(value: float | ca.SX, beside: Expression) -> Any:
+    """A number as an expression of the kind of another one, beside numbers that of the build; one that is not open as it is."""
+    if not isinstance(value, ca.SX) or isinstance(beside, ca.SX):
+        return value
+    if isinstance(beside, ca.DM):
+        return number_of(value)
     symbols = ca.symvar(value)
     graph = [_OPEN[_key(s)].graph[s.name()] for s in symbols]
     return graph[0] if value.is_symbolic() else ca.Function("fpirhc_open", symbols, [value])(*graph)
 
 
 def numbers(values: Sequence[float | ca.SX], beside: Expression) -> Expression:
-    """Return a column of numbers, of the kind of another one where some are open."""
-    return ca.vertcat(*(expressed(value, beside) for value in values))
+    """Return a column of numbers, of the kind of another one where some are open: beside numbers those of the build."""
+    return ca.vertcat(*(_expressed(value, beside) for value in values))

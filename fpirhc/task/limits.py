@@ -17,7 +17,7 @@ from fpirhc.plant.motion import derivative_unit
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression, Value
 from fpirhc.symbolic.layout import Named
-from fpirhc.symbolic.open import nominal
+from fpirhc.symbolic.open import nominal, numbers
 
 Interval = tuple[float, float]
 _FREE = (-math.inf, math.inf)
@@ -112,6 +112,11 @@ class Limits(Checked):
         """Lower and upper end of every input, which may be open numbers; infinite where free."""
         intervals = [self.inputs.get(name, _FREE) for name in plant.input.elements]
         return [low for low, _ in intervals], [high for _, high in intervals]
+
+    def shifted_ends(self, plant: Plant, low: Expression, high: Expression) -> tuple[Expression, Expression]:
+        """The ends in the expressions of a plan, less a column (nu,) each."""
+        lower, upper = self.input_ends(plant)
+        return numbers(lower, low) - low, numbers(upper, high) - high
 
     def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of every input, of the build where it is open, shape (nu,) each; infinite where free."""
