@@ -24,7 +24,7 @@ from fpirhc.sensing.base import backward_difference, combine
 from fpirhc.simulation.moved import Mover, acting_blocks, moving, outside_blocks, real_signals
 from fpirhc.simulation.replay import answer_blocks, gated_blocks
 from fpirhc.simulation.tables import disturbance_signal
-from fpirhc.symbolic.block import Block, Composite, Delay, compose, open_settings, rename
+from fpirhc.symbolic.block import Block, Composite, Delay, compose, rename
 from fpirhc.symbolic.expression import Signals, Value, expression
 from fpirhc.symbolic.layout import Expression, Layout, Signal, like, scalar, vector
 from fpirhc.task.dead_time import Queue, delay_block
@@ -36,7 +36,7 @@ def closed_loop(built: Built) -> Composite:
 
     With an `ExternalPlant` the step also reads its measurements, and returns the inputs that it is sent.
 
-    Both parameter sets are part of the memory (constant), so that other values need no new Function; open numbers likewise. The
+    Both parameter sets are part of the memory (constant), so that other values need no new Function. The
     disturbance input exists only when the problem has disturbances, `sensing` only where sensors are noisy or lose samples,
     `setpoints` only where the reference is given some.
     """
@@ -49,14 +49,12 @@ def closed_loop(built: Built) -> Composite:
     clock, actuating = _clock_block(problem.plant.time, problem.period), acting_blocks(mover, disturbed)
     outside = [clock, *outside_blocks(mover, built.model), *answer_blocks(mover)]
     around = [*outside, *seeing, *gated_blocks(mover, inner), *judging, *actuating]
-    constants = [Delay(signal, signal.name) for signal in open_settings(around)]
     reads = Layout((*disturbed, *problem.sensing.drawn, *built.given, *mover.reads))
-    delays = [*mover.delays, Delay(built.model.parameter, "parameters"), *constants]
-    return compose("loop", reads, around, delays, outputs=mover.sent)
+    return compose("loop", reads, around, mover.delays, outputs=mover.sent, constants=(built.model.parameter,))
 
 
 def start_memory(loop: Composite, problem: Problem, controller: Controller) -> np.ndarray:
-    """Return the first memory of a loop, shape (loop.memory.size,), with the live settings of the build.
+    """Return the first memory of a loop, shape (loop.memory.size,).
 
     Args:
         problem: the problem of the loop, or one that differs from it in the exact parameters only.

@@ -154,15 +154,26 @@ class Composite:
 
 
 def compose(
-    name: str, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay] = (), outputs: Sequence[str] = ()
+    name: str,
+    reads: Layout,
+    blocks: Sequence[Block],
+    delays: Sequence[Delay] = (),
+    outputs: Sequence[str] = (),
+    constants: Sequence[Signal] = (),
 ) -> Composite:
-    """Wire blocks, in order, by signal name into one step, which returns the traced `outputs` once more by themselves."""
+    """Wire blocks, in order, by signal name into one step, which returns the traced `outputs` once more by themselves.
+
+    `constants` are remembered as they were in the first cycle, and with them the settings that are open in the blocks. Without
+    constants the step reads these settings.
+    """
+    kept = (*constants, *open_settings(blocks)) if constants else ()
+    delays = (*delays, *(Delay(signal, signal.name) for signal in kept))
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
     reads = Layout((*reads.signals, *[s for s in open_settings(blocks) if s.name not in held]))
     _require_wired(reads, memory, blocks, delays)
     trace = Layout(tuple([s for b in blocks for s in b.writes.signals if not s.name.startswith("_")]))
-    return Composite(name, tuple(blocks), tuple(delays), reads, memory, trace, tuple(outputs))
+    return Composite(name, tuple(blocks), delays, reads, memory, trace, tuple(outputs))
 
 
 def _require_wired(reads: Layout, memory: Layout, blocks: Sequence[Block], delays: Sequence[Delay]) -> None:

@@ -107,19 +107,11 @@ class Latest(threading.local, Generic[T]):
         """Return what `build` returns, or what it returned for the `same` objects and `equal` values."""
         for objects, others, result in tuple(self._known):
             alike = len(objects) == len(same) and all(map(is_, objects, same))
-            if alike and _equal(others, equal):
+            if alike and others == equal:
                 return result
         result = build()
         self._known.append((same, equal, result))
         return result
-
-
-def _equal(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
-    """Whether they are equal; an open number, which has no truth value, equals no other."""
-    try:
-        return one == other
-    except RuntimeError:
-        return False
 
 
 def attempted(what: str, compute: Callable[..., T], *arguments: object, broken: list[str], **named: object) -> T | None:
