@@ -60,7 +60,7 @@ class LiveSettings:
             return compose(made(self.problem, ready))
         opened = Opened(self.start)
         try:
-            composite = compose(made(*self._with(opened.symbols, checked=False)))
+            composite = compose(made(*self._with(opened.symbols)))
         except _OF_BUILD as error:
             interruption = unwrapped(error)
             if not isinstance(interruption, Exception):
@@ -147,14 +147,14 @@ class LiveSettings:
         """Return where a memory has the numbers of all live settings."""
         return np.arange(memory.size)[memory.slice(SETTINGS)] if self.paths else np.zeros(0, dtype=int)
 
-    def _with(self, contents: Mapping[str, object], *, checked: bool = True) -> tuple[Problem, Controller]:
+    def _with(self, contents: Mapping[str, object]) -> tuple[Problem, Controller]:
         """Problem and controller with other contents, by path."""
         problem, controller = self.problem, self.controller
         for path, content in contents.items():
             if _owner(self.problem, self.controller, path) is self.problem:
-                problem = changed_at(problem, path, content, checked=checked)
+                problem = changed_at(problem, path, content)
             else:
-                controller = changed_at(controller, path, content, checked=checked)
+                controller = changed_at(controller, path, content)
         return problem, controller
 
     def _content(self, path: str) -> float:

@@ -18,10 +18,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, NotSupported, require
-from fpirhc.fields.checked import Checked, Inner, replaced
+from fpirhc.fields.checked import Checked, Inner, fact, replaced
 from fpirhc.symbolic.dotted import copied
 from fpirhc.symbolic.layout import Expression, Layout
-from fpirhc.symbolic.open import stays
 from fpirhc.task.dead_time import Cycles, every
 
 Wrapping = TypeVar("Wrapping")
@@ -110,10 +109,10 @@ class Deformation(Checked, ABC):
         inner = Inner()
 
     @final
-    @property
+    @fact
     def adapts(self) -> bool:
         """Whether the response changes the request at all, as its gain says."""
-        return not stays(self.effective_gain(), 0.0)
+        return self.effective_gain() != 0
 
     @property
     def form(self) -> Form:
@@ -288,7 +287,7 @@ def chosen_pole(gain: float, cycles: Cycles, uncertainty: int | None, pole: floa
 
 def leaked(pole: float, before: Expression, deformation: Expression) -> Expression:
     """Return p delta_{k-1} + (1 - p) delta; delta itself without a leak."""
-    return deformation if stays(pole, 0.0) else pole * before + (1 - pole) * deformation
+    return pole * before + (1 - pole) * deformation
 
 
 def default_pole(product: float, uncertainty: float) -> float:

@@ -12,7 +12,7 @@ from abc import ABCMeta
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from functools import cache, wraps
+from functools import cache, cached_property, wraps
 from importlib import import_module
 from typing import Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 
@@ -21,12 +21,22 @@ import casadi as ca
 from fpirhc.errors import InvalidField, InvalidName, NotSupported, nearest
 from fpirhc.fields.kinds import ANYTHING, SHORT, Expected, accepts, call_of, described, expected_by
 from fpirhc.fields.user_code import users_place
+from fpirhc.symbolic.open import closed, opened
+
+P = ParamSpec("P")
+R = TypeVar("R")
+Value = TypeVar("Value")
 
 
 class _CheckedWhenCalled(ABCMeta):
     """Classes whose calls check the arguments before anything is made of them."""
 
     def __call__(cls, *arguments: object, **named: object) -> object:
+        given = {**dict(zip(_arguments_of(cls).positional, arguments, strict=False)), **named}
+        if (numbers := closed(given)) is not given and is_dataclass(cls):
+            value = opened(cls(**numbers), given)
+            find_by_name(value)
+            return value
         mistakes = _abstract(cls) if inspect.isabstract(cls) else tuple(_arguments_of(cls).mistakes(arguments, named))
         if not mistakes:
             value = type.__call__(cls, *arguments, **named)
@@ -60,6 +70,14 @@ def expects_whole_number(owner: type, name: str) -> bool:
     return _arguments_of(owner).expected.get(name, ANYTHING).whole
 
 
+class fact(cached_property[Value]):
+    """A property that is found once, and from the numbers with which the value was checked."""
+
+    def __get__(self, value: Any, owner: type | None = None) -> Any:
+        checked = closed(value)
+        return super().__get__(value, owner) if checked is value else getattr(checked, cast(str, self.attrname))
+
+
 class Inner:
     """The first value of the same contract that a member holds in a field: what it is around; None for one that stands alone."""
 
@@ -82,11 +100,6 @@ def _abstract(cls: type) -> tuple[str, ...]:
         return (f"{cls.__name__} is a contract; use one of its members",)
     owners = {name: next(base for base in cls.__mro__ if name in vars(base)).__name__ for name in missing}
     return tuple(f"{cls.__name__} has no {name}(...), which its contract {owners[name]} asks for" for name in missing)
-
-
-P = ParamSpec("P")
-R = TypeVar("R")
-Value = TypeVar("Value")
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:

@@ -20,7 +20,6 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidField
-from fpirhc.symbolic.open import is_open
 
 SHORT = reprlib.Repr()
 SHORT.maxstring, SHORT.maxother, SHORT.maxdict = 60, 60, 2
@@ -164,11 +163,9 @@ _OFTEN = (float, int)
 
 
 def _number(integer: bool, within: Range | None = None) -> Expected:
-    """A number that is not NaN, as Python or numpy have it, or a number that stands for a symbol."""
+    """A number that is not NaN, as Python or numpy have it."""
 
     def fits(value: Any) -> bool:
-        if is_open(value):
-            return True
         if isinstance(value, np.ndarray) or (integer and not isinstance(value, numbers.Integral)):
             return False
         number = real_number(value)

@@ -23,7 +23,6 @@ from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.expression import total
 from fpirhc.symbolic.layout import Expression, Named, Signal
-from fpirhc.symbolic.open import stays
 
 
 @dataclass(frozen=True)
@@ -266,8 +265,8 @@ class Quadratic(Cost):
     def tracked(self) -> Mapping[str, float]:
         """The weights of `states` or `outputs`; those of `terminal` for what only the end of the horizon weighs."""
         at_end = self.terminal if isinstance(self.terminal, Mapping) else {}
-        own = {n: w for n, w in self._errors.items() if not stays(w, 0)}
-        return {n: w for n, w in {**at_end, **own}.items() if not stays(w, 0)}
+        own = {n: w for n, w in self._errors.items() if w}
+        return {n: w for n, w in {**at_end, **own}.items() if w}
 
     def check(self, plant: Plant) -> None:
         """Raise if a name is unknown or a weight is negative or not finite.

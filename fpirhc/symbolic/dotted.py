@@ -89,16 +89,16 @@ def copied(value: T, changes: Mapping[str, object]) -> T:
     return copy
 
 
-def changed_at(value: T, path: str, content: object, *, checked: bool = True) -> T:
-    """Return the value with another content at a path; where it is not `checked` it may be a symbol."""
+def changed_at(value: T, path: str, content: object) -> T:
+    """Return the value with another content at a path."""
 
     def with_(name: str, new: object) -> T:
-        return replace(value, **{name: new}) if checked else copied(value, {name: new})  # type: ignore[type-var]
+        return replace(value, **{name: new})  # type: ignore[type-var]
 
     name, _, rest = path.partition(".")
     if name not in names_in(value) and (field := _wraps(value)) is not None:
-        return with_(field, changed_at(entry(value, field), path, content, checked=checked))
-    inner = changed_at(entry(value, name), rest, content, checked=checked) if rest else content
+        return with_(field, changed_at(entry(value, field), path, content))
+    inner = changed_at(entry(value, name), rest, content) if rest else content
     if isinstance(value, Mapping):
         return cast(T, {**value, name: inner})
     if isinstance(value, Sequence):

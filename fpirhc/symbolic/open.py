@@ -3,20 +3,17 @@
     opened = Opened({"deformation.gain": -0.5})  # symbols with the numbers of the build
     opened.symbols["deformation.gain"], opened.signal
 
-The closed values are checked first; then a symbol is planted in place of each number, without another check
-(`fpirhc.controllers.live_settings`). A block whose step meets one reads the vector `settings` of its loop. Python cannot compute
-with a symbol: where a build does, it is refused by its path and the place.
+A value with open numbers is made by way of the `closed` one, with the numbers of the build, which is checked, and whose facts it
+has (`fpirhc.fields.checked`). A block whose step meets a symbol reads the vector `settings` of its loop. Python cannot compute with
+a symbol: where a build does, it is refused by its path and the place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from types import FunctionType
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.symbolic.dotted import copied
@@ -24,7 +21,7 @@ from fpirhc.symbolic.layout import Expression, Signal
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 SETTINGS = "settings"  # the signal of all open numbers of a loop
-_LEAVES = {float, int, bool, str, type(None), np.ndarray, FunctionType}
+_CLOSED = "_closed"  # of a value with open numbers: that with those of the build
 _OPEN: dict[int, Opened] = {}  # of every symbol of both kinds
 
 
@@ -71,11 +68,6 @@ def is_open(value: object) -> bool:
     return bool(symbols) and len(open_in(value)) == len(symbols)
 
 
-def stays(x: float, value: float) -> bool:
-    """Return whether a number is a certain one in every run of the loop; an open one may become another."""
-    return not isinstance(x, ca.SX) and x == value
-
-
 def not_live(paths: Iterable[str], why: str, where: str = "") -> NotSupported:
     """Return the error of settings that cannot be open, with the reason; `where` says in which case they cannot, after a space."""
     names = [f"'{path}'" for path in paths]
@@ -89,27 +81,26 @@ def number_of(value: ca.SX) -> float:
     return float(ca.Function("fpirhc_number", symbols, [value])(*numbers))
 
 
-def nominal(value: Any) -> Any:
-    """Return a value with the numbers of the build in place of all open ones in it; the value itself where it has none."""
-    if not _OPEN or type(value) in _LEAVES:
+def closed(value: Any) -> Any:
+    """Return a value with the numbers of the build in place of open ones; the value itself where it has none."""
+    if not _OPEN:
         return value
     if isinstance(value, ca.SX):
         return number_of(value) if is_open(value) else value
-    parts: dict[Any, Any]
-    if isinstance(value, Mapping):
-        parts = dict(value)
-    elif isinstance(value, tuple | list):
-        parts = dict(enumerate(value))
-    elif is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: getattr(value, f.name) for f in fields(value)}
-    else:
-        return value
-    changed = {key: nominal(part) for key, part in parts.items()}
+    if not isinstance(value, Mapping | tuple | list):
+        return getattr(value, "__dict__", {}).get(_CLOSED, value)
+    parts = dict(value) if isinstance(value, Mapping) else dict(enumerate(value))
+    changed = {key: closed(part) for key, part in parts.items()}
     if all(changed[key] is part for key, part in parts.items()):
         return value
-    if isinstance(value, Mapping):
-        return changed
-    return type(value)([*changed.values()]) if isinstance(value, tuple | list) else copied(value, changed)
+    return changed if isinstance(value, Mapping) else type(value)([*changed.values()])
+
+
+def opened(value: object, given: Mapping[str, object]) -> object:
+    """Return a frozen value with what is given in place of fields that have open numbers; the value itself is its closed one."""
+    other = copied(value, {name: one for name, one in given.items() if closed(one) is not one})
+    object.__setattr__(other, _CLOSED, value)
+    return other
 
 
 def _expressed(value: float | ca.SX, beside: Expression) -> Any:

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, fact
 from fpirhc.fields.kinds import Duration, Finite
 from fpirhc.horizon.cost import Cost, Horizon
 from fpirhc.horizon.nominal import nominal_run
@@ -20,7 +20,6 @@ from fpirhc.plant.plant import Plant, plant_facts
 from fpirhc.sensing.sensing import Sensing
 from fpirhc.summary import line
 from fpirhc.symbolic.layout import Signal
-from fpirhc.symbolic.open import nominal
 from fpirhc.task.checks import check_problem, settled
 from fpirhc.task.dead_time import DeadTime
 from fpirhc.task.disturbance import Disturbance
@@ -88,7 +87,7 @@ class Problem(Checked):
     def __post_init__(self) -> None:
         for name, value in settled(self).items():
             object.__setattr__(self, name, value)
-        check_problem(nominal(self))
+        check_problem(self)
 
     def __repr__(self) -> str:
         named = (self.name,) if self.name else ()
@@ -104,7 +103,7 @@ class Problem(Checked):
         """Number of control cycles in a run."""
         return round(self.duration / self.period)
 
-    @cached_property
+    @fact
     def judged_names(self) -> tuple[str, ...]:
         """Coordinates whose errors are logged and measured."""
         if self.judged is not None:

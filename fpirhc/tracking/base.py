@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, replaced
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
@@ -58,11 +57,7 @@ class Tracking(Checked, ABC):
 
 def bounded(law: Tracking, largest: Sequence[float]) -> Tracking:
     """Return the law with the largest response of every controlled coordinate in its field `largest`, where that is empty."""
-    if getattr(law, "largest", True):
-        return law
-    other = copy(law)  # not `replace`, which would check numbers that are open
-    object.__setattr__(other, "largest", tuple(largest))
-    return other
+    return law if getattr(law, "largest", True) else replaced(law, "largest", tuple(largest)) or law
 
 
 def decay_gains(rate: float, order: int) -> tuple[float, ...]:
