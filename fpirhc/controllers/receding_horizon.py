@@ -180,11 +180,11 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         if room is None:
             # The shift of the last cycle is added to the plan's inputs, so their rate counts from the last command without it.
             first = ocp.start(s._plan_state, s._command_before - s._command_shift_last)
-            lower, upper = problem.limits.shifted_ends(plant, s._command_shift_last, s._command_shift_last)
+            lower, upper = ocp.ends(s._command_shift_last, s._command_shift_last)
         else:
             own_room, planned_before = ca.MX(ca.DM(room)), getattr(s, _PLANNED_BEFORE)
             first = ocp.start(s._plan_state, planned_before)
-            lower, upper = problem.limits.shifted_ends(plant, expression(-own_room), expression(own_room))
+            lower, upper = ocp.ends(expression(-own_room), expression(own_room))
         before = graph(memory.join({m: getattr(s, m) for m in memory.names}))
         remembered = expression(ca.if_else(graph(s.plan_begun) > 0.5, optimiser.shifted(ocp, before), before))
         inputs, diagnostics, next_memory = solve(first, data, lower, upper, remembered)

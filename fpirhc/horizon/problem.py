@@ -16,7 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from fpirhc.symbolic.layout import Layout, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 _LEAST = 1e-3  # of what inputs move a state by: a smaller spread of the reference is no measure of it
 _NOTHING = 1e-9  # of the same: a spread of rounding
@@ -45,6 +45,7 @@ class OptimalControl:
         state_upper: bounds of s_1 ... s_N, shape (ns,).
         input_lower: bounds of u_i, shape (nu,); a call of an optimiser may have others.
         input_upper: bounds of u_i, shape (nu,); a call of an optimiser may have others.
+        ends: returns these bounds less a shift, of (shift of the lower ones, of the upper ones), shape (nu,) each.
         curvature: second derivative of the cost rate along each input near the reference, shape (nu,); it converts gradients to the
             units of the inputs.
         nodes: states, inputs and data along the reference from t = 0.
@@ -74,6 +75,7 @@ class OptimalControl:
     state_upper: np.ndarray
     input_lower: np.ndarray
     input_upper: np.ndarray
+    ends: Callable[[Expression, Expression], tuple[Expression, Expression]]
     curvature: np.ndarray
     nodes: tuple[np.ndarray, np.ndarray, np.ndarray]
     along: _ReferenceExpansion

@@ -77,7 +77,7 @@ def _transcribed(
 
     table = np.asarray(data_of()(0.0, plant.approximate).full())
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
-    bounds = limits.input_bounds(plant)
+    bounds, (low, high) = limits.input_bounds(plant), limits.input_ends(plant)
     _check_finite_limits(stage, nodes)
     _check_finite(stage, nodes)
     functions: dict[object, ca.Function] = {}
@@ -102,6 +102,7 @@ def _transcribed(
         state_upper=np.concatenate([upper, np.full(free, np.inf), [w.upper for w in binding]]),
         input_lower=bounds[0],
         input_upper=bounds[1],
+        ends=lambda below, above: (numbers(low, below) - below, numbers(high, above) - above),
         curvature=input_curvature(along, horizon.step),
         nodes=nodes,
         along=along,

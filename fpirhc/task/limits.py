@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 
 from fpirhc.errors import Mistakes
-from fpirhc.fields.checked import Checked
+from fpirhc.fields.checked import Checked, fact
 from fpirhc.fields.kinds import Positive
 from fpirhc.fields.user_code import called, scalar_expression
 from fpirhc.plant.motion import derivative_unit
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.expression import Expression, Value
 from fpirhc.symbolic.layout import Named
-from fpirhc.symbolic.open import nominal, numbers
 
 Interval = tuple[float, float]
 _FREE = (-math.inf, math.inf)
@@ -109,27 +108,27 @@ class Limits(Checked):
         return {**rates, **self.paths}
 
     def input_ends(self, plant: Plant) -> tuple[list[float], list[float]]:
-        """Lower and upper end of every input, which may be open numbers; infinite where free."""
+        """Lower and upper end of every input, for a step; infinite where free."""
         intervals = [self.inputs.get(name, _FREE) for name in plant.input.elements]
         return [low for low, _ in intervals], [high for _, high in intervals]
 
-    def shifted_ends(self, plant: Plant, low: Expression, high: Expression) -> tuple[Expression, Expression]:
-        """The ends in the expressions of a plan, less a column (nu,) each."""
-        lower, upper = self.input_ends(plant)
-        return numbers(lower, low) - low, numbers(upper, high) - high
+    @fact
+    def _checked(self) -> Self:
+        """These limits with the numbers that were checked."""
+        return self
 
     def input_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bound of every input, of the build where it is open, shape (nu,) each; infinite where free."""
-        return _bounds(self.inputs, plant.input.elements)
+        """Lower and upper bound of every input, as they were checked, shape (nu,) each; infinite where free."""
+        return _bounds(self._checked.inputs, plant.input.elements)
 
     def rate_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of the change of every input, shape (nu,) each; infinite where free or priced."""
-        rates = {name: ends for name, ends in self.rates.items() if name not in self.prices}
+        rates = {name: ends for name, ends in self._checked.rates.items() if name not in self.prices}
         return _bounds(rates, plant.input.elements)
 
     def state_bounds(self, plant: Plant) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bound of every state, shape (nx,) each; infinite where free."""
-        return _bounds(self.states, plant.state.elements)
+        return _bounds(self._checked.states, plant.state.elements)
 
 
 def _state(name: str) -> Callable[[OfStage], Value]:
@@ -148,5 +147,5 @@ def _check_interval(name: str, interval: Interval, mistakes: Mistakes) -> None:
 
 
 def _bounds(intervals: Mapping[str, Interval], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    pairs = np.array([nominal(intervals.get(n, _FREE)) for n in names], dtype=float).reshape(-1, 2)
+    pairs = np.array([intervals.get(n, _FREE) for n in names], dtype=float).reshape(-1, 2)
     return pairs[:, 0], pairs[:, 1]
