@@ -162,6 +162,7 @@ class Simulator:
             "parameters": [float(v) for v in model.parameters(model.plant)],
             "controller": _DESCRIBED.of((controller,), (), lambda: describe(controller)),
             "problem": describe(problem),
+            "limits": [ends.tolist() for ends in problem.limits.input_bounds(problem.plant)],  # in force
             "backend": "compiled C" if own.compiled else "CasADi virtual machine",
             "why not compiled": own.backend.reason,
         }

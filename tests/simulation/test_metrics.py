@@ -67,7 +67,7 @@ def test_at_limit_is_where_a_command_stands_and_of_the_measured_part():
     pump = problem(limits=fp.Limits(inputs={"u": (0.0, float("inf"))}))
     assert share(0.0, pump) == share(0.9e-9, pump) == pytest.approx(0.6)
     assert share(1.5e-9, pump) == 0.0  # a billionth of 1 N where a limit is open
-    given = replace(run(0.0, command=step(2.0, 0.0, 70)), settings={"live": {"limits.inputs.u.0": 0.0}})
+    given = replace(run(0.0, command=step(2.0, 0.0, 70)), settings={"limits": [[0.0], [2.0]]})
     assert fp.measure(limited, given)["at_limit"][""] == 1.0  # a limit that the run was given
     slow = problem(limits=fp.Limits(rates={"u": (-1.0, 2.0)}))  # 0.1 N down and 0.2 N up a cycle, to a millionth
     moves = {-0.1 + 5e-8: 0.98, -0.1 + 2e-7: 0.0, 0.2 - 1e-7: 0.98, 0.2 - 3e-7: 0.0}  # the first measured one begins

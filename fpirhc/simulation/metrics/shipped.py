@@ -8,9 +8,8 @@ factor by which the iteration shrinks an error per cycle: from the symbols along
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -82,12 +81,7 @@ def at_limit(problem: Problem, run: Run) -> float:
 
 def at_limits(problem: Problem, run: Run, *, rates: bool = True) -> np.ndarray:
     """Return whether every command, or with `rates` its change, is at a limit in a measured cycle, shape (cycles, inputs)."""
-    given = cast(Mapping[str, float], run.settings.get("live", {}))  # limits that the run was given
-    ends = enumerate(problem.limits.input_bounds(problem.plant))
-    lower, upper = (
-        np.array([given.get(f"limits.inputs.{name}.{k}", b) for name, b in zip(problem.plant.inputs, end, strict=True)])
-        for k, end in ends
-    )
+    lower, upper = np.array(run.settings.get("limits", problem.limits.input_bounds(problem.plant)))  # in force
     span = upper - lower
     near, commands = _AT * np.where(np.isfinite(span), span, 1.0), _measured(problem, run)
     stands = (commands <= lower + near) | (commands >= upper - near)
