@@ -101,8 +101,6 @@ class Cascade(Controller):
 
     deforms = "target"
 
-    planner = None  # plans of the inner controller follow the target, and not the reference of the problem
-
     def inner_problem(self, problem: Problem, name: str = "") -> Problem:  # noqa: ARG002
         return replace(problem, reference=Shifted(problem.reference))
 

@@ -162,10 +162,15 @@ class Controller(Checked, ABC):
         """
         return "response" if self.inner is None else self.inner.deforms
 
+    @final
     @property
     def planner(self) -> Planner | None:
-        """How the controller plans; None for a controller that does not plan over a horizon."""
-        return None if self.inner is None else self.inner.planner
+        """How it plans, by its fields `optimiser`, `cost`, `tracking`, `consistent` and `room`; None without an optimiser."""
+        names = ("optimiser", "cost", "tracking", "consistent", "room")
+        optimiser, cost, law, consistent, room = (getattr(self, name, None) for name in names)
+        if optimiser is None:  # plans along a target are none along the problem's reference
+            return None if self.inner is None or self.deforms == "target" else self.inner.planner
+        return Planner(optimiser, cost, law, law is not None or consistent, self.deformation.adapts, room is not None)
 
     @final
     def with_deformation(self, deformation: Deformation) -> Controller:

@@ -10,7 +10,6 @@ import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
 from fpirhc.controllers.built import Built
-from fpirhc.controllers.contract import Planner
 from fpirhc.deformation.base import Deformation, Identity
 from fpirhc.deformation.sigmoid import Sigmoid
 from fpirhc.errors import InvalidName, InvalidProblem, nearest
@@ -63,14 +62,9 @@ class RecedingHorizon(Controller):
     room: Mapping[str, NotNegative] | None = field(default=None, kw_only=True, hash=False)
     consistent: bool | None = field(default=None, kw_only=True)
 
-    @property
-    def planner(self) -> Planner:
-        law, consistent = self.tracking, self.tracking is not None or self.consistent
-        facts = consistent, self.deformation.adapts, self.room is not None
-        return Planner(self.optimiser, self.cost, law, *facts)
-
     def notes(self, problem: Problem) -> tuple[str, ...]:
         sensing, planner = problem.sensing, self.planner
+        assert planner is not None
         given = sensing.observer is None and sensing.delay(problem.plant, problem.period) > 0
         text = "its plans start where the model has the estimated outputs, and those without adaptation at the given state, so the "
         text += "pair differs with a right model too; consistent=False starts both at the state"
@@ -85,11 +79,13 @@ class RecedingHorizon(Controller):
         if self.room is not None and self.tracking is None:
             raise InvalidProblem("RecedingHorizon: room is what plans leave for `tracking`; give the law, or omit it")
         _room(problem, self.room)
+        assert self.planner is not None
         self.optimiser.check(_optimal_control(self.planner.planned(problem)))
 
     def blocks(self, built: Built) -> tuple[list[Block], list[Delay]]:
-        problem, plant = built.planned, built.plant
+        problem, plant, planner = built.planned, built.plant, self.planner
         assert problem is not None
+        assert planner is not None
         assert problem.horizon is not None
         cycles = cycles_per_plan(problem.horizon, problem.period)
         parts = from_measurement(built) if self.tracking is None else from_plan(built, self.tracking)
@@ -98,10 +94,10 @@ class RecedingHorizon(Controller):
         others = self.deformation.adapts, built.follows, plans_are_compiled()
         plan = _PLANS.of(same, others, lambda: every(_plan_block(problem, self, room), cycles))
         closing, delays = closing_blocks(built, self.deformation, [scalar("_solve_status")])
-        if self.planner.starts_consistent(plant):
+        if planner.starts_consistent(plant):
             before, after = (at_consistent_start(plant, some) for some in (before, after))
             before = [consistent_start(plant), *before]
-            closing = closing if self.planner.corrects(plant) else at_consistent_start(plant, closing)
+            closing = closing if planner.corrects(plant) else at_consistent_start(plant, closing)
         if built.follows:
             held, own = held_model(problem)
             newest, planned = problem.plant.parameter.name, _planned(problem)
@@ -161,9 +157,10 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
     """Block (time, plan state, parameters, shift and command of the last cycle) -> (planned input, solve statistics)."""
     assert problem.horizon is not None
     assert problem.cost is not None
-    optimiser, restarts = controller.optimiser, controller.tracking is None
+    optimiser, planner = controller.optimiser, controller.planner
+    assert planner is not None
     plant, horizon, ocp = problem.plant, problem.horizon, _optimal_control(problem)
-    preview, corrected = problem.reference.preview(plant, horizon.nodes), controller.planner.feeds_back(plant)
+    preview, corrected = problem.reference.preview(plant, horizon.nodes), planner.feeds_back(plant)
     data_of = ocp.data_of(previewed=preview is not None)
     memory = optimiser.memory(ocp).starting_at(first_memory_of(problem, optimiser, ocp))
     solve = built(optimiser, ocp, optimiser.step)
@@ -172,7 +169,7 @@ def _plan_block(problem: Problem, controller: RecedingHorizon, room: np.ndarray 
         own = [getattr(s, one.name) for one in problem.own_signals]
         motion = () if preview is None else preview(s.time, *own)
         data = data_of(s.time, *motion, s.parameters)
-        for seen in plant.beside if restarts else ():  # outputs that are given beside the state
+        for seen in plant.beside if planner.restarts else ():  # outputs that are given beside the state
             shifted = shifted_reference(plant, ocp.data, ocp.stages + 1, corrected=corrected)
             data = shifted(data, s._plan_state, getattr(s, seen.name), s.parameters, s._command_before)
         if horizon.measured:

@@ -28,8 +28,6 @@ WHY = (  # a number is refused: it decides the structure, or Python computes wit
     "turns one of them into a number",
 )
 WEIGHTS: dict[str, Any] = {"states": {"a": 1e2, "b": 1e2, "a'": 1.0, "b'": 1.0}, "deviation": {"Fa": 1e-3, "Fb": 1e-3}}
-
-
 FACTORS = (1.07, 0.93, 1.01, 0.5, 2.0)  # the first one that a setting accepts
 
 

@@ -139,3 +139,9 @@ def test_a_cascade_around_a_controller_of_an_output_takes_its_error_away(inner: 
     cascade = fp.Cascade(controller, affine(0.3), lag=1.0)
     errors = [fp.measure(problem, simulated(problem, c)).rms_error["depth"] for c in (controller, cascade)]
     assert errors[1] < 0.75 * errors[0]
+
+
+def test_plans_along_a_target_are_none_along_the_reference():
+    """Nobody who asks for the plans of the problem's horizon is shown them; around other wrappers they are the same."""
+    plan = fp.RecedingHorizon(OPTIMISER)
+    assert (fp.Cascade(plan, affine(0.5), None).planner, fp.Predicted(plan, inputs=0.0).planner) == (None, plan.planner)
