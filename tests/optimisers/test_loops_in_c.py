@@ -55,13 +55,11 @@ def test_calls_one_after_the_other(stepping, bounds, request):
 def test_matrices_of_many_rows():
     """Thirteen states and three inputs, of which some are at their bounds."""
     wide, random = pair("step", fp.FixedPoint(iterations=1, tolerance=1e-7), of=ring), np.random.default_rng(0)
+    bounds = np.array([-1.0, -20.0, -0.3]), np.array([1.5, 10.0, 0.4])
     for size in (0.3, 1.0, 3.0):
         memory = np.zeros(wide.size)
         for _ in range(5):
-            first = size * random.normal(size=13)
-            results = list(
-                wide.both(first, wide.data, np.array([-1.0, -20.0, -0.3]), np.array([1.5, 10.0, 0.4]), memory)
-            )
+            results = list(wide.both(size * random.normal(size=13), wide.data, *bounds, memory))
             same(results[0], results[1], 1e-6)
             memory = results[0][2]
 
@@ -73,8 +71,7 @@ def test_any_memory(stepping):
         for gamma in (1e-3, 0.1, 10.0, 0.0, -1.0):
             memory = 0.5 * random.normal(size=stepping.size)
             memory[-2:] = gamma, tau
-            one, other = stepping.both(random.normal(size=3), stepping.data, *NARROW, memory)
-            same(one, other, 1e-6)
+            same(*stepping.both(random.normal(size=3), stepping.data, *NARROW, memory), 1e-6)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e301])
