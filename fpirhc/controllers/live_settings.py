@@ -11,6 +11,7 @@ import math
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import cast
 
@@ -26,7 +27,7 @@ from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.expression import holds_nan
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.open import ANEW, SETTINGS, Opened, not_live
-from fpirhc.task.cases import is_whole
+from fpirhc.task.cases import is_whole, unit_of_setting
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
@@ -58,7 +59,7 @@ class LiveSettings:
         ready = checked(self.problem, self.controller, any_gain=any_gain)
         if not self.paths:
             return compose(made(self.problem, ready))
-        opened = Opened(self.start)
+        opened = Opened(self.start, [unit_of_setting(path, self.problem) for path in self.paths])
         try:
             composite = compose(made(*self._with(opened.symbols)))
         except _OF_BUILD as error:
@@ -101,8 +102,12 @@ class LiveSettings:
         problem, controller = self._with({p: v for p, v in values.items() if v != self.start[p]})
         return problem, checked(problem, controller, numbers_only=True), values
 
-    def bounds(self, path: str) -> Interval:
-        """Return the interval around the number of the build in which a setting is accepted while the others stay."""
+    @cached_property
+    def bounds(self) -> dict[str, Interval]:
+        """The interval around the number of the build in which each setting is accepted while the others stay, by path."""
+        return {path: self._bounds(path) for path in self.paths}
+
+    def _bounds(self, path: str) -> Interval:
         # A limit of an input is a fact of the plant: it ends at that of the build.
         of_plant = path[-2:] if path.startswith("limits.inputs.") else ""
         ends = (("." + "01"[side > 0], side) for side in (-1, 1))

@@ -12,9 +12,10 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -22,7 +23,6 @@ import numpy as np
 from fpirhc.controllers.contract import Controller
 from fpirhc.errors import CompileError, InvalidName, NotSupported, OutputError, package, writing
 from fpirhc.members import within
-from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.simulation.stepper import Stepper
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import command_of, find_compiler
@@ -58,24 +58,16 @@ class Device:
     @cached_property
     def inputs(self) -> Layout:
         """What a step is given: the time and the sample."""
-        return self._read(lambda name: name not in {*self.data.names, *self.settings.names})
-
-    @cached_property
-    def settings(self) -> Layout:
-        """Live settings, with their units as far as they are known."""
-        own = self.stepper.settings.signals
-        return Layout(tuple(replace(s, units=tuple(unit_of_setting(e, self.problem) for e in s.elements)) for s in own))
+        return Layout(tuple(s for s in self.stepper.reads.signals if s.name in self._sampled))
 
     @cached_property
     def data(self) -> Layout:
-        """What stays until somebody changes it: parameters and set-points."""
-        stays = {"parameters", *(signal.name for signal in self.problem.given_signals)}
-        return self._read(lambda name: name in stays)
+        """What stays until somebody changes it."""
+        return Layout(tuple(s for s in self.stepper.reads.signals if s.name not in self._sampled))
 
-    @cached_property
-    def bounds(self) -> dict[str, tuple[float, float]]:
-        """Intervals of the live settings, by path."""
-        return dict(self.stepper.bounds())
+    @property
+    def _sampled(self) -> set[str]:
+        return {self.problem.plant.time.name, *(signal.name for signal in self.problem.sample)}
 
     @cached_property
     def sources(self) -> tuple[str, ...]:
@@ -90,9 +82,6 @@ class Device:
     @cached_property
     def _generated(self) -> tuple[tuple[str, ...], dict[str, int]]:
         return c_of(self.stepper.function, self.name)
-
-    def _read(self, wanted: Callable[[str], bool]) -> Layout:
-        return Layout(tuple(s for s in self.stepper.reads.signals if wanted(s.name)))
 
 
 def c_of(function: ca.Function, name: str) -> tuple[tuple[str, ...], dict[str, int]]:
@@ -189,17 +178,17 @@ def targets() -> dict[str, Target]:
 
 
 def device_of(
-    problem: Problem, controller: Controller, title: str, *, name: str | None = None, live: Sequence[str] = ()
+    problem: Problem, controller: Controller, title: str, *, name: str | None = None, **of_stepper: Any
 ) -> Device:
-    """Return a controller for a device; `name` is the prefix of everything in C, None: made of the title."""
+    """Return a controller for a device, of arguments of a `Stepper`; `name` is the prefix in C, None: made of the title."""
     whole = f"{problem.name} {title}"
     chosen = default_name(whole) if name is None else name
     check_name(chosen)
     try:
         # A solver without a bound of its time is refused below, for what it is.
-        stepper = Stepper(problem, controller, live=live, bounded=False)
+        stepper = Stepper(problem, controller, bounded=False, **of_stepper)
         device = Device(chosen, in_comment(whole), problem, controller, stepper)
-        _ = device.sources, device.bounds
+        _ = device.sources, stepper.bounds()
     except NotSupported as error:
         raise NotSupported(f"'{title}' cannot be exported: {error}{_instead(controller)}") from None
     return device

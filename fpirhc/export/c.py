@@ -125,10 +125,10 @@ def _header(device: Device) -> str:
 
 
 def _set_declaration(device: Device) -> list[str]:
-    if not device.bounds:
+    name, upper, paths = device.name, device.name.upper(), list(device.stepper.bounds())
+    if not paths:
         return []
-    name, upper = device.name, device.name.upper()
-    items = [f"{upper}_SET_{one.upper()}" for one in identifiers(list(device.bounds))]
+    items = [f"{upper}_SET_{one.upper()}" for one in identifiers(paths)]
     return [
         "",
         f"typedef enum {{\n{_list(items)}\n}} {name}_setting;",
@@ -141,8 +141,7 @@ def _set_declaration(device: Device) -> list[str]:
 
 def data_of(device: Device) -> dict[str, Layout]:
     """Return the structs of what stays until somebody changes it, by name; none is empty."""
-    parts = {s.name: Layout((s,)) for s in device.data.signals if s.size and (s.elements or s.units)}
-    return parts if not device.settings.size else {**parts, "settings": device.settings}
+    return {s.name: Layout((s,)) for s in device.data.signals if s.size and (s.elements or s.units)}
 
 
 def _struct(name: str, layout: Layout) -> str:
@@ -204,7 +203,7 @@ def _controller(device: Device) -> str:
         missing=str(memory.slice(MISSING.name).start),
         skipped_now=str(trace.slice(SKIPPED).start),
         fails=str(int(not stepper.function.is_a("SXFunction"))),
-        changes=str(int(bool(device.bounds))),
+        changes=str(int(bool(stepper.bounds()))),
         **words,
     )
 
@@ -246,11 +245,12 @@ def _bound(device: Device) -> list[str]:
 
 def _setter(device: Device) -> str:
     """The function that checks a setting before it is in force; empty where nothing is live."""
-    if not device.bounds:
+    bounds = device.stepper.bounds()
+    if not bounds:
         return ""
-    paths = list(device.bounds)
+    paths = list(bounds)
     other = [_other_end(path, paths) for path in paths]
-    low, high = (np.array([ends[k] for ends in device.bounds.values()]) for k in (0, 1))
+    low, high = (np.array([ends[k] for ends in bounds.values()]) for k in (0, 1))
     tables = of_type("\n".join([_table("LOWEST", low), _table("HIGHEST", high)])).replace(OF_TYPE, "")
     # Of an interval the sign of the other end's number + 1 says on which side it stands.
     return f"""
@@ -309,7 +309,7 @@ def layout_of(device: Device) -> dict[str, object]:
         "status": {s.name: int(s) for s in Status},
         "work": device.sizes,
         **{part: _columns(layout) for part, layout in layouts.items()},
-        "bounds": {path: [e if np.isfinite(e) else None for e in ends] for path, ends in device.bounds.items()},
+        "bounds": {path: [e if np.isfinite(e) else None for e in ends] for path, ends in stepper.bounds().items()},
     }
 
 
@@ -324,13 +324,13 @@ def _library_files(device: Device) -> Mapping[str, str | bytes]:
     nothing = "  (void)controller, (void)setting, (void)value;\n  return 0;"
     own = {
         **sources(device),
-        f"{name}_library.c": filled(device, "library.c", change=change if device.bounds else nothing),
+        f"{name}_library.c": filled(device, "library.c", change=change if device.stepper.bounds() else nothing),
         "README.md": filled(
             device,
             "library.md",
             sample=_listed(device.inputs),
             command=_listed(Layout((device.stepper.signals["command"],))),
-            settings=", ".join(device.bounds) or "none",
+            settings=", ".join(device.stepper.bounds()) or "none",
         ),
     }
     made = shared_library(own)

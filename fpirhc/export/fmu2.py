@@ -82,7 +82,7 @@ def _variables(device: Device) -> list[Variable]:
             listed += _numbers(layout, "input")
     listed += [replace(one, start=None) for one in _numbers(Layout((stepper.signals["command"],)), "output")]
     listed.append(STATUS)
-    for (path, ends), unit in zip(device.bounds.items(), device.settings.units, strict=True):
+    for (path, ends), unit in zip(stepper.bounds().items(), stepper.settings.units, strict=True):
         listed.append(
             Variable(_structured(f"settings.{path}"), unit, "parameter", "tunable", stepper.numbers[path], ends)
         )
@@ -115,7 +115,7 @@ def _words(device: Device) -> dict[str, str]:
         rows.append(f"  if (r >= {at} && r < {at + size}) return (casadi_real*){place} + (r - {at});")
         at += size
     status = at + device.stepper.signals["command"].size
-    settings, trace = status + 1, status + 1 + len(device.bounds)
+    settings, trace = status + 1, status + 1 + device.stepper.settings.size
     return {
         "references": f"enum {{ TIME, COMMANDS = {at}, STATUS = {status}, SETTINGS = {settings}, TRACE = {trace} }};",
         "written": "\n".join(rows),
@@ -125,9 +125,9 @@ def _words(device: Device) -> dict[str, str]:
 
 def _settings(device: Device) -> dict[str, str]:
     """How a setting is read, and written through its check."""
-    if not device.bounds:
+    if not (count := device.stepper.settings.size):
         return {"settings_read": "", "settings_written": ""}
-    inside = f"  if (r >= SETTINGS && r < SETTINGS + {len(device.bounds)})"
+    inside = f"  if (r >= SETTINGS && r < SETTINGS + {count})"
     setting = f"({device.name}_setting)(r - SETTINGS)"
     return {
         "settings_read": f"{inside} return (casadi_real*)&s->c.settings + (r - SETTINGS);",

@@ -23,7 +23,6 @@ from fpirhc.errors import FpirhcError, package, require
 from fpirhc.export import Device, Target, c_of, literal, web_module
 from fpirhc.export.c import data_of, filled, layout_of, recorded, sources, template
 from fpirhc.problem_files.problem_file import Task
-from fpirhc.problem_files.settings import unit_of_setting
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
 from fpirhc.simulation.loop import start_memory
@@ -35,6 +34,7 @@ from fpirhc.simulation.tables import run_tables
 from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.symbolic.dotted import changed_at, paths_to
 from fpirhc.symbolic.driver import SIGNATURE
+from fpirhc.task.cases import unit_of_setting
 from fpirhc.task.problem import Problem
 from fpirhc.whole_file import write_whole
 
@@ -157,7 +157,7 @@ def _sliders(problem: Problem, loops: list[LabLoop]) -> list[dict[str, Any]]:
         places = [[own.index(f"settings.{path}")] if f"settings.{path}" in own else [] for own in columns]
         live = next(loop.ready.live for loop in loops if path in loop.ready.live.paths)
         value = live.start[path]
-        ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *live.bounds(path)).tolist()
+        ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *live.bounds[path]).tolist()
         found.append((path, unit_of_setting(path, problem), value, *ends, places))
     for name, parameter in problem.plant.parameters.items():
         for side, value in (("exact", parameter.exact), ("approximate", parameter.approximate)):
@@ -249,7 +249,7 @@ def _place(loop: LabLoop, column: str) -> int | None:
 def _files(device: Device) -> Mapping[str, str | bytes]:
     name, layout, structs = device.name, layout_of(device), data_of(device)
     calls = [f'EXPORT("{part}") void* get_{part}(void) {{ return &c.{part}; }}' for part in structs]
-    if device.bounds:
+    if device.stepper.settings.size:
         calls.append(
             f'EXPORT("set") int put(int which, double value) {{ return {name}_set(&c, ({name}_setting)which, value); }}'
         )

@@ -60,19 +60,6 @@ def is_own(controller: Controller, path: str) -> bool:
     return getattr(mapped(controller, first := path.partition(".")[0]), first, None) is not None
 
 
-def unit_of_setting(path: str, problem: Problem) -> str:
-    """Return the unit of a setting of a controller or of the problem, '' where its kind does not say it."""
-    word, _, name = path.partition(".")
-    if word in WORDS:
-        return settable(problem, word)[name][2]
-    if word in ("dead_time", "duration", "measure_from", "period"):
-        return problem.time_unit
-    name = name.removeprefix("inputs.").removeprefix("states.") if word == "limits" else name
-    signals = (problem.plant.state, problem.plant.input) if word == "limits" else ()
-    units = {n: u for one in signals for n, u in zip(one.elements, one.entry_units, strict=True)}
-    return units.get(name) or units.get(name.rpartition(".")[0], "")  # 'Q1.1' is an end of Q1
-
-
 def number_of_case(problem: Problem, path: str) -> float | None:
     """Return the number that a problem has at a path of a case; None where there is none, or no number."""
     word, _, name = path.partition(".")

@@ -359,7 +359,7 @@ class Stepper(Checked):
         Python's own check, to a millionth of the number. A limit of an input ends at that of the build; infinite ends refuse
         nothing.
         """
-        return ByName({path: self._live.bounds(path) for path in self._live.paths}, "Stepper.bounds()")
+        return ByName(self._live.bounds, "Stepper.bounds()")
 
     @property
     def numbers(self) -> dict[str, float]:

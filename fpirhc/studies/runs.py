@@ -22,7 +22,7 @@ from fpirhc.controllers.contract import resolved
 from fpirhc.describe import digest
 from fpirhc.errors import FpirhcError, InvalidProblem, OutputError, WorkerDied, writing
 from fpirhc.problem_files.problem_file import Task, load_problem
-from fpirhc.problem_files.settings import current_setting, unit_of_setting, with_settings
+from fpirhc.problem_files.settings import current_setting, with_settings
 from fpirhc.simulation.metrics import Metric, measure
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator, simulator
@@ -31,7 +31,7 @@ from fpirhc.studies.compare import select
 from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.verdict import left_alone, ranges, relative
 from fpirhc.summary import in_units
-from fpirhc.task.cases import as_declared
+from fpirhc.task.cases import as_declared, unit_of_setting
 from fpirhc.task.problem import Problem
 
 BLOCK = 64  # runs of a job at most

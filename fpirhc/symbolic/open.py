@@ -28,13 +28,13 @@ _OPEN: dict[int, Opened] = {}  # of every symbol of both kinds
 class Opened:
     """The open numbers of one loop, by path: one vector."""
 
-    def __init__(self, numbers: Mapping[str, float]) -> None:
+    def __init__(self, numbers: Mapping[str, float], units: Sequence[str] = ()) -> None:
         """Make their symbols; `numbers` are those of the build."""
         self.numbers = dict(numbers)
         self.symbols = {path: ca.SX.sym(path) for path in numbers}
         self.graph = {path: ca.MX.sym(path) for path in numbers}  # the same in graphs of calls
         self.read: set[str] = set()  # paths of those that some block needs
-        self.signal = Signal(SETTINGS, tuple(numbers), start=tuple(self.numbers.values()))
+        self.signal = Signal(SETTINGS, tuple(numbers), tuple(units), start=tuple(self.numbers.values()))
         _OPEN.update({_key(one): self for kind in (self.symbols, self.graph) for one in kind.values()})
 
 

@@ -201,6 +201,19 @@ def settable(problem: Problem, word: str) -> dict[str, tuple[float, tuple[float,
     return {name: (float(getattr(one, word)), one.bounds, one.unit) for name, one in stated.items() if not one.outside}
 
 
+def unit_of_setting(path: str, problem: Problem) -> str:
+    """Return the unit of a setting of a controller or of the problem, '' where its kind does not say it."""
+    word, _, name = path.partition(".")
+    if word in WORDS:
+        return settable(problem, word)[name][2]
+    if word in ("dead_time", "duration", "measure_from", "period"):
+        return problem.time_unit
+    name = name.removeprefix("inputs.").removeprefix("states.") if word == "limits" else name
+    signals = (problem.plant.state, problem.plant.input) if word == "limits" else ()
+    units = {n: u for one in signals for n, u in zip(one.elements, one.entry_units, strict=True)}
+    return units.get(name) or units.get(name.rpartition(".")[0], "")  # 'Q1.1' is an end of Q1
+
+
 def _meant(problem: Problem, name: str) -> str:
     """What to write for the name of a parameter, a state or an input alone."""
     paths = [f"'{word}.{name}' ({what})" for word, what in WORDS.items() if name in settable(problem, word)]
