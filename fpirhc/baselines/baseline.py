@@ -29,15 +29,8 @@ from fpirhc.studies.variants import Variant, Variants
 from fpirhc.whole_file import write_whole
 
 FACTOR, TIGHT, SEEDS = 3.0, 1e-6, 8  # of the spread, of the value, and of noise
-KEPT = (
-    "rms_error",
-    "max_error",
-    "effort",
-    "total_variation",
-    "at_limit",
-    "in_band",
-    "distance",
-)  # metrics of a baseline
+# Metrics of a baseline.
+KEPT = "rms_error", "max_error", "effort", "total_variation", "at_limit", "in_band", "distance"
 
 
 @dataclass(frozen=True)
@@ -114,10 +107,8 @@ def accept(
         expected = {}
         for metric, values in metrics.items():
             spread = max(values) - min(values)
-            floor = own[
-                next(k for k in (metric, metric.rpartition(".")[0], metric.partition(".")[0]) if k in own)
-            ].floor
-            band = max(FACTOR * spread, TIGHT * abs(values[0]), floor)
+            names = metric, metric.rpartition(".")[0], metric.partition(".")[0]
+            band = max(FACTOR * spread, TIGHT * abs(values[0]), own[next(k for k in names if k in own)].floor)
             if math.isfinite(values[0] + band):
                 expected[metric] = [values[0], float(f"{1.005 * band:.3g}")]
         controllers[name] = {"outcomes": outcomes, "metrics": expected}
@@ -191,43 +182,26 @@ def check(
         known = {name: facts["controllers"][name] for name in asked}
         expected = {n: {m: (float(v), float(b)) for m, (v, b) in one["metrics"].items()} for n, one in known.items()}
     except FileNotFoundError:
-        return Judgement(
-            task.name,
-            none,
-            unusable=f"there is no baseline '{path.name}'; write one: fpirhc accept {task.path} --reason ...",
-        )
+        text = f"there is no baseline '{path.name}'; write one: fpirhc accept {task.path} --reason ..."
+        return Judgement(task.name, none, unusable=text)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        return Judgement(
-            task.name, none, unusable=f"'{path.name}' is no whole baseline ({error!r}); measure it again: fpirhc accept"
-        )
+        text = f"'{path.name}' is no whole baseline ({error!r}); measure it again: fpirhc accept"
+        return Judgement(task.name, none, unusable=text)
     stale = "the problem file changed since it was accepted" if facts["file"] != file_hash(task.path) else ""
-    fresh = run_variants(
-        task, Repeats(seed), controllers=list(known), processes=processes, compiled=compiled, progress=progress
-    )
-    rows = []
+    how: dict[str, Any] = {"processes": processes, "compiled": compiled, "progress": progress}
+    fresh, rows = run_variants(task, Repeats(seed), controllers=list(known), **how), []
     for row in fresh.to_dict("records"):
         name = row["controller"]
         if row["outcome"] not in known[name]["outcomes"]:
-            rows.append(
-                {
-                    "controller": name,
-                    "metric": "outcome",
-                    "expected": ", ".join(known[name]["outcomes"]),
-                    "fresh": row["outcome"],
-                }
-            )
+            before = ", ".join(known[name]["outcomes"])
+            rows.append({"controller": name, "metric": "outcome", "expected": before, "fresh": row["outcome"]})
         for metric, (value, band) in expected[name].items():
             new = float(row.get(metric, math.nan))
-            holds = abs(new - value) <= max(band, ignore * abs(value))
-            rows.append(
-                {"controller": name, "metric": metric, "expected": value, "band": band, "fresh": new, "holds": holds}
-            )
+            one = {"controller": name, "metric": metric, "expected": value, "band": band, "fresh": new}
+            rows.append(one | {"holds": abs(new - value) <= max(band, ignore * abs(value))})
     table = pd.DataFrame(rows).assign(holds=lambda t: t.holds.eq(True))
-    size = (
-        (pd.to_numeric(table.fresh, errors="coerce") / pd.to_numeric(table.expected, errors="coerce") - 1)
-        .abs()
-        .fillna(math.inf)
-    )
+    now, then = (pd.to_numeric(table[column], errors="coerce") for column in ("fresh", "expected"))
+    size = (now / then - 1).abs().fillna(math.inf)
     return Judgement(task.name, table.loc[size.sort_values(ascending=False).index], stale)
 
 
