@@ -49,7 +49,8 @@ def compare(
 ) -> None:  # fmt: skip
     """Run controllers side by side and write a report. It names the winner, by how much, and at what price.
 
-    Exit code 1: no controller finishes. With -c or --set the report goes to results/PROBLEM/part.
+    Exit code 1: no controller follows its reference, or none finishes; the verdict alone changes no code. With -c or --set the
+    report goes to results/PROBLEM/part.
     """
     task = _task(problem, set_, controllers)
     from fpirhc.report.html import render
@@ -72,8 +73,8 @@ def compare(
     announce_backend(entry.run for entry in result.entries)
     _publish(result.view, render(result), folder, json, verbose)
     interrupted = any(why.startswith("interrupted") for why in result.skipped.values())
-    finished = any(entry.run.stop is None for entry in result.entries)
-    raise typer.Exit(130 if interrupted else 0 if finished else 1 if result.entries else 2)
+    entries = len(result.entries)
+    raise typer.Exit(130 if interrupted else 0 if len(result.lost) < entries else 1 if entries else 2)
 
 
 def _line() -> str:

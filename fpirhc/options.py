@@ -23,7 +23,7 @@ To begin:
 \b
 Exit codes:
   0  finished                      1  the answer is no: of review, of probe, or of compare, where
-                                      no controller finishes
+                                      no controller follows or finishes; its verdict changes no code
   2  bad input                     3  a file or folder cannot be written
   4  the run of fpirhc run ended early, or a plan of compare --plans did not converge
   5  a metric changed (check)      6  a baseline is missing or unusable (check)

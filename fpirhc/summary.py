@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 HELD = re.compile(r"(?<=\d) (?=\S{1,12}(?:\s|$))")  # a space in a number, or before its unit: no line ends there
-_LEAST_SHARE = 1e-5
+_LEAST_SHARE, _MOST = 1e-5, 1e3  # shares below and above which no number is said
 _ROUNDING = 1e-9  # share of its scale, below which an error has no meaning
-_LONGEST = 1e6  # from which a number is written with a power of ten
+_SHORT = 1e-3, 1e6  # from where to where a number is written without a power of ten
 
 
 @dataclass(frozen=True)
@@ -128,22 +128,24 @@ def number(value: float) -> str:
 
 
 def in_percent(share: float) -> str:
-    """Return a share in percent, in three digits; what is below a thousandth of a percent is said to be so."""
+    """Return a share in percent, in three digits; what is below a thousandth or beyond a hundred thousand is said to be so."""
+    if _MOST < share < math.inf:
+        return "more than 100 000 %"
     return "less than 0.001 %" if 0 < abs(share) < _LEAST_SHARE else f"{written_out(100 * share)} %"
 
 
 def beside(value: float, scale: float) -> str:
     """Return an error in three digits; what is rounding beside its scale is said to be so."""
-    return "0 to rounding" if 0 < value <= _ROUNDING * scale else f"{value:.3g}"
+    return "0 to rounding" if 0 < value <= _ROUNDING * scale else written_out(value)
 
 
 def written_out(value: float, digits: int = 3) -> str:
-    """Return a number in so many digits as people write it: 4 050 and 245 000, and beyond a million and below 1e-4 4.6e9, 2e-7."""
-    text = f"{value:.{digits}g}"
-    if not 1 <= abs(value) < _LONGEST:
-        mantissa, e, power = text.partition("e")
-        return f"{mantissa}e{int(power)}" if e else text
-    return f"{float(text):,.15g}".replace(",", " ")
+    """Return a number in so many digits as people write it: 4 050 and 245 000, from a million on 4.6e9, below a thousandth 2e-7."""
+    rounded = float(f"{value:.{digits}g}") + 0.0  # which has no -0
+    if not rounded or not math.isfinite(rounded) or _SHORT[0] <= abs(rounded) < _SHORT[1]:
+        return f"{rounded:,.15g}".replace(",", " ")
+    mantissa, power = f"{rounded:.15e}".split("e")
+    return f"{float(mantissa):.{digits}g}e{int(power)}"
 
 
 def in_words(says: str, numbers: Mapping[str, float], units: Mapping[str, str], **texts: str) -> str:

@@ -16,6 +16,7 @@ from fpirhc.contraction.spectrum import Array, jacobians_along, linear_limit
 from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
 from fpirhc.deformation.delayed import Paired
 from fpirhc.errors import NotContractive
+from fpirhc.summary import number, written_out
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.dead_time import Queue
 from fpirhc.task.problem import Problem
@@ -162,7 +163,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     right = deformation.with_effective_gain(-gain) if wrong else deformation
     judged = steady and (seen is not None or (remembers and not wrong))
     largest = largest_gain(right, jacobian, weights) if judged else abs(limit)
-    interval = f"0 < |{name}| < {abs((largest or limit) / gain * value):.3g}"
+    interval = f"0 < |{name}| < {written_out(abs((largest or limit) / gain * value))}"
     # A window does not see requests that alternate; a fraction of a cycle in the pairing damps them.
     paired = (Paired(deformation, cycles=d) for d in (delay, delay + 0.5, delay - 0.5) if d >= 0 and pairs)
     usable = (one for one in paired if converges(one, jacobian, weights))
@@ -180,7 +181,7 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
             f"{top.real if top.imag == 0 else top:.3g} at the start",
         )
     estimator, of_estimator = problem.sensing.estimator, problem.sensing.delay(problem.plant, problem.period)
-    apart = f"dead time {delay - of_estimator:.4g}, {estimator} {of_estimator:.4g}"
+    apart = f"dead time {number(delay - of_estimator)}, {estimator} {number(of_estimator)}"
     remedies = [*([interval] if largest else []), *[f"Paired(map, cycles={one.cycles:.4g})" for one in usable][:1]]
     # These remedies stay beside an advice on the gain, because all but the first change something else.
     raise NotContractive(

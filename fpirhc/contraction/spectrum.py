@@ -16,6 +16,7 @@ import numpy.typing as npt
 from fpirhc.deformation.base import Deformation, own_gain, with_its_gain
 from fpirhc.errors import NotContractive
 from fpirhc.plant.plant import Plant
+from fpirhc.summary import number, written_out
 from fpirhc.symbolic.evaluate import require_unsolved
 from fpirhc.symbolic.expression import Matrix, kind
 from fpirhc.task.problem import Problem
@@ -138,7 +139,7 @@ def linear_limit(eigenvalues: Array) -> tuple[float, float]:
     if not (least > small or most < -small):
         raise NotContractive(
             "the input gains of the plant, over those of the model, have both signs or are zero (from "
-            f"{least:.4g} to {most:.4g}), so no gain makes the iteration converge: "
+            f"{number(least)} to {number(most)}), so no gain makes the iteration converge: "
             "it enlarges the error in some direction. Check that each input acts on its own coordinate and that the "
             "approximate parameters give the effect of every input its true sign"
         )
@@ -201,17 +202,19 @@ def assess_gain(
     scale, what, fault = value / gain, with_its_gain(deformation), ""
     near, any_size = ((max(lower, -largest), min(upper, largest)) for lower, upper in (linear, sector))
     ends = [abs(scale * sum(limit)) for limit in (near, any_size)]  # one end of a limit is zero
-    converging = f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, 0 < |{name}| < {ends[0]:.3g}"
+    converging = (
+        f"a {'positive' if scale * sum(linear) > 0 else 'negative'} {name}, 0 < |{name}| < {written_out(ends[0])}"
+    )
     if not np.isclose(ends[0], ends[1]):
-        converging += f", and below {ends[1]:.3g} to converge from errors of any size"
-    behind = f", without the response's delay of {late:.4g} cycles" if late else ""
-    text = f"{what} leaves at most {predicted:.3g} of an error of the request per cycle{behind}"
+        converging += f", and below {written_out(ends[1])} to converge from errors of any size"
+    behind = f", without the response's delay of {number(late)} cycles" if late else ""
+    text = f"{what} leaves at most {written_out(predicted)} of an error of the request per cycle{behind}"
     if not sector[0] < gain < sector[1]:
         text += ", but only a small one: beyond the sector limit large errors may end in a bounded oscillation"
     if gain * sum(linear) < 0:
         fault = f"{what} has the wrong sign, so every cycle enlarges the error"
     elif abs(gain) >= abs(sum(linear)):
-        fault = f"{what} is too large: errors grow by the factor {predicted:.3g} per cycle"
+        fault = f"{what} is too large: errors grow by the factor {written_out(predicted)} per cycle"
     if fault:
         text, converging = f"{fault}; use {converging}{behind if largest == np.inf else ''}", ""
     return ContractionReport(predicted, gain, (name, scale), near, any_size, text, converging)

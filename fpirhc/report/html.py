@@ -81,7 +81,7 @@ def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, An
 
     runs, images, motions = {e.name: e.run for e in comparison.entries if e.run.cycles > 1}, [], []
     colours = colours_of(comparison)
-    for wanted in comparison.pictures:
+    for wanted in comparison.task.pictures:
         shown = {name: run for name, run in runs.items() if not wanted.controllers or name in wanted.controllers}
         if not shown:
             continue
@@ -168,7 +168,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
     """Return the data of the page's charts: controllers with their colours, and charts with one series per controller."""
     entries = [e for e in comparison.entries if e.run.cycles > 1]
     if not entries:
-        return {"controllers": [], "charts": [], "time": [], "timeUnit": comparison.time_unit}
+        return {"controllers": [], "charts": [], "time": [], "timeUnit": comparison.task.problem.time_unit}
     longest = max(entries, key=lambda e: e.run.cycles).run
     edges = np.unique(np.linspace(0, longest.cycles, min(INTERVALS, longest.cycles) + 1).astype(int))
     first, colours = entries[0].run, colours_of(comparison)
@@ -213,7 +213,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
             for e in entries
             for spans in [e.run.spans()]  # too many are not seen
         ],
-        "timeUnit": comparison.time_unit,
+        "timeUnit": comparison.task.problem.time_unit,
         "time": _round(np.repeat(longest.time[edges[:-1]], 2) + np.outer(middles, (0, 1)).ravel()),
         "charts": charts,
     }
@@ -246,9 +246,9 @@ _GOLDEN = 0.618034  # of a turn, from hue to hue
 
 def colours_of(comparison: Comparison) -> dict[str, str]:
     """Return the colour of every controller that ran, by name: that of its place in the problem file, whichever others ran."""
-    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(comparison.places)))
+    more = (hsv_to_rgb((k * _GOLDEN) % 1, 0.75, 0.6) for k in range(len(comparison.task.controllers)))
     extra = (f"#{''.join(f'{round(255 * one):02x}' for one in colour)}" for colour in more)
-    of_file = dict(zip(comparison.places, (*PALETTE, *extra), strict=False))
+    of_file = dict(zip(comparison.task.controllers, (*PALETTE, *extra), strict=False))
     return {e.name: of_file[e.name] for e in comparison.entries if e.run.cycles > 1}
 
 

@@ -151,8 +151,8 @@ def _least(table: Table, place: int) -> int:
 
 
 def _whole_units(head: str) -> str:
-    """A heading whose lines do not end inside a unit."""
-    return re.sub(r"\[[^]]*\]", lambda unit: unit[0].replace(" ", "\N{NO-BREAK SPACE}"), printable(head))
+    """A heading whose lines do not end inside a unit, nor beside a stroke or before a percent sign."""
+    return re.sub(r"\[[^]]*\]| / | (?=%)", lambda held: held[0].replace(" ", "\N{NO-BREAK SPACE}"), printable(head))
 
 
 def _grid(table: Table, part: Sequence[int]) -> Grid:

@@ -16,7 +16,7 @@ from fpirhc.horizon.cost import view_of
 from fpirhc.plant.motion import with_space
 from fpirhc.simulation.run import Run
 from fpirhc.status import STOPPED, Status
-from fpirhc.summary import in_percent, written_out
+from fpirhc.summary import in_percent, number, written_out
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Layout
@@ -58,7 +58,7 @@ class Ranges:
         row = int(np.argmax(outside.any(axis=1)))
         k = int(np.argmax(outside[row]))
         before, behind = self._words[k]
-        return row, f"{before} {values[row, k]:.6g} {behind}"
+        return row, f"{before} {number(values[row, k])} {behind}"
 
 
 def _of_states(problem: Problem, trace: Layout) -> Iterator[Range]:
@@ -88,7 +88,7 @@ def _of_errors(problem: Problem, trace: Layout) -> Iterator[Range]:
         along = np.append(motion[row], problem.start_output[row])
         size = float(np.abs(along[np.isfinite(along)]).max(initial=0.0))
         if size > 0:
-            behind = f"{unit}, more than a million times the {size:.3g} {unit} of its reference and start"
+            behind = f"{unit}, more than a million times the {number(size)} {unit} of its reference and start"
             yield Range(first + k, -_RUNAWAY * size, _RUNAWAY * size, (f"the error of '{name}' is", behind))
 
 
@@ -157,11 +157,9 @@ class Followed:
     def sentence(self) -> str:
         """How far it is left, and how often."""
         unit, worst = with_space(self.unit), float(self.values[self.beyond.argmax()])
-        limit = self.upper if worst > self.upper else self.lower
+        limit = number(self.upper if worst > self.upper else self.lower)
         share = in_percent(float((self.beyond > TOLERANCE).mean()))
-        return (
-            f"{self.name} reaches {worst:.4g}{unit}, beyond its hard limit of {limit:g}{unit}, in {share} of the cycles"
-        )
+        return f"{self.name} reaches {number(worst)}{unit}, beyond its hard limit of {limit}{unit}, in {share} of the cycles"
 
 
 def hard_limits(problem: Problem, run: Run) -> list[Followed]:
@@ -212,8 +210,10 @@ def misplaced(problem: Problem) -> list[str]:
         for what, values in ("start", problem.start_state[[at]]), ("reference", wanted[np.isfinite(wanted)]):
             beyond = Followed(name, unit, low, high, values).beyond
             if name not in problem.limits.prices and beyond.max(initial=0.0) > TOLERANCE:
-                worst = f"{values[beyond.argmax()]:.4g}{unit}"
-                found.append(f"the {what} of {name} is {worst}, outside its hard limits of {low:g} and {high:g}{unit}")
+                worst = f"{number(values[beyond.argmax()])}{unit}"
+                found.append(
+                    f"the {what} of {name} is {worst}, outside its hard limits of {number(low)} and {number(high)}{unit}"
+                )
     return found
 
 

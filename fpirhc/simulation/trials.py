@@ -29,6 +29,7 @@ from fpirhc.simulation.metrics import by_name
 from fpirhc.simulation.metrics.shipped import at_limit, rms_error
 from fpirhc.simulation.run import Run, judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.summary import written_out
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Expression, Named
 from fpirhc.task.dead_time import DeadTime
@@ -249,10 +250,10 @@ class ErrorPair:
         unit = with_space(self.units[self.worst])
         before, after = self.without[self.worst], self.adapted[self.worst]
         if not math.isfinite(before):
-            other = f"with it the rms error of {self.worst} is {after:.3g}{unit}"
+            other = f"with it the rms error of {self.worst} is {written_out(after)}{unit}"
             return f"the run without adaptation ends early, and {other if math.isfinite(after) else 'so does the one with it'}"
-        rest = f"{after:.3g}{unit} with it" if math.isfinite(after) else "a run that ends early with it"
-        return f"the rms error of {self.worst} is {before:.3g}{unit} without adaptation, {rest}"
+        rest = f"{written_out(after)}{unit} with it" if math.isfinite(after) else "a run that ends early with it"
+        return f"the rms error of {self.worst} is {written_out(before)}{unit} without adaptation, {rest}"
 
     @property
     def stuck(self) -> bool:

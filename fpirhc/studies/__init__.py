@@ -94,10 +94,10 @@ def to_json(facts: Mapping[str, Any]) -> str:
 
 
 def status_shares(statuses: Mapping[str, int]) -> str:
-    """The shares of cycles whose status is not ok, such as 'not converged 1.67 %'; 'ok' where there are none."""
+    """The shares of cycles whose status is not ok, such as 'not converged 1.67 %'."""
     cycles = sum(statuses.values())
     other = {name: count for name, count in statuses.items() if count and name != "OK"}
-    return ", ".join(f"{k.lower().replace('_', ' ')} {in_percent(v / cycles)}" for k, v in other.items()) or "ok"
+    return ", ".join(f"{k.lower().replace('_', ' ')} {in_percent(v / cycles)}" for k, v in other.items())
 
 
 def finite_alone(value: Any) -> Any:

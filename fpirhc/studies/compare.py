@@ -5,8 +5,8 @@ from __future__ import annotations
 import shlex
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -20,13 +20,12 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, Mistakes, No
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.chain import response_names
-from fpirhc.plant.motion import with_space
+from fpirhc.plant.motion import SECONDS, with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.problem_files.shipped import shipped_folders
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
-from fpirhc.simulation.pictures import Picture
 from fpirhc.simulation.ranges import Followed, hard_limits, input_limits, limits_left, misplaced, slip
 from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
@@ -35,7 +34,7 @@ from fpirhc.simulation.stepper import ComposedStep, Stepper
 from fpirhc.simulation.trials import ErrorPair, ModelAsPlant, errors_of, weighed
 from fpirhc.studies import Progress, Study, View, circumstances, status_shares
 from fpirhc.studies.verdict import NULL, Finding, Outcome, Yardstick, by_reason, findings, follows, objective
-from fpirhc.summary import Column, Table, number, written_out
+from fpirhc.summary import Column, Table, in_percent, number, written_out
 from fpirhc.symbolic.evaluate import attempted
 from fpirhc.symbolic.native import compile_all
 from fpirhc.task.problem import Problem
@@ -104,7 +103,7 @@ class Entry:
     exact: bool  # whether its model is exact where the others' is not
     contraction: Contraction | None = None
     null: ErrorPair | None = None  # errors on its own model, without adaptation and with it
-    cycle: tuple[float, ...] | None = None  # median time of a cycle, that of 99 %, and the longest, us
+    cycle: tuple[float, ...] = ()  # median time of a cycle, that of 99 %, and the longest, us; share above the period
     limits: tuple[Followed, ...] = ()  # along the run: those of inputs, and hard ones of states, rates and paths
     left: tuple[Followed, ...] = ()  # those that it leaves, the worst first
     notes: tuple[str, ...] = ()
@@ -120,14 +119,28 @@ class Comparison(Study):
     """The result of `compare`."""
 
     seed: int
-    measure_from: float
-    places: tuple[str, ...]  # all controllers of the file, in its order
-    rivals: frozenset[str]  # names of the rows of which the best numbers are marked: they follow, with a wrong model
+    task: Task = field(repr=False)
     entries: tuple[Entry, ...]
     skipped: Mapping[str, str]
-    findings: tuple[Finding, ...]
-    pictures: tuple[Picture, ...]
-    time_unit: str
+
+    @cached_property
+    def _yard(self) -> Yardstick:
+        return Yardstick.of(self.task.problem, self.seed)
+
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the file says, the headline pair, then the others, the best row, and what was not run."""
+        task, yard = self.task, self._yard
+        aim = objective(task.headline_metric, task.metrics, task.problem)
+        causes = _causes(task.problem, self.entries, yard)
+        found = findings(self.entries, task.headline, yard, self.skipped, aim, causes)
+        return (*found, *_without_noise(task, found[0].pair))
+
+    @cached_property
+    def lost(self) -> frozenset[str]:
+        """Names of the rows that end early or, where errors are judged, do not follow."""
+        judged = self.task.headline_metric is None
+        return frozenset(e.name for e in self.entries if e.run.stop or (judged and not follows(e, self._yard)))
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -148,45 +161,48 @@ class Comparison(Study):
     @property
     def view(self) -> View:
         shown = columns([e.metrics for e in self.entries], in_report)
-        done = [e.metrics for e in self.entries if e.name in self.rivals]
-        best = {c: c.best([c.number(one) for one in done]) for c in shown if c.metric.main}
+        rivals = {e.name: e for e in self.entries if not e.exact and e.name not in self.lost}  # whose best is marked
+        best = {c: c.best([c.number(e.metrics) for e in rivals.values()]) for c in shown if c.metric.main}
         best = {c: number for c, number in best.items() if number is not None}
-        said = {
-            c.metric: (c.metric.function.__doc__ or "").partition("\n")[0].removeprefix("Return ").rstrip(".")
-            for c in shown
-        }
+        docs = {c.metric: (c.metric.function.__doc__ or "").partition("\n")[0] for c in shown}
+        said = {metric: text.removeprefix("Return ").rstrip(".") for metric, text in docs.items()}
         heads = [Column(c.heading, c.short if c.metric.main else None, note=said[c.metric]) for c in shown]
-        heads = [Column("controller"), *heads, Column("cycle / 99 % / longest [us]"), Column("cycles", left=True)]
-        table = Table(
-            self.title,
-            heads,
-            "; ".join(f"{m.short or m.heading}: {text}" for m, text in said.items() if m.main and text),
-        )
+        heads = [Column("controller"), *heads, Column("cycle / 99 % / longest [us]"), Column("status", left=True)]
+        caption = "; ".join(f"{m.short or m.heading}: {text}" for m, text in said.items() if m.main and text)
+        table = Table(self.title, heads, caption)
         for e in self.entries:
             numbers = [(c, c.number(e.metrics)) for c in shown]
-            marked = [k for k, (c, v) in enumerate(numbers, 1) if e.name in self.rivals and v == best.get(c, np.nan)]
+            marked = [k for k, (c, v) in enumerate(numbers, 1) if e.name in rivals and v == best.get(c, np.nan)]
             texts = [c.text(v, missing="", none="none") for c, v in numbers]
-            why = "" if str(e.run.stop) in self.findings[0].text else f": {e.run.stop}"  # which stands above the table
-            status = f"ended early{why}" if e.run.stop else status_shares(e.metrics.statuses)
-            status += f", leaves {', '.join(one.name for one in e.left)}" if e.left else ""
-            cycle = " / ".join(f"{float(f'{one:.3g}'):g}" for one in e.cycle or ())
-            table.add([e.name, *texts, cycle, status], "red" if e.left else "", marked)
-        about = f"Errors from t = {number(self.measure_from)} {self.time_unit} on, seed {self.seed}."
+            cycle = " / ".join(map(written_out, e.cycle[:3]))
+            table.add([e.name, *texts, cycle, self._status(e)], "red" if e.left else "", marked)
+        problem = self.task.problem
+        about = f"Errors from t = {number(problem.measure_from)} {problem.time_unit} on, seed {self.seed}."
         notes = [CLOCK] * any(e.cycle for e in self.entries)
         notes += [f"{e.name}: {note}" for e in self.entries for note in e.notes]
         sentences = [(finding.text, finding.outcome) for finding in self.findings]
         null = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
         lists = {"Notes": notes, f"Null tests: {NULL}": null}
         lost = {f.pair[1] for f in self.findings if f.pair and f.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)}
-        lost |= {e.name for e in self.entries if e.run.stop}
+        lost |= self.lost
         lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run, lost)}" for e in self.entries if e.contraction]
         return View(self, sentences, about, (table.filled,), self._facts(), lists)
 
+    def _status(self, entry: Entry) -> str:
+        """What speaks against a run; 'ok' where nothing does."""
+        if stop := entry.run.stop:  # the first sentence may state the reason, above the table
+            said = ["ended early" if stop in self.findings[0].text else f"ended early: {stop}"]
+        else:
+            said = ["does not follow"] * (entry.name in self.lost) + [status_shares(entry.metrics.statuses)]
+        said += [f"late {in_percent(late)}" for late in entry.cycle[3:] if late]
+        said += [f"leaves {', '.join(one.name for one in entry.left)}"] * bool(entry.left)
+        return ", ".join(filter(None, said)) or "ok"
+
     def _facts(self) -> dict[str, Any]:
-        rows = {
-            e.name: {"metrics": e.metrics.numbers, "cycle_us": e.cycle, "notes": e.notes, "stop": e.run.stop}
-            for e in self.entries
-        }
+        rows = dict[str, Mapping[str, Any]]()
+        for e in self.entries:
+            own = {"metrics": e.metrics.numbers, "cycle_us": e.cycle[:3] or None, "notes": e.notes}
+            rows[e.name] = own | {"stop": e.run.stop}
         found = [{"text": f.text, "outcome": f.outcome, "pair": f.pair, "ratios": f.ratios} for f in self.findings]
         facts = {"problem": self.problem, "seed": self.seed, "versions": self.versions, "outcome": str(self.outcome)}
         return {**facts, "findings": found, "controllers": rows, "skipped": self.skipped}
@@ -215,7 +231,7 @@ def compare(
     begin, selected = time.perf_counter(), select(task, controllers)
     check_gains(task, selected)
     problem, skipped = task.problem, dict[str, str]()
-    aim = objective(task.headline_metric, task.metrics, problem)
+    objective(task.headline_metric, task.metrics, problem)  # a wrong one is told before anything runs
     rows, entries = _Rows(task, selected, seed, compiled), list[Entry]()
     for name in selected:
         try:
@@ -237,20 +253,8 @@ def compare(
             done = {*skipped, *(e.name for e in entries)}
             skipped |= dict.fromkeys([n for n in rows.composed if n not in done], "interrupted before it finished")
             break
-    yard = Yardstick.of(problem, seed)
-    found = findings(entries, task.headline, yard, skipped, aim, _causes(problem, entries, yard))
-    return Comparison(
-        **circumstances(task, selected, command, begin),
-        seed=seed,
-        measure_from=problem.measure_from,
-        places=tuple(task.controllers),
-        rivals=frozenset(e.name for e in entries if not e.exact and (aim.metric or follows(e, yard))),
-        entries=tuple(entries),
-        skipped=skipped,
-        findings=(*found, *_without_noise(task, found[0].pair)),
-        pictures=task.pictures,
-        time_unit=problem.time_unit,
-    )
+    facts = circumstances(task, selected, command, begin)
+    return Comparison(**facts, seed=seed, task=task, entries=tuple(entries), skipped=skipped)
 
 
 def _causes(problem: Problem, entries: Sequence[Entry], yard: Yardstick) -> list[str]:
@@ -289,7 +293,7 @@ class _Rows:
         pair = pair if pair in self.composed else None
         judged = weighed(problem, ready)
         null = part("the null test", self._null, pair, name, judged) if pair is not None else None
-        cycle = part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None
+        cycle = (part("the time of a cycle", _cycle_time, step, loop.compiled, run) if step is not None else None) or ()
         contraction = part("the contraction", _contraction, problem, ready, run, metrics)
         left = limits_left(limits := (*input_limits(problem, run), *hard_limits(problem, run)))
         told = [one.sentence for one in left]
@@ -335,7 +339,7 @@ CLOCK = "A cycle is a call of the controller, from measurement to command: the m
 
 
 def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float, ...]:
-    """Median, 99 % and longest wall time of a call of the controller, us: where plans are rare, the median has none."""
+    """Median, 99 % and longest wall time of a call of the controller, us, and the share of calls longer than the period."""
     stepper, count = Stepper.of(composed, compiled=compiled), min(run.cycles, REPLAYED)
     if not count:
         return ()
@@ -351,4 +355,5 @@ def _cycle_time(composed: ComposedStep, compiled: bool, run: Run) -> tuple[float
         begin = time.perf_counter_ns()
         _, memory = step(*(signal[k] for signal in samples), memory)
         taken[k] = time.perf_counter_ns() - begin
-    return tuple((np.percentile(taken, (50, 99, 100)) / 1e3).tolist())
+    late = np.mean(taken > 1e9 * run.period * SECONDS.get(run.time_unit, np.inf))
+    return (*(np.percentile(taken, (50, 99, 100)) / 1e3).tolist(), float(late))

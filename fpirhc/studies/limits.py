@@ -26,7 +26,7 @@ from fpirhc.studies.compare import check_gains, select
 from fpirhc.studies.runs import Kept, Row, Runner, header_of
 from fpirhc.studies.variants import Draws, Variant
 from fpirhc.studies.verdict import AT_LIMITS, HELPS, Objective, chatter, ranges
-from fpirhc.summary import Column, Table, in_percent, number, written_out
+from fpirhc.summary import Column, Table, in_percent, written_out
 from fpirhc.task.problem import Problem
 
 FAILS = 0.5  # relative error from which a run has failed, where nothing else is said
@@ -34,7 +34,7 @@ PLANTS = 100  # drawn for every percent of 'plants'
 _NEAR, _HALVINGS = 1.05, 14
 _OUTSIDE = 0.02  # of a limit's range: what is farther outside has left it
 _FARTHEST = 128  # cycles of latency
-_MEASURED = "rms_error", "total_variation", "effort", "at_limit"
+_MEASURED = "rms_error", "total_variation", "effort", "command_range", "at_limit"
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def _mismatch(problem: Problem, seed: int) -> Quantity:
         values = np.where(scaled, model * np.exp(share * ratios), model + share * (exact - model))
         return _one(problem.with_exact(values), seed, None, problem, problem)
 
-    return Quantity("times the file's", 1.0, 2.0, _existing(at, 1.0, 64.0), at)
+    return Quantity("of the file's", 1.0, 2.0, _existing(at, 1.0, 64.0), at)
 
 
 def _existing(at: Callable[[float], object], low: float, high: float) -> float:
@@ -120,7 +120,7 @@ def _plants(problem: Problem, seed: int) -> Quantity:
 
 
 QUANTITIES: Mapping[str, tuple[Callable[[Problem, int], Quantity], str]] = {  # and what grows, in words
-    "mismatch": (_mismatch, "all parameters are this many times as far from the model as in the file, up to 64"),
+    "mismatch": (_mismatch, "all parameters are as far from the model, in % of how far in the file, up to 6 400 %"),
     "plants": (_plants, f"{PLANTS} plants are drawn within this width, none of which may fail, up to 99 %"),
     "latency": (_latency, f"commands come later by whole cycles, up to {_FARTHEST}"),
     **{word: (partial(_sensed, word), fault.told) for word, fault in FAULTS.items()},
@@ -152,7 +152,7 @@ class Limits(Study):
         borne, grown, tables = dict[str, list[str]](), dict[str, tuple[str, int]](), [shown]
         for row in rows:
             share = row.unit.startswith("of ")  # of the range, of the samples
-            holds, fails = (number(100 * value if share else value) for value in (row.holds, row.fails))
+            holds, fails = (written_out(100 * value if share else value) for value in (row.holds, row.fails))
             where = f"at {_with_unit(row.fails, row.unit)}"
             if math.isnan(row.holds):
                 holds, fails, where = "none", "as it stands" if row.unit else fails, "as it stands"
@@ -168,20 +168,19 @@ class Limits(Study):
         about = (
             f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
-            "reference's range. What holds may have a large error. One beats another by a tenth of its error, with "
-            "a command neither chattering nor at limits."
+            "reference's range. What holds may have a large error. A controller beats its partner where its error is a tenth "
+            "smaller, and its command neither chatters nor stands at limits."
         )
         for what, (head, times) in grown.items():
             known = self.tried[what]
             values = sorted(set.intersection(*map(set, known.values())))  # at which all controllers were tried
-            columns = [Column(text) for text in ("controller", *(number(times * v) for v in values))]
-            tables.append(Table(f"error at {head}", columns))
-            for name, tried in known.items():
-                tables[-1].add([name, *(Objective().text(tried[v]["error"]) for v in values)])
+            tables.append(Table(f"error at {head}", [Column(text) for text in (head, *known)]))
+            for value in values:
+                errors = (Objective().text(tried[value]["error"]) for tried in known.values())
+                tables[-1].add([written_out(times * value), *errors])
         facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
-        return View(
-            self, [(f"{q.capitalize()}: {'; '.join(some)}.", None) for q, some in borne.items()], about, tables, facts
-        )
+        sentences = [(f"{q.capitalize()}: {'; '.join(some)}.", None) for q, some in borne.items()]
+        return View(self, sentences, about, tables, facts)
 
 
 @checked_call
@@ -248,9 +247,9 @@ def _beats(problem: Problem, pair: tuple[str, str], row: Row, tried: Mapping[str
     for value in sorted(tried[name].keys() & tried[partner].keys()):
         own, plain, where = tried[name][value], tried[partner][value], _with_unit(value, row["unit"])
         if not own["error"] < HELPS * plain["error"]:
-            why = f"error of {Objective().text(own['error'])} against {Objective().text(plain['error'])}"
+            why = f"its error is {Objective().text(own['error'])}, with {partner} {Objective().text(plain['error'])}"
         elif times := chatter(own, plain, problem):
-            why = f"it chatters, {written_out(times)} times the total variation"
+            why = f"it chatters, with {written_out(times)} times the total variation of {partner}"
         elif own["at_limit"] > AT_LIMITS:
             why = f"its command is at a limit in {in_percent(own['at_limit'])} of cycles"
         if why:
@@ -261,7 +260,7 @@ def _beats(problem: Problem, pair: tuple[str, str], row: Row, tried: Mapping[str
 
 def _with_unit(value: float, unit: str) -> str:
     share = unit.startswith("of ")
-    return f"{number(100 * value if share else value)} {'% ' * share}{unit}"
+    return f"{written_out(100 * value if share else value)} {'% ' * share}{unit}"
 
 
 def _outside(problem: Problem, run: Run) -> float:
@@ -276,7 +275,7 @@ def _why(row: Row, fails: float) -> str:
         return str(row["why"]).partition(";")[0]
     if row["outside"] > _OUTSIDE:
         return "a hard limit is left"
-    return "" if row["error"] <= fails else f"error of {in_percent(row['error'])}"
+    return "" if row["error"] <= fails else f"its error is {Objective().text(row['error'])}"
 
 
 def _limit(problem: Problem, what: str, seed: int, runner: Runner, fails: float) -> Mapping[str, object]:

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from fpirhc.errors import listed
 from fpirhc.fields.checked import checked_call
+from fpirhc.plant.motion import with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.simulation.metrics import known_metrics
 from fpirhc.studies import Progress, Study, View, circumstances
@@ -68,11 +70,8 @@ class VariantStudy(Study):
             "chatter": self.chatter,
             "versions": self.versions,
         }
-        shares = (
-            ""
-            if self.figure.metric
-            else " Errors are rms, in % of the range of the reference; points are percent of it."
-        )
+        shares = " Errors are rms, in % of the range of the reference, and differences are in percentage points."
+        shares *= self.figure.metric is None
         lists = {"Worst runs": [*_commands(self)]}
         return View(self, [*_sentences(self)], f"{self.variants}.{shares}", tables, facts, lists)
 
@@ -85,7 +84,7 @@ class VariantStudy(Study):
         shown = Table(title, [*map(Column, heads), Column("better in", None)])  # the verdict has it
         text, apart = self.figure.text, self.figure.difference
         for row in _rows(summary):
-            between = "" if math.isnan(row.low) else f"{apart(row.low)} to {apart(row.high)}"
+            between = "" if math.isnan(row.low) else apart(row.low, row.high)
             difference = "" if math.isnan(row.difference) else apart(row.difference)
             better = f"{row.better} of {row.variants}" if row.controller != first else ""
             numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between]
@@ -210,12 +209,12 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     aim, summary = result.figure, result.summary
     than, most = ("smaller", "smallest") if aim.sign > 0 else ("larger", "largest")
     for row in _rows(summary.iloc[1:]):
-        medians = f"in the median {aim.text(summary['median'].iloc[0])} -> {aim.text(row.median)}"
-        share = f"in {row.better} of {row.variants}, {medians}.{''.join(_moved(result, row.controller))}"
+        medians = f"the median is {aim.text(row.median)}, with {summary.index[0]} {aim.text(summary['median'].iloc[0])}"
+        share = f"in {row.better} of {row.variants} variants; {medians}.{''.join(_moved(result, row.controller))}"
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
         better = Outcome.DOUBTFUL if row.controller in result.chatter else Outcome.BETTER
         clear = better if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
-        said = f"{_CLEAR.get(clear, 'is not clearly different from')} {summary.index[0]} by {aim.column}: {than}"
+        said = f"{_CLEAR.get(clear, 'is not clearly different from')} {summary.index[0]}: its {aim.column} is {than}"
         if few := math.isnan(row.low):  # for an interval
             said = f"has a {than} {aim.column} than {summary.index[0]}"
         yield f"{row.controller} {said} {share}", None if few else clear
@@ -231,10 +230,10 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
     calm = [row.controller for row in _rows(summary) if not row.failures]
     for row in _rows(summary):
         low, high = share_interval(row.failures, row.variants)
-        others = f"; of all plants drawn so {in_percent(low)} to {in_percent(high)} fail, with 95 % confidence"
+        others = f": of all plants drawn so {in_percent(low)} to {in_percent(high)} fail, with 95 % confidence"
         drawn, names = others if result.variants.random else "", [row.controller] if row.failures else calm
         if (drawn or row.failures) and row.controller == names[0]:
-            text = f"{', '.join(names)} fail{'s' * (len(names) == 1)} in {row.failures} of {row.variants}{drawn}."
+            text = f"{listed(names)} fail{'s' * (len(names) == 1)} in {row.failures} of {row.variants} variants{drawn}."
             yield text + why.get(row.controller, ""), None
 
 
@@ -243,10 +242,12 @@ def _moved(result: VariantStudy, name: str) -> Iterator[str]:
     for column, moved in result.summary.filter(like=_MOVES).items():
         if moved[name] > 2 * moved.iloc[0]:
             what, unit = str(column).removeprefix(_MOVES), result.table.attrs["units"].get(column, "1")
-            yield f" Total variation of {what} {written_out(moved[name])} against {written_out(moved.iloc[0])} {unit}."
+            own, first = (f"{written_out(v)}{with_space(unit)}" for v in (moved[name], moved.iloc[0]))
+            yield f" The total variation of {what} is {own}, with {result.summary.index[0]} {first}."
     if chatter := sorted(result.chatter.get(name, {}).items(), key=lambda one: -one[1]):
         which = f"{', '.join(variant for variant, _ in chatter[:4])}{', ...' * (len(chatter) > 4)}"
-        yield f" It chatters in {len(chatter)} ({which}): total variation up to {written_out(chatter[0][1])} times its partner's."
+        times = written_out(chatter[0][1])
+        yield f" It chatters in {len(chatter)} variants ({which}): its total variation is up to {times} times its partner's."
 
 
 def _rows(frame: pd.DataFrame) -> Iterator[Any]:
@@ -303,7 +304,8 @@ def figure_of(result: VariantStudy) -> Any:
     if shown.shown.min() > 0:
         axis.set_yscale("log")
         few = shown.shown.max() < 20 * shown.shown.min()  # ticks, which all have their numbers
-        axis.yaxis.set(major_formatter="{x:g}", minor_formatter="{x:g}" if few else "")
+        shown_as = lambda value, _: written_out(value)  # noqa: E731
+        axis.yaxis.set(major_formatter=shown_as, minor_formatter=shown_as if few else "")
     axis.set(xlabel="share of the variants [%]", ylabel=with_unit[column])
     for name, values in axes.items():
         axis.set_xlabel(literal(with_unit[name]))

@@ -22,7 +22,7 @@ from fpirhc.simulation.metrics import RELATIVE_ERROR, Metric, measured_cycles
 from fpirhc.simulation.metrics.shipped import at_limits, rms_error
 from fpirhc.simulation.simulate import simulator
 from fpirhc.status import Status
-from fpirhc.summary import in_percent, in_words, number
+from fpirhc.summary import in_percent, in_words, number, written_out
 from fpirhc.symbolic.expression import TINY
 from fpirhc.task.problem import Problem
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fpirhc.studies.compare import Entry
 
 
-PENALTY = 10.0  # relative error that no run can exceed
+PENALTY = 10.0  # relative error that no run can exceed, and beyond which one is lost
 _NO_METRIC = 1e12  # in its place for a metric, whose size is not known
 
 
@@ -59,12 +59,15 @@ class Objective:
     def text(self, value: float) -> str:
         """Return a number of a run as text."""
         if not math.isfinite(value):
-            return "none"
+            return "none" if self.metric else "lost"
+        if self.metric is None and value > PENALTY:
+            return "lost"
         return in_percent(value) if self.metric is None else self.metric.text(value) + self._unit
 
-    def difference(self, value: float) -> str:
-        """Return a difference of two numbers as text."""
-        return f"{100 * value:+.3g} points" if self.metric is None else f"{value:+.3g}{self._unit}"
+    def difference(self, *values: float) -> str:
+        """Return a difference of two numbers, or the ends of its interval, as text."""
+        times, unit = (100, " points") if self.metric is None else (1, self._unit)
+        return " to ".join(f"{'+' * (v > 0)}{written_out(times * v)}" for v in values) + unit
 
     @property
     def _unit(self) -> str:
@@ -144,7 +147,7 @@ class Finding:
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
 STILL = 1e-5  # of the limits' range, or of the rms command, in a cycle: what moves less stands still
-WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own span: chatter
+WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own range: chatter
 AT_LIMITS = 0.2  # of the cycles: a command that is at a limit more often
 SWING = 0.05  # of the limits' range: as a sine from end to end in 11 cycles, or jumps between the ends every 10
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
@@ -231,31 +234,29 @@ def _growth(pair: Pair) -> float:
     return max((largest[-1] / np.maximum(largest[0], TINY))[exponential], default=math.nan)
 
 
-def _moves(pair: Pair, ways: float = 0.0) -> float:
-    """How many times as much an input moves, of those that move `ways` times their span; what stands still moves by STILL."""
-    (before, after), run = (e.metrics.total_variation for e in (pair.plain, pair.adaptive)), pair.adaptive.run
-    still = _still(pair.yard.problem, pair.adaptive.metrics["effort"])
-    moved = [n for n in after if after[n] > 0 and np.abs(np.diff(c := run[f"command.{n}"])).sum() >= ways * np.ptp(c)]
-    return max((after[n] / max(before[n], still[n]) for n in moved), default=math.nan)
-
-
-def _still(problem: Problem, effort: Mapping[str, float]) -> dict[str, float]:
-    low, high = problem.limits.input_bounds(problem.plant)
-    ranges = dict(zip(problem.plant.inputs, (high - low).tolist(), strict=True))
-    return {n: STILL / problem.period * (ranges[n] if math.isfinite(ranges[n]) else size) for n, size in effort.items()}
+def _moves(own: Mapping[str, Any], plain: Mapping[str, Any], problem: Problem, ways: float = 0.0) -> float:
+    """How many times as much an input moves, by rows of runs, of those that move `ways` times their range; at rest by STILL."""
+    (low, high), times = problem.limits.input_bounds(problem.plant), [0.0]
+    for name, size in zip(problem.plant.inputs, (high - low).tolist(), strict=True):
+        moved, before = (row[f"total_variation.{name}"] for row in (own, plain))
+        if moved > 0 and moved * (problem.duration - problem.measure_from) >= ways * own[f"command_range.{name}"]:
+            size = size if math.isfinite(size) else own[f"effort.{name}"]
+            times.append(moved / max(before, STILL / problem.period * size))
+    return max(times)
 
 
 def chatter(own: Mapping[str, Any], plain: Mapping[str, Any], problem: Problem) -> float:
-    """Return how many times as much as its partner's a command moves, by rows of runs; 0 where none goes to and fro."""
-    effort, times = {n: own[f"effort.{n}"] for n in problem.plant.inputs}, [0.0]
-    for name, still in _still(problem, effort).items():
-        moved, before = (row[f"total_variation.{name}"] for row in (own, plain))
-        if moved * (problem.duration - problem.measure_from) >= TO_AND_FRO * effort[name]:
-            times.append(moved / max(before, still))
-    return max(times) if max(times) > WILD else 0.0
+    """Return how many times as much as its partner's a command moves, by rows of runs; 0 where none chatters."""
+    times = _moves(own, plain, problem, ways=TO_AND_FRO)
+    return times if times > WILD else 0.0
 
 
-_chatters = partial(_moves, ways=TO_AND_FRO)
+def _of_pair(measure: Callable[..., float], pair: Pair) -> float:
+    own, plain = ({m.key(e): v for m, e, v in one.metrics.rows()} for one in (pair.adaptive, pair.plain))
+    return measure(own, plain, pair.yard.problem)
+
+
+_moved, _chatters = partial(_of_pair, _moves), partial(_of_pair, chatter)
 
 
 def _swing(pair: Pair) -> float:
@@ -281,7 +282,7 @@ def _at(pair: Pair) -> str:
     rate, (name, unit) = bool(values[k] < every[k] / 2), [*problem.plant.inputs.items()][k]
     ends = (problem.limits.rate_bounds if rate else problem.limits.input_bounds)(problem.plant)
     unit = with_space(derivative_unit(unit, int(rate), problem.time_unit))
-    return f"its {'rate' if rate else 'value'} ({name}: {ends[0][k]:.4g} to {ends[1][k]:.4g}{unit})"
+    return f"its {'rate' if rate else 'value'} ({name}: {number(ends[0][k])} to {number(ends[1][k])}{unit})"
 
 
 def _null(pair: Pair) -> float:
@@ -303,7 +304,7 @@ class Flag:
 
 NULL = "its own model as the plant, the problem's sensors and no disturbances"
 FLAGS = (
-    Flag(_left_alone, 1.0, "doing nothing is as good: rms error {value} times that of the plant whose inputs are held", True),
+    Flag(_left_alone, 1.0, "it is no better than doing nothing: its rms error is {value:%} of that with commands held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
     Flag(lambda pair: pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles, 0.05,
          "{value:%} of its plans did not converge: give the optimiser more iterations", True),
@@ -312,7 +313,7 @@ FLAGS = (
     Flag(_swing, SWING, "both commands swing: on average each is {value:%} of its limits' range off the mean of the one before and "
          "the one after", True),
     Flag(_chatters, WILD, "its command varies {value} times as much as without adaptation: it chatters, see fpirhc review", True),
-    Flag(_moves, 2.0, "the total variation of its command is {value} times that without adaptation"),
+    Flag(_moved, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(lambda pair: math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing, 0.05,
          "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_misfit, 1.0, "its measured contraction factor is {value}, though errors fall: noise, friction, rounding or a limit is in "
@@ -325,8 +326,8 @@ def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
     every, before = [(flag, flag.measure(pair)) for flag in FLAGS], pair.plain.metrics["at_limit"][""]
     raised = [(f, in_words(f.text, {"value": v, "before": before}, {}, at=_at(pair))) for f, v in every if v > f.least]
-    chatter = any(flag.measure is _chatters for flag, _ in raised)
-    return [one for one in raised if not (chatter and one[0].measure is _moves)]
+    wild = any(flag.measure is _chatters for flag, _ in raised)
+    return [one for one in raised if not (wild and one[0].measure is _moved)]
 
 
 def by_reason(reasons: Mapping[str, str]) -> dict[str, list[str]]:
@@ -362,7 +363,8 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     elif outcome is Outcome.BETTER and any(flag.doubts for flag, _ in raised):
         outcome = Outcome.DOUBTFUL
     outcome = Outcome.LIMIT_LEFT if adaptive.left else outcome
-    errors = ", ".join(f"{n} {before[n]:.3g} -> {after[n]:.3g}{with_space(run.unit(f'error.{n}'))}" for n in ratios)
+    units = {n: with_space(run.unit(f"error.{n}")) for n in ratios}
+    errors = ", ".join(f"{n} {written_out(before[n])} -> {written_out(after[n])}{unit}" for n, unit in units.items())
     text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'}, {yard.span})."
     return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
 
@@ -419,11 +421,10 @@ def findings(
     judged += [judge(*pair, yard) for pair in pairs]
     if not judged:
         judged = [Finding("No controller is here both with and without adaptation.", Outcome.NOT_COMPARABLE)]
-    if (left := leaves(entries)) and any(by_name[name].left for name in judged[0].pair or ()):
-        judged[0] = replace(judged[0], text=f"{left} {judged[0].text}")
-    elif left:
-        judged.append(Finding(left, Outcome.LEAVES))
-    judged[0] = replace(judged[0], text=" ".join([*causes, judged[0].text]))
+    left, first = leaves(entries), judged[0]
+    own = any(by_name[name].left for name in first.pair or ())
+    judged[0] = replace(first, text=" ".join([*causes, *[left] * own, first.text]))
+    judged += [Finding(left, Outcome.LEAVES)] * bool(left and not own)
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
 

@@ -107,6 +107,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (WRONG_SIGN, "compare line.py --no-compile", 2, "fpirhc: problem 'line': controllers 'CTC+FPI', 'Too'"),
     ],
     "plans": [
+        (None, "compare line.py --no-compile -c CTC --set exact.b=1e-3", 1, MASS),  # it does not follow
         (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
         (receding, "compare line.py --no-compile -c RHC", 0, MASS),
         (OF_AN_END, "compare line.py --plans -c RHC", 2, "fpirhc: FixedPoint needs a cost that"),

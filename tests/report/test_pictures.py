@@ -104,7 +104,7 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_report_whole(tmp_path):
     own = page.read_text(encoding="utf-8").partition("Pictures of this problem")[2].partition("</section>")[0]
     assert own.count("<img") == 1
     assert "bad is not drawn" in own
-    fp.write_report(replace(comparison, pictures=()), page)
+    fp.write_report(replace(comparison, task=replace(comparison.task, pictures=())), page)
     assert "Pictures of this problem" not in page.read_text(encoding="utf-8")
 
 

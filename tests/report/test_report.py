@@ -75,6 +75,9 @@ def test_no_factor_is_the_best_and_no_number_of_those_that_do_not_follow(compari
     lost = compared(limits=fp.Limits(inputs={"u": (-0.01, 0.01)}), duration=3.0)  # the mass goes on
     assert "No controller follows" in " ".join(lost.verdict)
     assert not any(row.best for row in lost.view.tables[0].rows)
+    assert {row.cells[-1].partition(",")[0] for row in lost.view.tables[0].rows} == {"does not follow"}
+    [quick] = compared("plain", period=1e-9, duration=1e-8).view.tables[0].rows  # no call is done in a nanosecond
+    assert "late 100 %" in quick.cells[-1]
 
 
 def test_data_of_the_charts_is_complete(comparison, written):
@@ -126,13 +129,13 @@ def test_page_states_a_policy_that_allows_its_own_scripts_alone(written):
 
 
 def test_a_run_that_ends_early_is_told_in_words(comparison, tmp_path):
-    """Its numbers are 'none' and its reason is in the table; a comparison without a row says so; a folder must be there."""
+    """Its numbers are 'none' and its reason is in the verdict; a comparison without a row says so; a folder must be there."""
     entry = comparison["plain"]
     short = replace(entry.run, log=entry.run.log[:300], stop="signal 'x' is not finite at t = 0.3 s")
     ended = replace(entry, run=short, metrics=fp.measure(problem(), short))
     fp.write_report(replace(comparison, entries=(ended, *comparison.entries[1:])), tmp_path / "ended.html")
     page = (tmp_path / "ended.html").read_text(encoding="utf-8")
-    assert "ended early: signal &#39;x&#39; is not finite" in page
+    assert "does not finish: signal &#39;x&#39; is not finite" in page
     assert "<td class='none'>none</td>" in page
     fp.write_report(replace(comparison, entries=(), skipped={"x": "because"}), tmp_path / "empty.html")
     assert "No controller finished" in (tmp_path / "empty.html").read_text(encoding="utf-8")
@@ -142,13 +145,9 @@ def test_a_run_that_ends_early_is_told_in_words(comparison, tmp_path):
 
 def test_the_plot_of_a_run_names_quantities_units_and_controller():
     """A chart has one unit; a concentration is no position; the name is that of the problem file and not of a class."""
-    plant = fp.Plant(
-        coordinates={"c": "mol/s", "T": "K"},
-        inputs={"F": "l/s", "Q_dot": "kW"},
-        order=1,
-        response=lambda q, u, p: {"c": p.k * u.F - q.c, "T": p.k * u.Q_dot - q.T},
-        parameters={"k": fp.Parameter(1.0, 1.5, "1")},
-    )
+    response = lambda q, u, p: {"c": p.k * u.F - q.c, "T": p.k * u.Q_dot - q.T}  # noqa: E731
+    gain = {"k": fp.Parameter(1.0, 1.5, "1")}
+    plant = fp.Plant({"c": "mol/s", "T": "K"}, {"F": "l/s", "Q_dot": "kW"}, gain, response, order=1)
     reference = fp.Trajectory(lambda t: {"c": ca.sin(t), "T": 5 * ca.cos(t)})
     one = fp.Problem(plant, reference, {"c": 0.0, "T": 4.0}, period=0.01, duration=0.5)
     loaded = tasks.made(one, {"pump, steady": fp.ComputedTorque(fp.Exponential(rate=6.0))})

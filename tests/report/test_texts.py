@@ -44,6 +44,7 @@ OF_A_MACHINE = (
     (r"\d{4}-\d\d-\d\d[ T][\d:.+Z]*", "DATE"),
     (r"[^\s'\"]*/(?=line\.py|results)", ""),
 )
+TIME = r"\d[\d.]*(?: \d{3})*"
 INLINE = {"span", "b", "i", "a", "code", "strong", "em"}
 
 
@@ -93,7 +94,7 @@ def same_on_every_machine(text: str) -> str:
     """Without what belongs to this one: the last digit of a number, and the column of times."""
     for pattern, instead in OF_A_MACHINE:
         text = re.sub(pattern, instead, text)
-    text = re.sub(r"\S+ / \S+ / \S+(?= +ok)", "US", text)
+    text = re.sub(rf"{TIME} / {TIME} / {TIME}", "US", re.sub(r"\blate [\d.]+ %", "ok", text))
     text = re.sub(r"(?<![\w.])-?\d+(\.\d+)?(e[+-]?\d+)?", number, text)
     return "\n".join(re.sub(r"[ \u2500-\u257f]+", " ", line).strip() for line in text.splitlines()).strip() + "\n"
 

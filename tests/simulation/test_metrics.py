@@ -379,9 +379,9 @@ def test_a_signal_that_is_not_there_breaks_its_figure_alone():
 
 # In the order of tables. h: stands in short ones, r: in reports, s: in studies too where nobody judges by it.
 MEANT = {
-    "cycles": "s", "rms_error": "hrs", "max_error": "rs", "settling": "rs", "effort": "rs", "total_variation": "hrs",
-    "at_limit": "hrs", "cost": "r", "status": "s", "contraction.measured": "hr", "contraction.predicted": "r",
-    "contraction.growing": "r", "solve.median_iterations": "rs", "solve.worst_iterations": "s",
+    "cycles": "s", "rms_error": "hrs", "max_error": "rs", "settling": "rs", "effort": "rs", "command_range": "s",
+    "total_variation": "hrs", "at_limit": "hrs", "cost": "r", "status": "s", "contraction.measured": "hr",
+    "contraction.predicted": "r", "contraction.growing": "r", "solve.median_iterations": "rs", "solve.worst_iterations": "s",
     "solve.median_stationarity": "s", "solve.worst_stationarity": "rs", "solve.worst_feasibility": "s", "plans": "s",
 }  # fmt: skip
 

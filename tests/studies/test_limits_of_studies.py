@@ -125,7 +125,7 @@ def test_a_controller_that_fails_as_the_problem_stands():
     """Without feedback of the error a wrong start stays: the error is that of the start, all of the range."""
     one = found("lost", pump(), fp.ComputedTorque(fp.Exponential(rate=1e-9, integral=False)))
     assert math.isnan(one.table.holds[0])
-    assert one.table.why[0] == "error of 100 %"
+    assert one.table.why[0] == "its error is 100 %"
     assert "as it stands" in one.view.tables[0].rows[0].cells
 
 
@@ -144,7 +144,7 @@ def test_what_each_bears_is_told():
     wave = fp.Trajectory(lambda t: {"y": ca.sin(t)})
     task = tasks.made(pump(1.2, reference=wave, duration=40.0, measure_from=10.0), {"law": LAW, "law+FPI": ADAPTIVE})
     one = fp.limits(task, over=["noise"], compiled=False)
-    each = "; ".join(f"{r.controller} fails at {100 * r.fails:.4g} % of the range" for r in one.table.itertuples())
+    each = "; ".join(f"{r.controller} fails at {100 * r.fails:.3g} % of the range" for r in one.table.itertuples())
     [(text, _)] = one.view.sentences
     assert text.startswith("Noise: law+FPI beats law up to ")
     assert text.endswith(f": {one.beats['noise'][0].rpartition(': ')[2]}; {each}.")
@@ -152,4 +152,4 @@ def test_what_each_bears_is_told():
     noisy = [replace(task.problem, sensing=fp.Sensing({"y": fp.Sensor(noise=fp.Noise(2 * v))})) for v in two]
     outcomes = [str(fp.compare(replace(task, problem=p), seed=0, compiled=False).outcome) for p in noisy]
     assert outcomes[0] == "better" != outcomes[1]
-    assert [[row.cells[0] for row in table.rows] for table in one.view.tables] == [["law", "law+FPI"]] * 2
+    assert [column.head for column in one.view.tables[1].columns] == ["noise [% of the range]", "law", "law+FPI"]

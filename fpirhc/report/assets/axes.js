@@ -1,5 +1,8 @@
 "use strict";
 // The axis of values of a chart: digits that tell its ticks apart, powers of ten where numbers are long, whatever the browser's language.
+const isPlain = (size) => size < 1e6 && size >= 1e-3;
+const power = (v, digits) => v.toExponential(digits).replace("e+", "e");
+const numberText = (v) => (v === 0 || isPlain(Math.abs(v)) ? String(+v.toPrecision(4)) : power(v, 3));
 function tickTexts(splits) {
   const step = Math.abs(splits[1] - splits[0]), largest = Math.max(...splits.map(Math.abs));
   if (!(step > 0) || !isFinite(largest)) return splits.map((v) => String(+v.toPrecision(3)));
@@ -7,9 +10,9 @@ function tickTexts(splits) {
   if (Math.abs(+(step * 10 ** decimals).toFixed(6) % 1) > 1e-6) decimals += 1; // steps of 2.5
   return splits.map((v) => {
     if (Math.abs(v) < 1e-6 * step) return "0";
-    if (largest < 1e6 && largest >= 1e-3) return v.toFixed(Math.max(0, decimals));
+    if (isPlain(largest)) return v.toFixed(Math.max(0, decimals));
     const digits = Math.max(0, decimals + Math.floor(Math.log10(Math.abs(v)) + 1e-9));
-    return v.toExponential(Math.min(digits, 15)).replace("e+", "e");
+    return power(v, Math.min(digits, 15));
   });
 }
 const AXIS_OF_VALUES = {

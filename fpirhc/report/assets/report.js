@@ -93,7 +93,7 @@ function draw({ box, spec }) {
         width,
         dash,
         points: { show: s.values.filter((v) => v !== null).length === 1, size: 9, fill: colors[s.name] }, // a value alone is a dot
-        value: (_, v) => (v === null || v === undefined ? "" : v.toPrecision(4)),
+        value: (_, v) => (v === null || v === undefined ? "" : numberText(v)),
       };
     })
   );
@@ -103,7 +103,7 @@ function draw({ box, spec }) {
     height: HEIGHT,
     series,
     scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec), spec.limits) } },
-    axes: [{ ...axis, ...labelled, ...(spec.across ? { values: AXIS_OF_VALUES.values } : {}), label: across.label }, { ...axis, ...AXIS_OF_VALUES }],
+    axes: [{ ...axis, ...labelled, values: AXIS_OF_VALUES.values, label: across.label }, { ...axis, ...AXIS_OF_VALUES }],
     cursor: spec.across ? {} : { sync: { key: sync.key } },
     legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
     hooks: spec.across ? {} : { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => limits(chart, spec)] },

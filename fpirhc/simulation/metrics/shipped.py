@@ -68,6 +68,13 @@ def effort(problem: Problem, run: Run) -> dict[str, float]:
     return by_name(run.layout["command"].elements, np.sqrt(_mean(commands * commands)))
 
 
+def command_range(problem: Problem, run: Run) -> dict[str, float]:
+    """Return the largest less the smallest command of every input; NaN where no cycle is measured."""
+    commands = _measured(problem, run)
+    ranges = np.ptp(commands, axis=0) if len(commands) else np.full(commands.shape[1], np.nan)
+    return by_name(run.layout["command"].elements, ranges)
+
+
 def total_variation(problem: Problem, run: Run) -> dict[str, float]:
     """Return sum |u_k+1 - u_k| per unit of time, by input."""
     moves = _mean(np.abs(np.diff(_measured(problem, run), axis=0))) / problem.period
@@ -275,6 +282,7 @@ METRICS = (
     Metric("max_error", max_error, by="coordinate", unit=coordinate_unit, order=20),
     Metric("settling", settling, by="coordinate", unit=lambda problem, _: problem.time_unit, title="settled", order=40),
     Metric("effort", effort, by="input", unit=input_unit, better="neither", title="rms", order=50),
+    Metric("command_range", command_range, by="input", unit=input_unit, better="neither", report=False, order=50),
     Metric(
         "total_variation",
         total_variation,
