@@ -23,6 +23,8 @@ from fpirhc.status import Status
 from fpirhc.symbolic.driver import OF_TYPE, SIGNATURE, of_type
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import why_no_compiler
+from fpirhc.symbolic.open import SETTINGS
+from fpirhc.task.limits import Interval
 
 _FEW = 12  # entries of a signal that are named in C; longer ones are arrays
 _WIDTH = 120
@@ -142,6 +144,12 @@ def _set_declaration(device: Device) -> list[str]:
 def data_of(device: Device) -> dict[str, Layout]:
     """Return the structs of what stays until somebody changes it, by name; none is empty."""
     return {s.name: Layout((s,)) for s in device.data.signals if s.size and (s.elements or s.units)}
+
+
+def checks_of(device: Device) -> dict[str, tuple[str, list[Interval]]]:
+    """Return for a struct of data that is written through a check: that C function (controller, entry, value), and all bounds."""
+    bounds = device.stepper.bounds()
+    return {SETTINGS: (f"{device.name}_set", list(bounds.values()))} if bounds else {}
 
 
 def _struct(name: str, layout: Layout) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from fpirhc.errors import package
 from fpirhc.export import Device, Target, shared_library
-from fpirhc.export.c import data_of, filled, sources
+from fpirhc.export.c import checks_of, data_of, filled, sources
 from fpirhc.symbolic.layout import Layout
 
 
@@ -75,17 +75,13 @@ def _variables(device: Device) -> list[Variable]:
     stepper = device.stepper
     listed = [Variable("time", device.problem.plant.time_unit, "independent", "continuous")]
     listed += _numbers(device.inputs, "input")[1:]
+    checks, given = checks_of(device), [signal.name for signal in device.problem.given_signals]
     for part, layout in data_of(device).items():
-        if part == "parameters":
-            listed += _numbers(layout, "parameter", "tunable")
-        elif part != "settings":
-            listed += _numbers(layout, "input")
+        rows = _numbers(layout, "input") if part in given else _numbers(layout, "parameter", "tunable")
+        bounds = checks[part][1] if part in checks else [row.bounds for row in rows]
+        listed += [replace(row, bounds=ends) for row, ends in zip(rows, bounds, strict=True)]
     listed += [replace(one, start=None) for one in _numbers(Layout((stepper.signals["command"],)), "output")]
     listed.append(STATUS)
-    for (path, ends), unit in zip(stepper.bounds().items(), stepper.settings.units, strict=True):
-        listed.append(
-            Variable(_structured(f"settings.{path}"), unit, "parameter", "tunable", stepper.numbers[path], ends)
-        )
     trace = zip(stepper.signals.columns, stepper.signals.units, strict=True)
     return listed + [Variable(_structured(f"trace.{name}"), unit, "local") for name, unit in trace]
 
@@ -106,33 +102,21 @@ def _structured(name: str) -> str:
 
 def _words(device: Device) -> dict[str, str]:
     """Where the shared functions find a number, by its reference; references count the variables in their order."""
-    data = {part: layout for part, layout in data_of(device).items() if part != "settings"}
-    rows, at = [], 1
-    for place, size in [
-        ("&s->in + 1", device.inputs.size - 1),
-        *((f"&s->c.{part}", one.size) for part, one in data.items()),
-    ]:
-        rows.append(f"  if (r >= {at} && r < {at + size}) return (casadi_real*){place} + (r - {at});")
+    places = [("&s->in + 1", "", device.inputs.size - 1)]
+    places += [(f"&s->c.{part}", part, one.size) for part, one in data_of(device).items()]
+    rows, checked, checks, at = [], [], checks_of(device), 1
+    for place, part, size in places:
+        inside = f"  if (r >= {at} && r < {at + size})"
+        rows.append(f"{inside} return (casadi_real*){place} + (r - {at});")
+        if part in checks:
+            answer = f"return {checks[part][0]}(&s->c, r - {at}, (casadi_real)value) ? DONE : REFUSED;"
+            checked.append(f"{inside} {{\n    s->fresh = 0;\n    {answer}\n  }}")
         at += size
     status = at + device.stepper.signals["command"].size
-    settings, trace = status + 1, status + 1 + device.stepper.settings.size
     return {
-        "references": f"enum {{ TIME, COMMANDS = {at}, STATUS = {status}, SETTINGS = {settings}, TRACE = {trace} }};",
+        "references": f"enum {{ TIME, COMMANDS = {at}, STATUS = {status}, TRACE = {status + 1} }};",
         "written": "\n".join(rows),
-        **_settings(device),
-    }
-
-
-def _settings(device: Device) -> dict[str, str]:
-    """How a setting is read, and written through its check."""
-    if not (count := device.stepper.settings.size):
-        return {"settings_read": "", "settings_written": ""}
-    inside = f"  if (r >= SETTINGS && r < SETTINGS + {count})"
-    setting = f"({device.name}_setting)(r - SETTINGS)"
-    return {
-        "settings_read": f"{inside} return (casadi_real*)&s->c.settings + (r - SETTINGS);",
-        "settings_written": f"{inside} {{\n    s->fresh = 0;\n"
-        f"    return {device.name}_set(&s->c, {setting}, (casadi_real)value) ? DONE : REFUSED;\n  }}",
+        "checked": "\n".join(checked),
     }
 
 

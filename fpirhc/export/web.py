@@ -21,7 +21,7 @@ import numpy as np
 from fpirhc.controllers.base import Controller
 from fpirhc.errors import FpirhcError, package, require
 from fpirhc.export import Device, Target, c_of, literal, web_module
-from fpirhc.export.c import data_of, filled, layout_of, recorded, sources, template
+from fpirhc.export.c import checks_of, data_of, filled, layout_of, recorded, sources, template
 from fpirhc.problem_files.problem_file import Task
 from fpirhc.report.html import asset
 from fpirhc.simulation.drawing import PALETTE
@@ -249,10 +249,8 @@ def _place(loop: LabLoop, column: str) -> int | None:
 def _files(device: Device) -> Mapping[str, str | bytes]:
     name, layout, structs = device.name, layout_of(device), data_of(device)
     calls = [f'EXPORT("{part}") void* get_{part}(void) {{ return &c.{part}; }}' for part in structs]
-    if device.stepper.settings.size:
-        calls.append(
-            f'EXPORT("set") int put(int which, double value) {{ return {name}_set(&c, ({name}_setting)which, value); }}'
-        )
+    for check, _ in checks_of(device).values():
+        calls.append(f'EXPORT("set") int put(int which, double value) {{ return {check}(&c, which, value); }}')
     files = {**sources(device), f"{name}_wasm.c": filled(device, "wasm.c", data="\n".join(calls))}
     text = json.dumps(layout, indent=1)
     return {

@@ -59,7 +59,6 @@ static casadi_real* written(cycle_state* s, unsigned r) {
 static casadi_real* place(cycle_state* s, unsigned r) {
   if (r >= COMMANDS && r < COMMANDS + @NAME@_COMMANDS) return (casadi_real*)&s->out + (r - COMMANDS);
   if (r >= TRACE && r < TRACE + @NAME@_TRACE) return (casadi_real*)&s->c.trace + (r - TRACE);
-@settings_read@
   return written(s, r);
 }
 
@@ -73,7 +72,7 @@ static int get_number(cycle_state* s, unsigned r, double* value) {
 
 static int set_number(cycle_state* s, unsigned r, double value) {
   casadi_real* at = written(s, r);
-@settings_written@
+@checked@
   if (!at) return UNKNOWN;
   *at = (casadi_real)value;
   s->fresh = 0;
