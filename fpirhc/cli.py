@@ -129,7 +129,7 @@ def run(
     task = in_case(task, case) if case else task
     chosen, folder = select(task, [controller])[controller], opt.folder_of(out, task.name)
     from fpirhc.controllers.contract import resolved
-    from fpirhc.errors import writing
+    from fpirhc.errors import InvalidProblem, writing
     from fpirhc.report.terminal import announce_backend, progress_bars, say, show_run
     from fpirhc.simulation.metrics import measure
     from fpirhc.simulation.simulate import simulate
@@ -141,7 +141,11 @@ def run(
         task, seed = replace(task, problem=one.problem), one.seed
     with progress_bars() as progress:
         report = lambda done, total: progress(controller, done, total)  # noqa: E731
-        found = simulate(task.problem, chosen, seed=seed, name=controller, compiled=not no_compile, progress=report)
+        how: dict[str, Any] = {"seed": seed, "name": controller, "compiled": not no_compile, "progress": report}
+        try:
+            found = simulate(task.problem, chosen, **how)
+        except InvalidProblem as error:
+            raise InvalidProblem(f"{task.place}{error}") from None
     plain = "".join(c if c.isalnum() or c == "-" else "_" for c in controller)
     files = [folder / f"{plain}.npz", folder / f"{plain}.png"]
     found.save(files[0])

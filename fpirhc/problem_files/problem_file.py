@@ -80,6 +80,12 @@ class Task(FoundByName):
         object.__setattr__(self, "controllers", named)
         super().__post_init__()
 
+    @property
+    def place(self) -> str:
+        """File and line of the problem, "arm.py, line 12: "; empty where there is no file."""
+        line = _line_of(self.path, "problem") if self.path.is_file() else ""
+        return f"{self.path.name}, {line}" * bool(line)
+
     def __repr__(self) -> str:
         return line(self, self.name, self.title, f"{len(self.controllers)} controllers")
 
@@ -251,9 +257,9 @@ def _imported(path: Path) -> ModuleType:
     return module
 
 
-def _line_of(module: ModuleType, name: str) -> str:
+def _line_of(module: ModuleType | Path, name: str) -> str:
     """Return "line 12: " of the last assignment of a name in a module's file; empty where there is none."""
-    tree = ast.parse(Path(module.__file__ or "").read_bytes())
+    tree = ast.parse(Path(getattr(module, "__file__", module)).read_bytes())
     assigned = (one for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) for one in ast.walk(node))
     names = [one for one in assigned if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)]
     lines = [one.lineno for one in names if one.id == name]

@@ -88,5 +88,6 @@ def find_problem(name_or_path: str) -> Path:
     named = f"no file at '{name_or_path}'" if is_path else f"problem '{name_or_path}' is unknown"
     near = get_close_matches(name_or_path, beside, n=1) if path.suffix else [n for n in beside if n == f"{path}.py"]
     near = near or get_close_matches(path.stem, shipped, n=1, cutoff=0.5)
-    hint = f" Did you mean '{near[0]}'?" if near else ""
+    here = [] if near else [str(one) for one in problem_files(path.parent)[:_OFFERED]]
+    hint = f" Did you mean '{near[0]}'?" if near else f" Problem files there: {', '.join(here)}." * bool(here)
     raise ProblemFileError(f"{named}.{hint} Give the path of a problem file, or a name from 'fpirhc list'")

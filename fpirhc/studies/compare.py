@@ -239,7 +239,8 @@ def compare(
         except FpirhcError as error:
             skipped[name] = str(error)
     if not rows.composed:
-        raise InvalidProblem("; ".join(f"{', '.join(names)}: {why}" for why, names in by_reason(skipped).items()))
+        told = "; ".join(f"{', '.join(names)}: {why}" for why, names in by_reason(skipped).items())
+        raise InvalidProblem(f"{task.place}{told}")
     tell = progress if progress and rows.wanted else lambda *_: None
     tell("compiling", 0, 1)
     compile_all(rows.wanted)

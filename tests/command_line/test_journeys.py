@@ -54,14 +54,12 @@ def receding() -> None:
 
 
 def recorded() -> None:
-    run = fp.simulate(
-        fp.load_problem("line.py").problem, fp.load_problem("line.py").controllers["CTC"], seed=0, compiled=False
-    )
+    task = fp.load_problem("line.py")
+    run = fp.simulate(task.problem, task.controllers["CTC"], seed=0, compiled=False)
     columns = {"u": "command.u", "y": "state.y", "y'": "state.y'", "y''": "realised.y"}
     rows = zip(run.time, *(run[name] for name in columns.values()), strict=True)
-    Path("run.csv").write_text(
-        "\n".join([",".join(["time", *columns]), *(",".join(map(repr, map(float, r))) for r in rows)])
-    )
+    lines = [",".join(map(repr, map(float, row))) for row in rows]
+    Path("run.csv").write_text("\n".join([",".join(["time", *columns]), *lines]))
 
 
 TIGHT = edited('"u": (-30.0, 30.0)}', '"u": (-1.0, 1.0)}, states={"y": (0.8, 1.0)}')
@@ -71,9 +69,8 @@ TUNABLE = edited(
     "controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {'
 )
 PLAN = "fp.FixedPoint(iterations=1, tolerance=1e-3)"
-PRECISE = edited(
-    f"{PLAN}),\n", 'fp.FixedPoint(tolerance=1e-6)),\n    "IPOPT": fp.RecedingHorizon(fp.Ipopt(tolerance=1e-6)),\n'
-)
+IPOPT = '    "IPOPT": fp.RecedingHorizon(fp.Ipopt(tolerance=1e-6)),\n'
+PRECISE = edited(f"{PLAN}),\n", f"fp.FixedPoint(tolerance=1e-6)),\n{IPOPT}")
 OF_AN_END = edited(
     'fp.Quadratic(states={"y": 100.0, "y\'": 1.0}, deviation={"u": 1e-2})',
     """fp.CustomCost(
@@ -109,7 +106,9 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
     "plans": [
         (None, "compare line.py --no-compile -c CTC --set exact.b=1e-3", 1, MASS),  # it does not follow
         (None, "compare line.py --plans", 2, "fpirhc: problem 'line' has no horizon, or none of CTC, CTC+FPI plans"),
-        (receding, "compare line.py --no-compile -c RHC", 0, MASS),
+        (edited("controllers = {\n", PLANNERS), "run line.py RHC", 2, "fpirhc: line.py, line 14: RecedingHorizon needs"),
+        (None, "compare line.py -c RHC", 2, "fpirhc: line.py, line 14: RHC: RecedingHorizon needs Problem(horizon=...)"),
+        (edited("measure_from=0.5,\n", HORIZON), "compare line.py --no-compile -c RHC", 0, MASS),
         (OF_AN_END, "compare line.py --plans -c RHC", 2, "fpirhc: FixedPoint needs a cost that"),
         (BENDS, "compare line.py --plans -c RHC+FPI", 0, "line, first horizon"),
     ],

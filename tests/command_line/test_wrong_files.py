@@ -257,7 +257,7 @@ def changed(file: str, table: str) -> dict[str, Wrong]:
 FILES = changed(PENDULUM, WRONG_PENDULUM) | changed(REACTOR, WRONG_REACTOR) | OTHERS
 # Command lines beside a correct file: the words, and what must be said, in this order.
 REFUSED = """
-compare nofile => problem 'nofile' is unknown. Give the path of a problem file, or a name from 'fpirhc list'
+compare nofile => problem 'nofile' is unknown. Problem files there: mine.py. Give the path of a problem file
 compare mien.py => no file at 'mien.py'. Did you mean 'mine.py'?
 compare mine => problem 'mine' is unknown. Did you mean 'mine.py'?
 compare Two_Mass => Did you mean 'two_mass'?
