@@ -215,6 +215,9 @@ class Stepper(Checked):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return (command, memory for the next cycle).
 
+        A sample that is not finite, or outside its sensor's range, skips the cycle: the command is the last one, in the first cycle
+        `Problem.input_before`, by default 0 clipped to its limits; the status is BAD_SAMPLE, and `skipped` counts.
+
         Args:
             time: in the plant's unit of time.
             state: the measured state, shape (nx,). Where it is estimated, use `step_measured`.
