@@ -131,7 +131,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
 @cache
 def blocks(text: str) -> list[tuple[bool, str]]:
     """Return the paragraphs of a description, each with whether it is set as written, as indented equations and tables are."""
-    blocks = (block for block in textwrap.dedent(text).strip("\n").split("\n\n") if block.strip())
+    blocks = (block for block in text.strip("\n").split("\n\n") if block.strip())
     return [(True, textwrap.dedent(b)) if b.startswith("  ") else (False, " ".join(b.split())) for b in blocks]
 
 
@@ -168,7 +168,7 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
     """Return the data of the page's charts: controllers with their colours, and charts with one series per controller."""
     entries = [e for e in comparison.entries if e.run.cycles > 1]
     if not entries:
-        return {"controllers": [], "charts": [], "time": [], "timeUnit": comparison.task.problem.time_unit}
+        return {"controllers": [], "timeUnit": comparison.task.problem.time_unit, "time": [], "charts": []}
     longest = max(entries, key=lambda e: e.run.cycles).run
     edges = np.unique(np.linspace(0, longest.cycles, min(INTERVALS, longest.cycles) + 1).astype(int))
     first, colours = entries[0].run, colours_of(comparison)
@@ -202,21 +202,12 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
             charts.append({**_chart(n, real[0].run.unit(f"reality_state.{n}"), lines, edges), "real": True})
     charts += contraction_charts(comparison)
     middles = 0.5 * np.diff(edges) * longest.period
-    return {
-        "controllers": [
-            {
-                "name": e.name,
-                "color": colours[e.name],
-                "slots": [[*_round(span[:2]), span[2]] for span in spans] if len(spans) <= INTERVALS else [],
-                "ended": bool(e.run.stop),
-            }
-            for e in entries
-            for spans in [e.run.spans()]  # too many are not seen
-        ],
-        "timeUnit": comparison.task.problem.time_unit,
-        "time": _round(np.repeat(longest.time[edges[:-1]], 2) + np.outer(middles, (0, 1)).ravel()),
-        "charts": charts,
-    }
+    shown = [{"name": e.name, "color": colours[e.name], "ended": bool(e.run.stop)} for e in entries]
+    for one, e in zip(shown, entries, strict=True):
+        spans = e.run.spans()  # too many are not seen
+        one["slots"] = [[*_round(span[:2]), span[2]] for span in spans] if len(spans) <= INTERVALS else []
+    times = _round(np.repeat(longest.time[edges[:-1]], 2) + np.outer(middles, (0, 1)).ravel())
+    return {"controllers": shown, "timeUnit": comparison.task.problem.time_unit, "time": times, "charts": charts}
 
 
 def _chart(title: str, unit: str, lines: Sequence[tuple[str, np.ndarray]], edges: np.ndarray) -> dict[str, Any]:

@@ -64,12 +64,9 @@ class VariantStudy(Study):
         title = f"{self.problem}: {self.count} variants"
         tables = [self._shown(name, some) for name, some in {title: self.summary, **self.groups}.items()]
         facts: Any = {"problem": self.problem, "variants": str(self.variants), "metric": self.figure.column}
-        facts |= {
-            "summary": self.summary.reset_index().to_dict("records"),
-            "groups": {g: some.reset_index().to_dict("records") for g, some in self.groups.items()},
-            "chatter": self.chatter,
-            "versions": self.versions,
-        }
+        facts["summary"] = self.summary.reset_index().to_dict("records")
+        facts["groups"] = {g: some.reset_index().to_dict("records") for g, some in self.groups.items()}
+        facts |= {"chatter": self.chatter, "versions": self.versions}
         shares = " Errors are rms, in % of the range of the reference, and differences are in percentage points."
         shares *= self.figure.metric is None
         lists = {"Worst runs": [*_commands(self)]}

@@ -137,8 +137,10 @@ def test_a_run_that_ends_early_is_told_in_words(comparison, tmp_path):
     page = (tmp_path / "ended.html").read_text(encoding="utf-8")
     assert "does not finish: signal &#39;x&#39; is not finite" in page
     assert "<td class='none'>none</td>" in page
-    fp.write_report(replace(comparison, entries=(), skipped={"x": "because"}), tmp_path / "empty.html")
-    assert "No controller finished" in (tmp_path / "empty.html").read_text(encoding="utf-8")
+    none = replace(comparison, entries=(), skipped={"x": "because"}, description="  y = x")
+    fp.write_report(none, tmp_path / "empty.html")
+    empty = (tmp_path / "empty.html").read_text(encoding="utf-8")
+    assert ("No controller finished" in empty, "<pre class='about'>y = x</pre>" in empty) == (True, True)
     with pytest.raises(OutputError, match="cannot write the report"):
         fp.write_report(comparison, tmp_path / "missing" / "report.html")
 
