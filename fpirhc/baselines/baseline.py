@@ -21,7 +21,7 @@ import pandas as pd
 from fpirhc.errors import InvalidValue, writing
 from fpirhc.fields.checked import checked_call
 from fpirhc.problem_files.problem_file import Task, load_problem
-from fpirhc.problem_files.shipped import missing
+from fpirhc.problem_files.shipped import missing, problem_files
 from fpirhc.studies import Progress, versions
 from fpirhc.studies.compare import select
 from fpirhc.studies.runs import run_variants
@@ -112,15 +112,12 @@ def accept(
             if math.isfinite(values[0] + band):
                 expected[metric] = [values[0], float(f"{1.005 * band:.3g}")]
         controllers[name] = {"outcomes": outcomes, "metrics": expected}
-    facts = {
+    facts: Any = {
         "problem": task.name,
         "reason": reason.strip(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "seed": seed,
-        "versions": versions(),
-        "file": file_hash(task.path),
-        "controllers": controllers,
     }
+    facts |= {"seed": seed, "versions": versions(), "file": file_hash(task.path), "controllers": controllers}
     path = baseline_path(task.path, baselines)
     with writing(path.parent, "--baselines"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -215,8 +212,7 @@ def problems_here(folder: Path) -> list[Path]:
     for inner in (place, *sorted(one for one in place.iterdir() if one.is_dir())):
         reasons = inner / "baselines" / "unchecked.toml"
         unchecked = tomllib.loads(reasons.read_text(encoding="utf-8")) if reasons.is_file() else {}
-        files = [one for one in sorted(inner.glob("*.py")) if one.stem not in unchecked]
-        found += [f for f in files if "controllers = " in f.read_text(encoding="utf-8") and not missing(f)]
+        found += [one for one in problem_files(inner) if one.stem not in unchecked and not missing(one)]
     if not found:
         raise InvalidValue(f"no problem to check in '{place}'; name one, as in fpirhc check two_mass")
     return found
