@@ -57,10 +57,10 @@ def test_a_compiler_that_fails_is_an_error(monkeypatch):
 
 
 def test_a_run_keeps_the_numbers_that_it_was_given(tmp_path):
-    """All live numbers are in the run and its file; a run without live settings has none."""
-    ready, given = fp.simulator(brief(), by_torque(), compiled=False, live=FOUR[1:3]), {"deformation.gain": -0.9}
-    run = ready.run(seed=0, settings=given)
-    assert run.settings["live"] == {"deformation.scale": by_torque().deformation.scale} | given
-    run.save(tmp_path / "run.npz")
-    assert fp.load_run(tmp_path / "run.npz").settings["live"] == run.settings["live"]
+    """All live numbers and the limits in force are in the run's file; a run without live settings has none."""
+    live, given = [*FOUR[1:3], FIVE[-1]], {"deformation.gain": -0.9, FIVE[-1]: 20.0}
+    fp.simulator(brief(), by_torque(), compiled=False, live=live).run(seed=0, settings=given).save(tmp_path / "run.npz")
+    kept = fp.load_run(tmp_path / "run.npz").settings
+    assert kept["live"] == {"deformation.scale": by_torque().deformation.scale} | given
+    assert kept["limits"][1][0] == given[FIVE[-1]]
     assert "live" not in fp.simulate(brief(), tasks.two_mass.controllers["CTC"], seed=0, compiled=False).settings
