@@ -99,7 +99,10 @@ class LiveSettings:
                 raise InvalidValue(
                     f"setting '{path}' cannot become {value}: the compiled loop has this number in its code; use a large one"
                 )
-        problem, controller = self._with({p: v for p, v in values.items() if v != self.start[p]})
+        others = {path: value for path, value in values.items() if value != self.start[path]}
+        if not others:  # those of the build are checked
+            return self.problem, self.controller, values
+        problem, controller = self._with(others)
         return problem, checked(problem, controller, numbers_only=True), values
 
     @cached_property

@@ -145,12 +145,9 @@ class Simulator:
         own: Simulator = self
         if self.outdated_by(problem):
             own = simulator(problem, self.live.unresolved, compiled=self.compiles, live=self.live.paths)
-        live = replace(own.live, problem=problem)
-        controller, numbers = own.controller, live.start
-        if settings:
-            problem, controller, numbers = live.changed(settings)
+        problem, controller, numbers = replace(own.live, problem=problem).changed(settings or {})
         start = start_memory(own.loop, problem, controller)
-        start[live.places(own.loop.memory)] = list(numbers.values())
+        start[own.live.places(own.loop.memory)] = list(numbers.values())
         tables = run_tables(problem, seed, _padded(problem, ()), disturbed=disturbed, setpoints=setpoints)
         logged, stop = run_cycles(problem, start, own.loop, own.evaluator, tables, seed, progress)
         layout, log = with_common_columns(own.loop.trace, logged)
