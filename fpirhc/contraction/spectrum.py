@@ -57,10 +57,7 @@ def jacobians_along(
 def _response_jacobian(plant: Plant) -> ca.Function:
     """Return Function (state, deformed, exact, approximate) -> J = df/dr of the controlled coordinates, n x n.
 
-        f(r) = response(state, inverse(state, r; approximate); exact)
-
-    Raises:
-        InvalidProblem: the inputs and the controlled coordinates differ in number.
+    f(r) = response(state, inverse(state, r; approximate); exact)
     """
     matrix = kind(plant.equations.inverse_opaque)
     x = matrix.sym("x", plant.state.size)
@@ -105,12 +102,7 @@ def _sampled_jacobian(problem: Problem) -> ca.Function:
 def _response(
     problem: Problem, advance: ca.Function, after: Matrix, command: Matrix, held: tuple[Matrix, Matrix, ca.DM]
 ) -> Matrix:
-    """The response to the command of a cycle; of a map the divided differences y_{k+r} / T^r, as far as that command changes them.
-
-    Args:
-        after: state at the end of the cycle, whose command is `command`.
-        held: command of the cycles after it, parameters, no forcing.
-    """
+    """The response to the command of a cycle, or of a map the divided differences y_{k+r} / T^r as far as it changes them."""
     counts, orders = problem.plant.differences, problem.plant.response_orders
     names = [name + "'" * (order - counts[name]) for name, order in orders.items()]
     shown, state = problem.reality_or_model.function(names, seen=True), after

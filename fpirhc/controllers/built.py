@@ -249,10 +249,7 @@ def with_aim(built: Built, blocks: Sequence[Block]) -> list[Block]:
 def _informed(
     built: Built, reads: Layout, blocks: Sequence[Block], delays: Sequence[Delay], *, ahead: bool = False
 ) -> Composite:
-    """Return blocks as one step to the command, behind a block of what the controller is told of signals from outside.
-
-    `ahead`: whether the time is the one at which the command will act.
-    """
+    """Return blocks as one step to the command, behind one of signals from outside; `ahead`: at the time of the command."""
     told = built.told
     compares = bool(told.places) and ACTED in _read_by(blocks)
     first = told.block(remembers=compares and not ahead)

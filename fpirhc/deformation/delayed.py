@@ -21,15 +21,7 @@ from fpirhc.task.dead_time import Cycles, Queue, check_cycles
 
 @dataclass(frozen=True)
 class _Queued(Wrapper):
-    """The wrapped map with its own past requests and desired responses.
-
-    Args:
-        cycles: dead time d between a request and its response, beyond the one cycle that every loop has; a tuple gives every
-            controlled coordinate its own.
-
-    Raises:
-        InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles; an uncertainty beyond the dead time.
-    """
+    """The wrapped map with its own past requests and desired responses."""
 
     cycles: Cycles
 
@@ -86,7 +78,7 @@ class Paired(_Queued):
 
     Args:
         map: any deformation that iterates.
-        cycles: dead time d, or one for every controlled coordinate.
+        cycles: dead time d beyond the one cycle that every loop has, or a tuple with one for every controlled coordinate.
 
     Raises:
         InvalidValue: a dead time that is negative, not finite, or beyond 1000 cycles.

@@ -106,10 +106,7 @@ def examples(inner: Deformation) -> tuple[Deformation, ...]:
 def _growing_in_a_row(
     count: Expression, error: Expression, before: Expression, slow: float, fast: Expression
 ) -> Expression:
-    """How many errors in a row alternated in sign and grew; zero when the newest did not.
-
-    An error that grew by less than the factor `fast` counts `slow`.
-    """
+    """How many errors in a row alternated in sign and grew, each by the factor `fast`: one that grew less counts `slow`."""
     size, earlier = ca.sumsqr(error), ca.sumsqr(before)
     weight = ca.if_else(size > fast**2 * earlier, 1, slow)
     return ca.if_else(ca.logic_and(ca.dot(error, before) < 0, size > earlier), count + weight, 0)
@@ -125,10 +122,7 @@ def _returning_in_a_row(count: Expression, error: Expression, before: Expression
 
 
 def _mean_sign(product: float, components: int) -> float:
-    """The mean of sgn(h_k' h_{k-1}) in white noise, 2 I_{(1+rho)/2}(m/2, m/2) - 1 with rho = -g / 2; the product may be open.
-
-    I is the regularised incomplete beta function; the proof stands in docs/theory.md.
-    """
+    """The mean of sgn(h_k' h_{k-1}) in white noise, see docs/theory.md; the product may be open."""
     correlation = -0.5 * product
     # Integration by parts: the mean for m + 2 components is the mean for m plus one term.
     size = 1 if components % 2 else 2

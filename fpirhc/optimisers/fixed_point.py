@@ -320,10 +320,7 @@ EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, 
 
 
 def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Columns, first: Columns) -> Columns:
-    """The better results of a call of the plain iteration and of the one with limits, in the memory of the plain one.
-
-    Both begin with the same inputs.
-    """
+    """The better results of the plain iteration and of the one with limits from the same inputs, in the plain one's memory."""
     own, ns = limited_memory(ocp), ocp.state.size
     begin = own.start()
     begin[own.slice("plan_inputs")] = call[4][layout.slice("plan_inputs")]

@@ -266,6 +266,7 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
                 what = f"{len(rows)} questions" if brief else whole
                 say(f"  {one.verdict:7s} {what}", STYLES[Outcome.WORSE] if one.verdict == "no" else "")
             these = f"For these {len(rows)}: " * (len(rows) > 1 and not brief)
+            change = change if verbose else re.sub(r"( helps, [^()]*) \(.*?\)\.", r"\1.", change)  # what was run
             say(f"          -> {these}{change}", "bold") if change else None
     advised = {one.change for some in found.answers.values() for one in some if one.verdict in ("no", "caution")}
     first = "Take one advice at a time, the uppermost first, and ask again after each.\n" * (len(advised) > 1)

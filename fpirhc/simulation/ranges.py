@@ -16,7 +16,7 @@ from fpirhc.horizon.cost import view_of
 from fpirhc.plant.motion import with_space
 from fpirhc.simulation.run import Run
 from fpirhc.status import STOPPED, Status
-from fpirhc.summary import in_percent, number, written_out
+from fpirhc.summary import in_percent, number
 from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import Latest
 from fpirhc.symbolic.layout import Layout
@@ -215,15 +215,3 @@ def misplaced(problem: Problem) -> list[str]:
                     f"the {what} of {name} is {worst}, outside its hard limits of {number(low)} and {number(high)}{unit}"
                 )
     return found
-
-
-def apart(problem: Problem) -> dict[str, float]:
-    """How many times the plant's value the model's is, of parameters that are apart by a power of ten or by sign."""
-    known = {n: p.approximate / p.exact for n, p in problem.plant.parameters.items() if p.exact and not p.outside}
-    return {n: ratio for n, ratio in known.items() if ratio and not 0.1 < ratio < 10 and problem.reality is None}
-
-
-def slip(problem: Problem) -> str:
-    """What parameters are apart, in words; '' where there is none."""
-    told = ", ".join(f"{name} is {written_out(ratio)} times the plant's" for name, ratio in apart(problem).items())
-    return f"In the model {told}: is it a slip of {'sign' if ' -' in told else 'units'}?" * bool(told)

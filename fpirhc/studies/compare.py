@@ -23,10 +23,11 @@ from fpirhc.plant.chain import response_names
 from fpirhc.plant.motion import SECONDS, with_space
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.problem_files.shipped import shipped_folders
+from fpirhc.review.experiments import slips
 from fpirhc.review.review import recommended_for
 from fpirhc.simulation.metrics import Metrics, columns, in_report, measure
 from fpirhc.simulation.metrics.shipped import sampled_spectrum
-from fpirhc.simulation.ranges import Followed, hard_limits, input_limits, limits_left, misplaced, slip
+from fpirhc.simulation.ranges import Followed, hard_limits, input_limits, limits_left, misplaced
 from fpirhc.simulation.replay import raw_measurements
 from fpirhc.simulation.run import Run
 from fpirhc.simulation.simulate import Simulator
@@ -58,7 +59,7 @@ def check_gains(task: Task, controllers: Mapping[str, Controller]) -> None:
             checked(task.problem, controller)
         except NotContractive as error:
             best = recommended_for(task.problem, controller)
-            more = " ".join(filter(None, (slip(task.problem), best)))
+            more = " ".join([*(change for _, change, _ in slips(task.problem)), *filter(None, [best])])
             owners.setdefault(f"{error}{more and f'. {more}'}", []).append(f"'{name}'")
         except FpirhcError:
             continue  # reported later, as the reason why the controller is skipped
@@ -262,7 +263,7 @@ def _causes(problem: Problem, entries: Sequence[Entry], yard: Yardstick) -> list
     """What the file itself says of loops that do not follow, or leave a limit."""
     placed = [f"{text[0].upper()}{text[1:]}." for text in misplaced(problem)]
     lost = any(not e.adaptive and not follows(e, yard) for e in entries)
-    return [*placed, *filter(None, [slip(problem) * lost])]
+    return [*placed, *(f"{told[0].upper()}{told[1:]}. {change}" for told, change, _ in slips(problem) if lost)]
 
 
 class _Rows:

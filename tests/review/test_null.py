@@ -48,14 +48,6 @@ def test_a_period_that_is_long_against_the_plant_fails():
     assert found.numbers["error_with"] > 5 * found.numbers["error_without"]
 
 
-def test_the_form_that_passes_passes():
-    """Equal to no adaptation to rounding. The wrong model is what the null test must not see."""
-    problem = drifting(exact=0.8 * POLE)
-    assert alone(problem, planned(fp.ModelReferenced(MAP))).verdict == "yes"
-    model = drifting()
-    assert rms(model, planned(fp.ModelReferenced(MAP))) == pytest.approx(rms(model, planned()), rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("late", "gain", "verdict"), [(0.0, -1.0, "yes"), (0.01, -0.298, "caution"), (0.01, -0.4, "no")]
 )

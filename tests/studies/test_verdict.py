@@ -226,7 +226,7 @@ def tank(**changes: Any) -> fp.Problem:
 def test_a_slip_of_units_is_named_where_the_model_follows_nothing():
     """In the verdict of what runs, and in the refusal of a gain that it makes too large."""
     slow, law = tank(start={"y": 0.5}).with_exact(np.array([5e-3])), fp.ComputedTorque(fp.Exponential(rate=2.0))
-    slip = "In the model rate is 1 000 times the plant's: is it a slip of units?"
+    slip = "In the model rate is 1 000 times the plant's. Mend rate of the model: is it a slip of units?"
     for problem, told in (slow, True), (tank(), False):
         assert fp.compare(tasks.made(problem, {"law": law}), seed=0, compiled=False).verdict[0].startswith(slip) == told
 
