@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidName, InvalidProblem, Mistakes
-from fpirhc.fields.user_code import scalar_expression
+from fpirhc.fields.user_code import place_of, scalar_expression
 from fpirhc.horizon.cost import Cost, Horizon, Linearisation, View, outputs_of, reads_feedforward, view_of
 from fpirhc.horizon.nominal import data_layout, hastened, nominal_motion, reference_state, stage_data
 from fpirhc.horizon.problem import OptimalControl, expand_along, input_curvature
@@ -79,7 +79,7 @@ def _transcribed(
     nodes = _nodes(plant, reference, horizon, table, (free, len(binding)), limits, start)
     bounds, (low, high) = limits.input_bounds(plant), limits.input_ends(plant)
     _check_finite_limits(stage, nodes)
-    _check_finite(stage, nodes)
+    _check_finite(plant, stage, nodes)
     functions: dict[object, ca.Function] = {}
     along = expand_along(stage.dynamics, stage.cost, stage.terminal_cost, nodes, functions)
     lower, upper = limits.state_bounds(plant)
@@ -349,7 +349,7 @@ def _check_finite_limits(stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.
     mistakes.raise_if_any()
 
 
-def _check_finite(stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+def _check_finite(plant: Plant, stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
     states, inputs, data = nodes
     values = stage.cost(states[:, 0], inputs[:, 0], data[:, 0])[1].full().ravel()
     final = float(stage.terminal_cost(states[:, -1], data[:, -1]))
@@ -362,6 +362,9 @@ def _check_finite(stage: _Stage, nodes: tuple[np.ndarray, np.ndarray, np.ndarray
                 hint = "; the end has no input, and input_before and feedforward only where a term of the stages reads them"
             if not np.isfinite(states).all():
                 hint = ": the states that would keep the outputs there grow without bound"
+            elif not np.isfinite(data[:, 0]).all():
+                at = ", ".join(map("{} = {:g}".format, plant.state.elements, states[:, 0]))
+                hint = f", {at}: no finite command keeps it there; look at roots and divisions in {place_of(plant.response)}"
             mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")
     mistakes.raise_if_any()
 

@@ -268,10 +268,7 @@ def _line_of(module: ModuleType | Path, name: str) -> str:
 
 @contextlib.contextmanager
 def _neighbours(path: Path) -> Iterator[None]:
-    """Let a file import the modules beside it, as a program can; libraries come first.
-
-    The modules are forgotten afterwards: another folder may have others of the same name.
-    """
+    """Let a file import the modules beside it after libraries; they are forgotten, as another folder has others of the name."""
     folder, before = str(path.resolve().parent), set(sys.modules)
     sys.path.append(folder)
     try:

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.errors import InvalidProblem, InvalidValue, Mistakes
-from fpirhc.fields.user_code import named_results, scalar_expression
+from fpirhc.fields.user_code import named_results, place_of, scalar_expression
 from fpirhc.horizon.cost import Cost, Horizon, view_of_symbols
 from fpirhc.horizon.transcription import check_names
 from fpirhc.plant.chain import differentiated_signals
@@ -195,7 +195,7 @@ def _check_inverse(problem: Problem, mistakes: Mistakes) -> None:
             name = plant.controlled_names[int(np.argmin(np.isfinite(free).ravel()))]
             mistakes.add(
                 f"the response of '{name}' ({which} parameters) is not finite at the start ({state}); "
-                "start elsewhere, or change what is divided by zero there"
+                f"start elsewhere, or mend a root or a division in {place_of(plant.response)}"
             )
         elif plant.equations.affine and np.linalg.matrix_rank(gain) < gain.shape[0]:
             weakest = int(np.argmin(np.linalg.norm(gain, axis=0)))

@@ -124,7 +124,7 @@ an input that is switched
 response that divides by zero
   ca.sin(q.angle) -> ca.sin(q.angle) / q.angle
     the response of 'angle' (approximate parameters) is not finite at the start (angle = 0, angle' = 0) ... start elsewhere, or
-    change what is divided by zero there
+    mend a root or a division in mine.py, line 7
 period of zero
   period=1e-2 -> period=0
     Problem.period: expected a number from 1e-12 to 1e12 in the plant's unit of time, got 0

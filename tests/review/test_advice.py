@@ -29,15 +29,12 @@ def law(gain: float, rate: float = 8.0) -> fp.ComputedTorque:
 
 
 NOISY = fp.Sensing({"q": fp.Sensor(noise=fp.Noise(3e-5))}, fp.SavitzkyGolay(window=21, degree=2))
-
-
-LATE = motor(0.7, dead_time=fp.DeadTime({"V": 0.01})), fp.Predicted(law(1.0), inputs=0.01)
 OWN = (
     (motor(), law(-9.0)),
     (motor(1.2), law(0.01)),
     (motor(0.7, sensing=NOISY), law(2.0)),
     (mass(), torque(-20.0)),
-    LATE,
+    (motor(0.7, dead_time=fp.DeadTime({"V": 0.01})), fp.Predicted(law(1.0), inputs=0.01)),
 )
 
 
@@ -192,6 +189,13 @@ def test_other_units_are_named_first_and_are_what_mends_a_loop_that_does_not_fol
     (key, first), *others = answers(problem, fp.ComputedTorque(fp.Exponential(6.0))).items()
     assert (key, first.evidence[: 4 + len(told)], first.change) == ("sizes", f"The {told}", change)
     assert dict(others)["follows"].change == change
+
+
+def test_a_response_without_a_value_on_the_reference_is_named_with_its_place():
+    plant = replace(heater().plant, response=lambda x, u, p: {"T": u.u - ca.sqrt(0.5 - x.T)})
+    plan = {"horizon": fp.Horizon(5, 0.1), "cost": fp.Quadratic({"T": 1.0}, deviation={"u": 1.0})}
+    [fits] = answers(replace(heater(), plant=plant, start={"T": 0.2}, **plan), plans()["RHC"]).values()
+    assert "T = 1: no finite command keeps it there; look at roots and divisions in test_advice.py, line" in fits.change
 
 
 def test_a_forgotten_estimator_is_told():
