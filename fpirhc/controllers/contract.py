@@ -166,10 +166,9 @@ class Controller(Checked, ABC):
     @property
     def planner(self) -> Planner | None:
         """How it plans, by its fields `optimiser`, `cost`, `tracking`, `consistent` and `room`; None without an optimiser."""
-        names = ("optimiser", "cost", "tracking", "consistent", "room")
-        optimiser, cost, law, consistent, room = (getattr(self, name, None) for name in names)
-        if optimiser is None:  # plans along a target are none along the problem's reference
+        if (optimiser := getattr(self, "optimiser", None)) is None:  # plans along a target are none along the problem's reference
             return None if self.inner is None or self.deforms == "target" else self.inner.planner
+        cost, law, consistent, room = (getattr(self, n, None) for n in ("cost", "tracking", "consistent", "room"))
         return Planner(optimiser, cost, law, law is not None or consistent, self.deformation.adapts, room is not None)
 
     @final

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
 
-from fpirhc.fields.checked import Checked, replaced
+from fpirhc.fields.checked import Checked
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
 from fpirhc.symbolic.expression import Signals, power
@@ -57,7 +58,9 @@ class Tracking(Checked, ABC):
 
 def bounded(law: Tracking, largest: Sequence[float]) -> Tracking:
     """Return the law with the largest response of every controlled coordinate in its field `largest`, where that is empty."""
-    return law if getattr(law, "largest", True) else replaced(law, "largest", tuple(largest)) or law
+    if not getattr(law, "largest", True):
+        vars(law := copy(law))["largest"] = tuple(largest)  # unchecked: a number of it may be open
+    return law
 
 
 def decay_gains(rate: float, order: int) -> tuple[float, ...]:
