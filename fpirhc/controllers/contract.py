@@ -166,7 +166,7 @@ class Controller(Checked, ABC):
     @property
     def planner(self) -> Planner | None:
         """How it plans, by its fields `optimiser`, `cost`, `tracking`, `consistent` and `room`; None without an optimiser."""
-        if (optimiser := getattr(self, "optimiser", None)) is None:  # plans along a target are none along the problem's reference
+        if (optimiser := getattr(self, "optimiser", None)) is None:  # plans along a target are none along the reference
             return None if self.inner is None or self.deforms == "target" else self.inner.planner
         cost, law, consistent, room = (getattr(self, n, None) for n in ("cost", "tracking", "consistent", "room"))
         return Planner(optimiser, cost, law, law is not None or consistent, self.deformation.adapts, room is not None)
