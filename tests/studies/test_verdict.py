@@ -24,6 +24,7 @@ SENT = {
     "ramp": lambda size, t: size * t / (PERIOD * CYCLES),
     "steady": lambda size, t: 3 + size * t,
     "zigzag": lambda size, t: size * ca.cos(math.pi * t / PERIOD),
+    "waves": lambda size, t: 0.5 * ca.cos(size * math.pi * (t - 0.5) / 3.5),  # so many ways in the cycles that count
     "full": lambda size, t: LIMIT * ca.if_else(t < size * PERIOD * CYCLES, 1.0, 0.5),
 }
 
@@ -138,6 +139,8 @@ FLAGS: dict[str, tuple[Facts, Facts, str, str]] = {
     "both swing": (*SWINGS(2.0), "doubtful", "Both commands swing: on average each is 20 % of its limits' range off"),
     "both swing little": (*SWINGS(0.4), "better", "none"),
     "chatter": (Facts(), Facts(0.1, sends="zigzag", size=0.0131), "doubtful", "it chatters, see fpirhc review"),
+    "chatter of 10 ways": (Facts(), Facts(0.1, sends="waves", size=10.4), "doubtful", "varies 11.8 times as much as"),
+    "9 ways": (Facts(), Facts(0.1, sends="waves", size=9.4), "better", "variation of its command is 10.7 times"),
     "moves once, far": (Facts(size=0.1), Facts(0.1, size=1.2), "better", "variation of its command is 12 times"),
     "moves twice": (Facts(), Facts(0.1, size=2.2), "better", "variation of its command is 2.2 times"),
     "moves a bit more": (Facts(), Facts(0.1, size=1.9), "better", "none"),
