@@ -84,7 +84,7 @@ from .simulation.simulate import simulator as simulator
 from .simulation.stepper import Stepper as Stepper
 from .status import Status as Status
 from .studies.compare import compare as compare
-from .studies.limits import limits as limits
+from .studies.margins import margins as margins
 from .studies.open_loop import certify as certify
 from .studies.study import study as study
 from .studies.tune import tune as tune

@@ -162,12 +162,12 @@ def run(
     "study two_mass --draws 100 --mismatch 20%        exact parameters within 20 % of the problem's",
     "study anaesthesia --cases all --metric in_band",
     "study two_mass --over deformation.gain=-2:-0.1:40 exact.m1=0.5:2:9:log -c RHC+FPI",
-    "study two_mass --limits latency noise            up to where each controller fails",
+    "study two_mass --margins latency noise            up to where each controller fails",
 )
 def study(
     problem: opt.Problem, cases: opt.Cases = None, draws: Annotated[int | None, opt.Count] = None,
     over: Annotated[list[str] | None, given("PATH=LOW:HIGH:COUNT[:log] ...", "sweep one or two settings")] = None,
-    limits: Annotated[list[str] | None, given("WORD ...", "what grows: mismatch, plants, latency, noise, lost")] = None,
+    margins: Annotated[list[str] | None, given("WORD ...", "what grows: mismatch, plants, latency, noise, lost")] = None,
     mismatch: opt.Mismatch = 0.0, controllers: opt.Controllers = None,
     metric: Annotated[str | None, given("NAME", "number by which runs are compared [default: the error]")] = None,
     processes: Annotated[int | None, given("N", "number of processes [default: one per core]", min=1)] = None,
@@ -175,35 +175,35 @@ def study(
     verbose: opt.Verbose = False,
 ) -> None:  # fmt: skip
     """Run controllers in many variants of a problem. Variants are named cases, drawn plants, or swept settings; or one quantity
-    grows until each controller fails (--limits).
+    grows until each controller fails (--margins).
 
     Every controller is compared with the first one, or with the first of the file's headline. study.csv has every run and its
     parameters; the same command goes on after an interruption.
     """
     if mismatch and not draws:
         raise typer.BadParameter("--mismatch is of drawn plants: give --draws N too")
-    if sum(map(bool, (cases, draws, over, limits))) != 1:
-        raise typer.BadParameter("give one of --cases, --draws, --over, --limits")
-    if limits and (metric or (processes or 1) > 1):
-        raise typer.BadParameter("--limits takes the error, run by run: leave out --metric and --processes")
+    if sum(map(bool, (cases, draws, over, margins))) != 1:
+        raise typer.BadParameter("give one of --cases, --draws, --over, --margins")
+    if margins and (metric or (processes or 1) > 1):
+        raise typer.BadParameter("--margins takes the error, run by run: leave out --metric and --processes")
     task = _task(problem)
     from fpirhc.studies.compare import select
-    from fpirhc.studies.limits import limits as find_limits
+    from fpirhc.studies.margins import margins as find_margins
     from fpirhc.studies.study import figure_of
     from fpirhc.studies.study import study as run_study
     from fpirhc.studies.variants import CasesOf, Draws, Grid, Variants
     from fpirhc.summary import write_csv
 
     select(task, controllers)
-    folder = opt.folder_of(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "limits")
+    folder = opt.folder_of(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "margins")
     from fpirhc.report.html import render_charted
     from fpirhc.report.terminal import progress_bars
 
     with progress_bars() as progress:
         facts: dict[str, Any] = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
         facts["progress"] = progress
-        if limits:
-            result: Any = find_limits(task, over=limits, seed=seed, folder=folder, **facts)
+        if margins:
+            result: Any = find_margins(task, over=margins, seed=seed, folder=folder, **facts)
             page = render_charted(result.view)
         else:
             named: Variants = Draws(draws, mismatch, seed) if draws else CasesOf(tuple(cases or ()), seed)

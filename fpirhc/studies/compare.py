@@ -331,7 +331,7 @@ def _without_noise(task: Task, pair: tuple[str, str] | None) -> list[Finding]:
         return []
     shown = {*problem.sensing.measures(problem.plant)} - {n for n, one in problem.sensing.sensors.items() if one.acts}
     file = task.name if any(folder in task.path.parents for folder in shipped_folders()) else str(task.path)
-    words = shlex.join(["fpirhc", "study", file, "--limits", "noise", "-c", *pair])
+    words = shlex.join(["fpirhc", "study", file, "--margins", "noise", "-c", *pair])
     text = f"{pair[1]} measures its response without noise; what noise costs: {words}"
     return [Finding(text)] if {*response_names(problem.plant)} <= shown else []
 

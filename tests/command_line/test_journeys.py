@@ -125,7 +125,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (None, "study line.py --draws 3 --mismatch 20% --no-compile --out twice", 0, "A mass on a line"),
         (None, "study line.py --draws 3 --mismatch 30% --no-compile --out twice", 3, "fpirhc: "),
         (None, "study line.py --over tracking.rate=2:6:3 exact.k=1:9:2:log -c CTC --no-compile", 0, "A mass on a line"),
-        (None, "study line.py --limits latency --processes 1 -c CTC --no-compile", 0, "A mass on a line"),
+        (None, "study line.py --margins latency --processes 1 -c CTC --no-compile", 0, "A mass on a line"),
         (WITH_CASES, "study line.py --cases soft --no-compile --json", 0, "{"),
         (None, "run line.py CTC --case soft --no-compile", 0, ""),
         (None, "run line.py CTC --case sof --no-compile", 2, "fpirhc: "),

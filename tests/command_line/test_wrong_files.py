@@ -271,7 +271,7 @@ compare mine.py --seed abc => '--seed' ... expected integer
 compare mine.py two_mass => unexpected extra argument ... two_mass
 compare mine.py --controllers RHC,RHC+FPI => controller 'RHC,RHC+FPI' is unknown ... names are separated by spaces, without commas
 study mine.py --draws 2 --mismatch x => expected percent of at least 0, such as 20%, got 'x'
-study mine.py --limits noise --mismatch 20 => --mismatch is of drawn plants: give --draws N too
+study mine.py --margins noise --mismatch 20 => --mismatch is of drawn plants: give --draws N too
 review mine.py --mismatch 120% => mismatch 120 %: use at least 0 % and less than 100 %, where no parameter changes its sign
 run mine.py fpi => controller 'fpi' is unknown. Did you mean 'RHC+FPI'?
 run mine.py RHC+FPI --set gain=-2 => has no 'gain'. Did you mean 'optimiser.map.gain' or 'deformation.map.gain'?

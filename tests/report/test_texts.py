@@ -36,7 +36,7 @@ COMMANDS = {
     "review": "review line.py --verbose",
     "noisy": "review noisy.py --verbose -c CTC+FPI",
     "study": "study line.py --draws 6 --mismatch 20% --no-compile -c CTC CTC+FPI",
-    "limits": "study line.py --limits lost --no-compile -c CTC",
+    "margins": "study line.py --margins lost --no-compile -c CTC",
 }
 OF_A_MACHINE = (
     (r"took [\d.e+-]+ s", "took S s"),

@@ -177,14 +177,14 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_goes_on(task, proces
 def test_limits_that_were_found_are_not_searched_again(task):
     """An interruption between two of them costs the one that was searched."""
     facts = {"over": ["mismatch", "lost"], "controllers": ["CTC", "CTC+FPI"], "compiled": False}
-    whole = fp.limits(task, **facts, folder=Path("whole"))
+    whole = fp.margins(task, **facts, folder=Path("whole"))
 
     def interrupt(name: str, done: int, of: int) -> None:
         if name == "CTC+FPI" and done < of:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fp.limits(task, **facts, folder=Path("out"), progress=interrupt)
-    assert len(kept("out/limits.jsonl")) == 1 + 3
-    pd.testing.assert_frame_equal(fp.limits(task, **facts, folder=Path("out")).table, whole.table)
-    assert kept("out/limits.jsonl") == kept("whole/limits.jsonl")
+        fp.margins(task, **facts, folder=Path("out"), progress=interrupt)
+    assert len(kept("out/margins.jsonl")) == 1 + 3
+    pd.testing.assert_frame_equal(fp.margins(task, **facts, folder=Path("out")).table, whole.table)
+    assert kept("out/margins.jsonl") == kept("whole/margins.jsonl")

@@ -340,7 +340,7 @@ def test_the_cost_can_be_judged():
         ("--over deformation.gain=-1:-0.2:3 exact.b=1:2:2", 18, []),
         ("--over exact.b=1:2:3:log", 9, ["log"]),
         ("--over deformation.gain=-1:-0.2:3:log exact.b=1:2:3", 27, ["symlog"] * 3),
-        ("--limits mismatch lost", 6, []),
+        ("--margins mismatch lost", 6, []),
     ],
 )
 def test_the_command_writes_a_page_and_a_table(words, count, scales, task, capsys, monkeypatch):

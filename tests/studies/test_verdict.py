@@ -367,7 +367,7 @@ def test_a_response_without_noise_is_told_and_how_to_see_what_noise_costs():
     noisy = replace(one.problem, sensing=fp.Sensing({"q''": fp.Sensor(noise=fp.Noise(0.1))}))
     for problem, told in (one.problem, 1), (noisy, 0):
         said = " ".join(fp.compare(replace(one, problem=problem), seed=0, controllers=[*one.headline]).verdict)
-        assert said.count(f"without noise; what noise costs: fpirhc study {one.name} --limits noise -c RHC") == told
+        assert said.count(f"without noise; what noise costs: fpirhc study {one.name} --margins noise -c RHC") == told
 
 
 def test_the_time_of_a_cycle_is_the_median_beside_the_longest(monkeypatch):

@@ -128,8 +128,8 @@ QUANTITIES: Mapping[str, tuple[Callable[[Problem, int], Quantity], str]] = {  # 
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Limits(Study):
-    """The result of `limits`.
+class Margins(Study):
+    """The result of `margins`.
 
     Args:
         table: a row per controller and quantity: unit, holds (NaN where the problem as it stands fails), error (largest relative
@@ -166,7 +166,7 @@ class Limits(Study):
                 borne.setdefault(row.quantity, [*self.beats[row.quantity]]).append(f"{row.controller} fails {where}")
         grows = " ".join(f"{name.capitalize()}: {QUANTITIES[name][1]}." for name in dict.fromkeys(self.table.quantity))
         about = (
-            f"One quantity grows until a run fails; its limit is found to 5 %. {grows} A run fails if it ends early, leaves a "
+            f"One quantity grows until a run fails; the margin is found to 5 %. {grows} A run fails if it ends early, leaves a "
             f"hard limit by {in_percent(_OUTSIDE)} of its range, or has an error above {in_percent(self.fails)} of the "
             "reference's range. What holds may have a large error. A controller beats its partner where its error is a tenth "
             "smaller, and its command neither chatters nor stands at limits."
@@ -178,13 +178,13 @@ class Limits(Study):
             for value in values:
                 errors = (Objective().text(tried[value]["error"]) for tried in known.values())
                 tables[-1].add([written_out(times * value), *errors])
-        facts = {"limits": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
+        facts = {"margins": self.table.to_dict("records"), "fails": self.fails, "versions": self.versions}
         sentences = [(f"{q.capitalize()}: {'; '.join(some)}.", None) for q, some in borne.items()]
         return View(self, sentences, about, tables, facts)
 
 
 @checked_call
-def limits(
+def margins(
     task: Task,
     *,
     over: Sequence[str] | None = None,
@@ -195,7 +195,7 @@ def limits(
     folder: Path | None = None,
     command: str = "",
     progress: Progress | None = None,
-) -> Limits:
+) -> Margins:
     """Return for every controller how much it bears, to 5 %, and what fails there.
 
         mismatch    f: exact = approximate (exact / approximate)^f of all parameters; 1 is the problem's own.
@@ -209,7 +209,7 @@ def limits(
         fails: relative error from which a run has failed.
         seed: of noise, lost samples and plants, the same in all runs.
         compiled: whether loops run as compiled C.
-        folder: of finished limits, which the same call does not search again.
+        folder: of finished margins, which the same call does not search again.
         command: that reproduces it.
         progress: called with (controller, quantities done, in all).
 
@@ -222,8 +222,8 @@ def limits(
     for name in [one for one in wanted if one not in QUANTITIES]:
         raise InvalidName(f"quantity '{name}' is unknown.{nearest(name, QUANTITIES)}")
     metrics = [*(m for m in task.metrics if m.name in _MEASURED), Metric("outside", _outside)]
-    header = header_of(replace(task, controllers=chosen), {"kind": "limits", "fails": fails, "seed": seed}, metrics)
-    with Kept(folder and folder / "limits.jsonl", header) as kept:
+    header = header_of(replace(task, controllers=chosen), {"kind": "margins", "fails": fails, "seed": seed}, metrics)
+    with Kept(folder and folder / "margins.jsonl", header) as kept:
         rows = {(row["controller"], row["quantity"]): row for row in kept.rows}
         for name in chosen:
             runner = Runner(task, name, metrics, compiled=compiled)
@@ -238,7 +238,7 @@ def limits(
     table = pd.DataFrame([rows[name, what] for name in chosen for what in wanted])
     pairs = [(name, plain) for name in chosen if (plain := pair_of(chosen, name)) not in (None, name)]
     told = {what: [_beats(task.problem, pair, rows[pair[0], what], tried[what]) for pair in pairs] for what in wanted}
-    return Limits(table=table, fails=fails, tried=tried, beats=told, **circumstances(task, chosen, command, begin))
+    return Margins(table=table, fails=fails, tried=tried, beats=told, **circumstances(task, chosen, command, begin))
 
 
 def _beats(problem: Problem, pair: tuple[str, str], row: Row, tried: Mapping[str, Mapping[float, Row]]) -> str:

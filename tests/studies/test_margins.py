@@ -32,7 +32,7 @@ ADAPTIVE = LAW.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.8)))
 
 def found(quantity: str, problem: fp.Problem, controller: Controller = LAW, **more: Any) -> Any:
     task = tasks.made(problem, {"law": controller})
-    return fp.limits(task, over=[quantity], compiled=False, **more)
+    return fp.margins(task, over=[quantity], compiled=False, **more)
 
 
 def limit_of(quantity: str, problem: fp.Problem, controller: Controller = LAW, **more: Any) -> Any:
@@ -49,7 +49,7 @@ def near(one: Any, value: float, share: float = 0.03) -> bool:
 def test_quantities_that_are_asked_together_have_the_limits_of_each_alone(order):
     problem = pump(duration=8.0, measure_from=2.0)
     task = tasks.made(problem, {"law": LAW})
-    together = fp.limits(task, over=order, compiled=False).table.fails
+    together = fp.margins(task, over=order, compiled=False).table.fails
     assert [*together] == [limit_of(one, problem).fails for one in order]
 
 
@@ -143,7 +143,7 @@ def test_what_each_bears_is_told():
     """Beside what fails up to where adaptation is better: a comparison with the same noise says so too."""
     wave = fp.Trajectory(lambda t: {"y": ca.sin(t)})
     task = tasks.made(pump(1.2, reference=wave, duration=40.0, measure_from=10.0), {"law": LAW, "law+FPI": ADAPTIVE})
-    one = fp.limits(task, over=["noise"], compiled=False)
+    one = fp.margins(task, over=["noise"], compiled=False)
     each = "; ".join(f"{r.controller} fails at {100 * r.fails:.3g} % of the range" for r in one.table.itertuples())
     [(text, _)] = one.view.sentences
     assert text.startswith("Noise: law+FPI beats law up to ")
