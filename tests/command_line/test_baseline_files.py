@@ -20,9 +20,8 @@ PLANNED = """measure_from=0.1, limits=fp.Limits(inputs={"u": (-25.0, 25.0)}), ho
 SIGMOID = "fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)"
 PLANS = f'controllers["RHC+FPI"] = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), {SIGMOID})\n'
 LINE = line_text(f"{SHORT}, {PLANNED}", SIGMOID, more=PLANS)
-NOISY = line_text(
-    f"{SHORT}, disturbances={{'u': fp.Noise(0.5), 'y': fp.Noise(2.0)}}", more='del controllers["CTC+FPI"]\n'
-)
+NOISE = "disturbances={'u': fp.Noise(0.5), 'y': fp.Noise(2.0)}"
+NOISY = line_text(f"{SHORT}, {NOISE}", more='del controllers["CTC+FPI"]\n')
 NOISY = NOISY.replace("ca.sin(2 * t)", "0 * t").replace('"y": 0.5', '"y": 0.0')
 TWO = NOISY.replace("controllers = ", "controllers: dict = ")
 PROBLEMS = {"line": LINE, "noisy": NOISY}
@@ -115,9 +114,8 @@ def test_a_damaged_file_is_no_baseline(text, folder, capsys):
 
 def test_one_controller_is_checked_alone_and_small_changes_can_be_ignored(folder):
     task = fp.load_problem(folder / "line.py")
-    changed(
-        folder / "baselines/line.json", lambda f: f["controllers"]["CTC"]["metrics"].update({"rms_error.y": [9.0, 0.0]})
-    )
+    path, other = folder / "baselines/line.json", {"rms_error.y": [9.0, 0.0]}
+    changed(path, lambda f: f["controllers"]["CTC"]["metrics"].update(other))
     assert fp.check(task, controllers=["CTC+FPI"], compiled=False).holds
     assert list(fp.check(task, compiled=False).changed.metric) == ["rms_error.y"]
     assert fp.check(task, ignore=0.999, compiled=False).holds

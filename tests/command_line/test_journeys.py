@@ -65,9 +65,8 @@ def recorded() -> None:
 TIGHT = edited('"u": (-30.0, 30.0)}', '"u": (-1.0, 1.0)}, states={"y": (0.8, 1.0)}')
 WEAK = edited("measure_from", 'limits=fp.Limits(inputs={"u": (-0.01, 0.01)}), measure_from')
 DIVERGING = edited("- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.5001 - q.y)")
-TUNABLE = edited(
-    "controllers = {", 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}\ncontrollers = {'
-)
+SPANS = 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}'
+TUNABLE = edited("controllers = {", f"{SPANS}\ncontrollers = {{")
 PLAN = "fp.FixedPoint(iterations=1, tolerance=1e-3)"
 IPOPT = '    "IPOPT": fp.RecedingHorizon(fp.Ipopt(tolerance=1e-6)),\n'
 PRECISE = edited(f"{PLAN}),\n", f"fp.FixedPoint(tolerance=1e-6)),\n{IPOPT}")
