@@ -70,7 +70,7 @@ def compare(
     folder = opt.folder_of(out, task.name, *["part"] * bool(controllers or set_))
     with progress_bars() as progress:
         result = run(task, seed=seed, controllers=named, compiled=not no_compile, command=_line(), progress=progress)
-    announce_backend(entry.run for entry in result.entries)
+    announce_backend(entry.run.settings["why not compiled"] for entry in result.entries)
     _publish(result.view, render(result), folder, json, verbose)
     interrupted = any(why.startswith("interrupted") for why in result.skipped.values())
     entries = len(result.entries)
@@ -151,7 +151,7 @@ def run(
     found.save(files[0])
     with writing(folder, "--out"):
         found.plot().savefig(files[1], dpi=120)
-    announce_backend([found])
+    announce_backend([found.settings["why not compiled"]])
     since = f"{task.problem.measure_from:g} {task.problem.time_unit}"
     say(task.title, "bold", f" {controller}: errors from t = {since} on, seed {seed}.")
     show_run(found, measure(task.problem, found, task.metrics), files)
@@ -187,6 +187,7 @@ def study(
     if margins and (metric or (processes or 1) > 1):
         raise typer.BadParameter("--margins takes the error, run by run: leave out --metric and --processes")
     task = _task(problem)
+    from fpirhc.simulation.simulate import SWITCHED_OFF
     from fpirhc.studies.compare import select
     from fpirhc.studies.margins import margins as find_margins
     from fpirhc.studies.study import figure_of
@@ -197,8 +198,10 @@ def study(
     select(task, controllers)
     folder = opt.folder_of(out, task.name, "draws" if draws else "cases" if cases else "over" if over else "margins")
     from fpirhc.report.html import render_charted
-    from fpirhc.report.terminal import progress_bars
+    from fpirhc.report.terminal import announce_backend, progress_bars
+    from fpirhc.symbolic.native import find_compiler, why_no_compiler
 
+    announce_backend([SWITCHED_OFF if no_compile else "" if find_compiler() else why_no_compiler()])
     with progress_bars() as progress:
         facts: dict[str, Any] = {"controllers": controllers, "compiled": not no_compile, "command": _line()}
         facts["progress"] = progress

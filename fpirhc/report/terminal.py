@@ -171,14 +171,9 @@ def _grid(table: Table, part: Sequence[int]) -> Grid:
 @contextmanager
 def progress_bars() -> Iterator[Report]:
     """Yield a function (name, done, total) that shows bars on standard error; or, without a terminal, lines."""
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f}"),
-        TimeElapsedColumn(),
-        TextColumn("to go"),
-        TimeRemainingColumn(),
-    )
+    words = "{task.description}", "{task.completed:.0f} of {task.total:.0f}", "to go"
+    named, counts, to_go = (TextColumn(text, markup=False) for text in words)
+    columns = named, BarColumn(), counts, TimeElapsedColumn(), to_go, TimeRemainingColumn()
     out, told, known, begin = Console(stderr=True), dict[str, float](), dict[str, TaskID](), time.monotonic()
     bars = Progress(*columns, console=out, transient=True)
 
@@ -205,12 +200,11 @@ def progress_bars() -> Iterator[Report]:
             bars.stop()
 
 
-def announce_backend(runs: Iterable[Run]) -> None:
-    """Print on standard error why loops of a command ran without compiled C, where they did."""
-    reasons = {str(run.settings["why not compiled"]) for run in runs if not run.compiled}
-    for reason in sorted(reasons):
+def announce_backend(reasons: Iterable[object]) -> None:
+    """Print on standard error why loops of a command run without compiled C; an empty reason is that of one that does not."""
+    for reason in sorted({str(one) for one in reasons if one}):
         why = "--no-compile was given" if reason == SWITCHED_OFF else reason
-        print(f"fpirhc: loops ran in CasADi's virtual machine, more slowly, because {why}", file=sys.stderr)
+        print(f"fpirhc: loops run in CasADi's virtual machine, more slowly, because {why}", file=sys.stderr)
 
 
 def show_run(run: Run, metrics: Metrics, saved: Sequence[Path]) -> None:
