@@ -447,7 +447,7 @@ QUESTIONS = (
              "weight speed"),
     Question("inner", "Are the zero dynamics stable?", _inner, "the largest real part is {rate_with_outputs_held} 1/{time}",
              "States without a task go off: weigh them in the cost, or control another output."),
-    Question("noise", "Is the chatter from noise small?", _noise, "noise changes {of} by {rms_step:%} of its motion from cycle to "
+    Question("noise", "Is the movement from noise small?", _noise, "noise changes {of} by {rms_step:%} of its motion from cycle to "
              "cycle| its total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with "
              "less noise.", "model gain filter estimator rate weight"),
     Question("model", "Would it do little harm if the model were right?", _model, "then, without noise, the rms error of {of} is "
