@@ -22,6 +22,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table as Grid
 from rich.text import Text
 
+from fpirhc.errors import listed
 from fpirhc.simulation.metrics import columns
 from fpirhc.simulation.simulate import SWITCHED_OFF
 from fpirhc.status import Status
@@ -97,7 +98,7 @@ def show_brief(table: Table, console: Console | None = None) -> None:
         alike, in_words = len(by_text) == 1 < len(table.rows), table.columns[k].left and table.names == 1
         if alike or in_words:  # one name tells a row from others
             most = max(by_text, key=lambda text: len(by_text[text]))
-            apart = [f"{table.columns[k].head} of {', '.join(n)}: {t}" for t, n in by_text.items() if t != most]
+            apart = [f"{table.columns[k].head} of {listed(n)}: {t}" for t, n in by_text.items() if t != most]
             below += [*apart, f"{table.columns[k].head}{' of the others' * bool(apart)}: {most or '-'}"]
         elif len(_parts(table.of([*range(table.names), *kept, k]), width)) == 1:
             kept.append(k)

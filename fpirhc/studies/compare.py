@@ -132,9 +132,7 @@ class Comparison(Study):
     def findings(self) -> tuple[Finding, ...]:
         """What the file says, the headline pair, then the others, the best row, and what was not run."""
         task, yard = self.task, self._yard
-        aim = objective(task.headline_metric, task.metrics, task.problem)
-        causes = _causes(task.problem, self.entries, yard)
-        found = findings(self.entries, task.headline, yard, self.skipped, aim, causes)
+        found = findings(self.entries, task, yard, self.skipped, _causes(task.problem, self.entries, yard))
         return (*found, *_without_noise(task, found[0].pair))
 
     @cached_property

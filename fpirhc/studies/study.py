@@ -81,11 +81,10 @@ class VariantStudy(Study):
         shown = Table(title, [*map(Column, heads), Column("better in", None)])  # the verdict has it
         text, apart = self.figure.text, self.figure.difference
         for row in _rows(summary):
-            between = "" if math.isnan(row.low) else apart(row.low, row.high)
-            difference = "" if math.isnan(row.difference) else apart(row.difference)
             better = f"{row.better} of {row.variants}" if row.controller != first else ""
-            numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median), difference, between]
-            moved = [written_out(float(summary[name][row.controller])) for name in medians]
+            numbers = [text(row.worst), row.worst_in, str(row.failures), text(row.median)]
+            numbers += [apart(row.difference), apart(row.low, row.high)]
+            moved = [written_out(v) if math.isfinite(v := summary[name][row.controller]) else "" for name in medians]
             shown.add([row.controller, *numbers, *moved, better])
         return shown.filled
 
@@ -126,8 +125,10 @@ def study(
     named, known = table.loc[table.group != ""], known_metrics()
     also = tuple(one.name for one in task.metrics if one.main and one not in known)
     groups = {str(g): summarised(some, aim, also) for g, some in named.groupby("group", sort=False)}
-    facts = {**circumstances(task, chosen, command, begin), "chatter": _chatter(table, task)}
-    facts["places"] = tuple(task.controllers)
+    facts = circumstances(task, chosen, command, begin) | {
+        "chatter": _chatter(table, task),
+        "places": (*task.controllers,),
+    }
     summary = summarised(table, aim, also)
     return VariantStudy(table=table, summary=summary, groups=groups, figure=aim, variants=variants, **facts)
 
@@ -223,7 +224,9 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
             number, place = aim.text(good[aim.column].iloc[best]), good.variant.iloc[best]
             yield f"{name}: the {most} {aim.column} is {number}, at {place}.", None
     failed = result.table.loc[result.table.outcome != "finished"].groupby("controller").first()
-    why = {r.controller: f" The first, {r.variant}: {r.outcome}{r.why and ': '}{r.why}" for r in _rows(failed)}
+    why = {
+        r.controller: f" The first is variant {r.variant}: {r.outcome}{r.why and ': '}{r.why}" for r in _rows(failed)
+    }
     calm = [row.controller for row in _rows(summary) if not row.failures]
     for row in _rows(summary):
         low, high = share_interval(row.failures, row.variants)

@@ -27,6 +27,7 @@ from fpirhc.symbolic.expression import TINY
 from fpirhc.task.problem import Problem
 
 if TYPE_CHECKING:
+    from fpirhc.problem_files.problem_file import Task
     from fpirhc.studies.compare import Entry
 
 
@@ -65,9 +66,11 @@ class Objective:
         return in_percent(value) if self.metric is None else self.metric.text(value) + self._unit
 
     def difference(self, *values: float) -> str:
-        """Return a difference of two numbers, or the ends of its interval, as text."""
+        """Return a difference of two numbers, or the ends of its interval, as text; infinite: one of the two runs is lost."""
         times, unit = (100, " points") if self.metric is None else (1, self._unit)
-        return " to ".join(f"{'+' * (v > 0)}{written_out(times * v)}" for v in values) + unit
+        lost = {self.sign * math.inf: "lost", -self.sign * math.inf: "other lost"}
+        said = (lost.get(v, f"{'+' * (v > 0)}{written_out(times * v)}") for v in values if not math.isnan(v))
+        return " to ".join(dict.fromkeys(said)) + unit * math.isfinite(values[-1])
 
     @property
     def _unit(self) -> str:
@@ -406,17 +409,12 @@ def leaves(entries: Sequence[Entry]) -> str:
 
 
 def findings(
-    entries: Sequence[Entry],
-    headline: tuple[str, str] | None,
-    yard: Yardstick,
-    skipped: Mapping[str, str],
-    aim: Objective,
-    causes: Sequence[str],
+    entries: Sequence[Entry], task: Task, yard: Yardstick, skipped: Mapping[str, str], causes: Sequence[str]
 ) -> tuple[Finding, ...]:
     """Return the verdict: what the file says, the headline pair, then the others, the best row, and what was not run."""
-    by_name = {e.name: e for e in entries}
+    by_name, aim = {e.name: e for e in entries}, objective(task.headline_metric, task.metrics, task.problem)
     pairs = [(by_name[e.pair], e) for e in entries if e.pair in by_name]
-    pairs.sort(key=lambda p: ((p[0].name, p[1].name) != headline, "solve" not in p[1].run.layout))
+    pairs.sort(key=lambda p: ((p[0].name, p[1].name) != task.headline, "solve" not in p[1].run.layout))
     judged = [judge_by(aim, *pair) for pair in pairs] if aim.metric is not None else []
     judged += [judge(*pair, yard) for pair in pairs]
     if not judged:
