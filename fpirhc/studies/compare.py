@@ -190,7 +190,7 @@ class Comparison(Study):
     def _status(self, entry: Entry) -> str:
         """What speaks against a run; 'ok' where nothing does."""
         if stop := entry.run.stop:  # the first sentence may state the reason, above the table
-            said = ["ended early" if stop in self.findings[0].text else f"ended early: {stop}"]
+            said = ["ended early" if stop in self.findings[0].text else f"ended early: {stop.partition(';')[0]}"]
         else:
             said = ["does not follow"] * (entry.name in self.lost) + [status_shares(entry.metrics.statuses)]
         said += [f"late {in_percent(late)}" for late in entry.cycle[3:] if late]
