@@ -235,7 +235,7 @@ def _gains(case: Case) -> Fact:
     steps = BUSY * max(CALM, case.bench.back.steps)
     lost = [gain for gain, run in runs.items() if run.left > 1 or run.steps > steps]
     least, most = (1.0 if gain in lost else gain for gain in runs)
-    says = f"with {' and '.join(map(str, lost))} times their gain a push grows or the command chatters" * bool(lost)
+    says = f"with {' and '.join(map(str, lost))} times their gain a push grows or the movement doubles" * bool(lost)
     return Fact(Verdict.CAUTION if lost else Verdict.YES, {"most": most, "least": least}, says=says)
 
 

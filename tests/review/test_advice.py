@@ -254,6 +254,12 @@ def test_the_worked_review_of_the_page_is_what_the_command_prints(tmp_path: Path
     assert counts == (2, 0, 7, 1)
 
 
+def test_a_review_ends_where_a_gain_mends_another_row_than_its_own():
+    seen, late = fp.Sensing({"q''": fp.Sensor(fp.Noise(0.3))}), fp.DeadTime({"u": 0.01})
+    found = answers(mass(period=5e-3, sensing=seen, dead_time=late, measure_from=2.0), torque(-0.1))
+    assert ["None of the changes" in found[key].change for key in ("gain", "model")] == [True, False]
+
+
 def test_rows_of_one_controller_agree_on_its_gain():
     """By itself one row would lower the gain and another leave adaptation out, which mends both."""
     plan = {"horizon": fp.Horizon(15, 2e-2), "cost": fp.Quadratic({"q": 1e2, "q'": 1.0}, deviation={"u": 1e-2})}

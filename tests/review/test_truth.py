@@ -121,11 +121,6 @@ CASES: dict[str, Case] = {
         {("it", "model"): "no"},
         changes={("it", "model"): "Set deformation.gain to -0.0625."},
     ),
-    "an inverse with two branches": Case(
-        foreign("cstr", "RHC", "RHC+FPI"),
-        {("RHC", "follows"): "yes", ("RHC", "returns"): "yes", ("RHC+FPI", "model"): "no", ("RHC+FPI", "pays"): "no"},
-        never=("problem", "RHC"),
-    ),
     "the published iteration of two masses": Case(
         shipped("two_mass", "CTC", CTC6),
         {("CTC", "follows"): "no", (CTC6, "returns"): "yes", (CTC6, "pays"): "yes", (CTC6, "gain"): "yes"},
@@ -205,7 +200,7 @@ def said(name: str) -> dict[tuple[str, str], Any]:
     return {(about, a.key): a for about, some in found.items() for a in some}
 
 
-LONG = "a map", "a servo", "an own", "an inv", "a limit of", "a dead"  # 4 s and more
+LONG = "a map", "a servo", "an own", "a limit of", "a dead"  # 4 s and more
 
 
 def kept(name: str, rows: dict[str, list[Any]]) -> dict[str, list[Any]]:
