@@ -12,7 +12,7 @@ from abc import ABCMeta
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from functools import cache, cached_property, wraps
+from functools import cache, cached_property, partial, wraps
 from importlib import import_module
 from typing import Any, ClassVar, NoReturn, ParamSpec, TypeVar, cast, get_origin
 
@@ -21,7 +21,7 @@ import casadi as ca
 from fpirhc.errors import InvalidField, InvalidName, NotSupported, nearest
 from fpirhc.fields.kinds import ANYTHING, SHORT, Expected, accepts, call_of, described, expected_by
 from fpirhc.fields.user_code import users_place
-from fpirhc.symbolic.open import closed, opened
+from fpirhc.symbolic.open import closed, made
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -32,19 +32,7 @@ class _CheckedWhenCalled(ABCMeta):
     """Classes whose calls check the arguments before anything is made of them."""
 
     def __call__(cls, *arguments: object, **named: object) -> object:
-        given = {**dict(zip(_arguments_of(cls).positional, arguments, strict=False)), **named}
-        if (numbers := closed(given)) is not given and is_dataclass(cls):
-            value = opened(cls(**numbers), given)
-            find_by_name(value)
-            return value
-        mistakes = _abstract(cls) if inspect.isabstract(cls) else tuple(_arguments_of(cls).mistakes(arguments, named))
-        if not mistakes:
-            value = type.__call__(cls, *arguments, **named)
-            mistakes = tuple(value._lacks())
-        if mistakes:
-            raise InvalidField(mistakes, users_place())
-        find_by_name(value)
-        return value
+        return found_by_name(made(partial(_checked, cls), _arguments_of(cls).positional, *arguments, **named))
 
     @property
     def __signature__(cls) -> inspect.Signature:
@@ -74,8 +62,7 @@ class fact(cached_property[Value]):
     """A property that is found once, and from the numbers with which the value was checked."""
 
     def __get__(self, value: Any, owner: type | None = None) -> Any:
-        checked = closed(value)
-        return super().__get__(value, owner) if checked is value else getattr(checked, cast(str, self.attrname))
+        return super().__get__(closed(value), owner)
 
 
 class Inner:
@@ -91,6 +78,17 @@ class Inner:
         found = next((one for one in held if isinstance(one, self._contract)), None)
         vars(value)[self._name] = found  # values are frozen, so it is looked for once
         return found
+
+
+def _checked(cls: Any, /, *arguments: object, **named: object) -> object:
+    """Return a value of a class, or raise all mistakes in its arguments together."""
+    mistakes = _abstract(cls) if inspect.isabstract(cls) else tuple(_arguments_of(cls).mistakes(arguments, named))
+    if not mistakes:
+        value = type.__call__(cls, *arguments, **named)
+        mistakes = tuple(value._lacks())
+    if mistakes:
+        raise InvalidField(mistakes, users_place())
+    return value
 
 
 def _abstract(cls: type) -> tuple[str, ...]:
@@ -283,12 +281,13 @@ class FoundByName:
     """Base of dataclasses whose dictionaries are found by name."""
 
     def __post_init__(self) -> None:
-        find_by_name(self)
+        found_by_name(self)
 
 
-def find_by_name(value: object) -> None:
-    """Let every dictionary in a public attribute of a frozen value be found by name, and stay as it is."""
+def found_by_name(value: Value) -> Value:
+    """Return a frozen value, in which every dictionary in a public attribute is now found by name, and stays as it is."""
     frozen = is_dataclass(value) and getattr(value, "__dataclass_params__").frozen  # noqa: B009
     for name, content in list(vars(value).items()) if frozen else ():
         if type(content) is dict and not name.startswith("_") and all(isinstance(key, str) for key in content):
             object.__setattr__(value, name, Fixed(content, f"{type(value).__name__}.{name}"))
+    return value

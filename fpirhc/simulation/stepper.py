@@ -30,15 +30,15 @@ from fpirhc.simulation.step_arguments import (
 )
 from fpirhc.simulation.trials import warn_of_harm
 from fpirhc.status import Status
-from fpirhc.symbolic.block import Composite, open_settings
+from fpirhc.symbolic.block import Composite
 from fpirhc.symbolic.evaluate import unwrapped
 from fpirhc.symbolic.layout import Layout
 from fpirhc.symbolic.native import native
+from fpirhc.symbolic.open import settings_among
 from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _TRUTHS = (bool, np.bool_)
-
 _NOT_SOLVED = "the compiled solver failed"
 
 
@@ -353,7 +353,7 @@ class Stepper(Checked):
     @property
     def settings(self) -> Layout:
         """The vector of the live settings among `reads`, 'settings'; an element is a path."""
-        return Layout(open_settings(self._composite.blocks))
+        return Layout(settings_among([self._composite.reads]))
 
     def bounds(self) -> dict[str, Interval]:
         """Return for each live setting the interval of the numbers that a device without Python may accept, by path.

@@ -17,7 +17,7 @@ import casadi as ca
 from fpirhc.errors import InvalidName, InvalidValue, nearest
 from fpirhc.symbolic.expression import Expression, Matrix, Signals, Value, kind
 from fpirhc.symbolic.layout import Layout, Signal
-from fpirhc.symbolic.open import SETTINGS, with_settings
+from fpirhc.symbolic.open import settings_among, with_settings
 
 Step = Callable[[Signals], Mapping[str, Value]]
 PREFIX = "fpirhc_"  # keeps generated C names away from those of libc
@@ -74,16 +74,9 @@ class Block:
                 raise InvalidValue(f"block '{self.name}' gives '{key}' with {value.numel()} entries, expected {size}")
             is_column = value.is_dense() and value.is_column()  # not built anew, which costs more than most operations
             results.append(value if is_column else ca.densify(value.reshape((value.numel(), 1))))
-        keys = list(self._results)
-        name, columns = PREFIX + self.name, list(symbols.values())
-        function = ca.Function(name, columns, results, list(symbols), keys, {"allow_free": True})
-        if not function.has_free():
-            return function, self.reads
-        results, column, signal = with_settings(self.name, results)
-        inputs = self.reads if signal.name in self.reads else self.reads + Layout((signal,))
-        names = [*inputs.names, *self.memory.names]
-        columns = [column if n == signal.name else symbols[n] for n in names]
-        return ca.Function(name, columns, results, names, keys), inputs
+        name, columns, free = PREFIX + self.name, list(symbols.values()), {"allow_free": True}
+        function = ca.Function(name, columns, results, list(symbols), list(self._results), free)
+        return with_settings(function, self.reads, symbols, results)
 
     @cached_property
     def _results(self) -> dict[str, Signal]:
@@ -166,11 +159,12 @@ def compose(
     `constants` are remembered as they were in the first cycle, and with them the settings that are open in the blocks. Without
     constants the step reads these settings.
     """
-    kept = (*constants, *open_settings(blocks)) if constants else ()
+    settings = settings_among(block.inputs for block in blocks)
+    kept = (*constants, *settings) if constants else ()
     delays = (*delays, *(Delay(signal, signal.name) for signal in kept))
     memory = Layout((*[d.now for d in delays], *[s for b in blocks for s in b.memory.signals]))
     held = {*reads.names, *memory.names}
-    reads = Layout((*reads.signals, *[s for s in open_settings(blocks) if s.name not in held]))
+    reads = Layout((*reads.signals, *[s for s in settings if s.name not in held]))
     _require_wired(reads, memory, blocks, delays)
     trace = Layout(tuple([s for b in blocks for s in b.writes.signals if not s.name.startswith("_")]))
     return Composite(name, tuple(blocks), delays, reads, memory, trace, tuple(outputs))
@@ -203,11 +197,6 @@ def call(block: Block, known: dict[str, Matrix], next_memory: dict[str, Matrix])
         known[name] = results[name]
     for m in block.memory.names:
         next_memory[m] = results[f"{m}_next"]
-
-
-def open_settings(blocks: Sequence[Block]) -> tuple[Signal, ...]:
-    """Return the signal of the settings, where some blocks read it."""
-    return tuple({s.name: s for b in blocks for s in b.inputs.signals if s.name == SETTINGS}.values())
 
 
 def fed(block: Block, name: str, source: Signal) -> Block:

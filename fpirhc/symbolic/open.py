@@ -10,14 +10,14 @@ a symbol: where a build does, it is refused by its path and the place.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 
 from fpirhc.errors import InvalidName, NotSupported
 from fpirhc.symbolic.dotted import copied
-from fpirhc.symbolic.layout import Expression, Signal
+from fpirhc.symbolic.layout import Expression, Layout, Signal
 
 ANEW = "state it in the problem or the controller, and build a loop for each number"  # what to do instead
 SETTINGS = "settings"  # the signal of all open numbers of a loop
@@ -47,17 +47,29 @@ def open_in(*expressions: Expression) -> list[ca.SX]:
     return [s for s in ca.symvar(ca.veccat(*expressions)) if _key(s) in _OPEN]
 
 
-def with_settings(block: str, results: Sequence[Expression]) -> tuple[list[Expression], Expression, Signal]:
-    """Return results of a block with open symbols as functions of one column, that column, and its signal."""
+def with_settings(
+    function: ca.Function, reads: Layout, symbols: Mapping[str, Any], results: list[Any]
+) -> tuple[ca.Function, Layout]:
+    """Return the function of a block and what it reads, with the vector of the settings where results have open symbols."""
+    if not function.has_free():
+        return function, reads
     found = open_in(*results)
     if not found:
-        raise InvalidName(f"block '{block}' uses symbols that it does not read")
+        raise InvalidName(f"block '{function.name().partition('_')[2]}' uses symbols that it does not read")
     opened = _OPEN[_key(found[0])]
     opened.read |= {s.name() for s in found}
-    if isinstance(found[0], ca.SX):
-        return list(results), ca.vertcat(*opened.symbols.values()), opened.signal
-    column = ca.MX.sym(SETTINGS, len(opened.numbers))
-    return ca.graph_substitute(list(results), list(opened.graph.values()), ca.vertsplit(column)), column, opened.signal
+    column: Any = ca.vertcat(*opened.symbols.values())
+    if isinstance(found[0], ca.MX):
+        column = ca.MX.sym(SETTINGS, len(opened.numbers))
+        results = ca.graph_substitute(results, list(opened.graph.values()), ca.vertsplit(column))
+    inputs = reads if SETTINGS in reads else reads + Layout((opened.signal,))
+    columns = {**dict.fromkeys(inputs.names), **symbols, SETTINGS: column}
+    return ca.Function(function.name(), [*columns.values()], results, [*columns], function.name_out()), inputs
+
+
+def settings_among(inputs: Iterable[Layout]) -> tuple[Signal, ...]:
+    """Return the signal of the settings, where some of these have it."""
+    return tuple({s.name: s for layout in inputs for s in layout.signals if s.name == SETTINGS}.values())
 
 
 def is_open(value: object) -> bool:
@@ -96,9 +108,14 @@ def closed(value: Any) -> Any:
     return changed if isinstance(value, Mapping) else type(value)([*changed.values()])
 
 
-def opened(value: object, given: Mapping[str, object]) -> object:
-    """Return a frozen value with what is given in place of fields that have open numbers; the value itself is its closed one."""
-    other = copied(value, {name: one for name, one in given.items() if closed(one) is not one})
+def made(make: Callable[..., Any], names: Sequence[str], /, *arguments: object, **named: object) -> Any:
+    """Return the frozen value that `make` gives; one with open numbers by way of the closed one. `names` are of arguments."""
+    given = {**dict(zip(names, arguments, strict=False)), **named}
+    numbers = closed(given)
+    if numbers is given:
+        return make(*arguments, **named)
+    value = make(**numbers)
+    other = copied(value, {name: one for name, one in given.items() if numbers[name] is not one})
     object.__setattr__(other, _CLOSED, value)
     return other
 
