@@ -10,6 +10,7 @@ import base64
 import hashlib
 import html
 import json
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,12 +30,11 @@ from fpirhc.simulation.loop import start_memory
 from fpirhc.simulation.ranges import Ranges
 from fpirhc.simulation.replay import needs_driver
 from fpirhc.simulation.run import judged_motion
-from fpirhc.simulation.simulate import Simulator, simulator
+from fpirhc.simulation.simulate import Simulator
 from fpirhc.simulation.tables import run_tables
 from fpirhc.simulation.trials import warn_of_harm
-from fpirhc.symbolic.dotted import changed_at, paths_to
+from fpirhc.symbolic.dotted import changed_at
 from fpirhc.symbolic.driver import SIGNATURE
-from fpirhc.task.cases import unit_of_setting
 from fpirhc.task.problem import Problem
 from fpirhc.whole_file import write_whole
 
@@ -47,7 +47,7 @@ class LabLoop:
     """A closed loop that a page runs."""
 
     name: str  # of the controller
-    ready: Simulator  # the loop with its live settings
+    ready: Simulator
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -130,35 +130,16 @@ def write_lab(task: Task, file: str, controllers: dict[str, Controller], path: P
     loops = []
     for name, controller in controllers.items():
         warn_of_harm(problem, controller)
-        loops.append(LabLoop(name, _with_live(problem, controller)))
+        loops.append(LabLoop(name, Simulator.adjustable(problem, controller)))
     write_whole(_page(task, file, loops), path, "lab")
-
-
-def _with_live(problem: Problem, controller: Controller) -> Simulator:
-    """The loop with those of its gains and the limits of its inputs that it can keep open."""
-    wanted = [path for path in paths_to("gain", controller) if not path.startswith("optimiser.")]
-    ends = ((name, k, end) for name, pair in problem.limits.inputs.items() for k, end in enumerate(pair))
-    wanted += [f"limits.inputs.{name}.{k}" for name, k, end in ends if np.isfinite(end)]
-    ready, opened = simulator(problem, controller, compiled=False), list[str]()
-    for path in wanted:
-        try:
-            ready = simulator(problem, controller, compiled=False, live=[*opened, path])
-            opened.append(path)
-        except FpirhcError:
-            continue
-    return ready
 
 
 def _sliders(problem: Problem, loops: list[LabLoop]) -> list[dict[str, Any]]:
     """Numbers to be moved: path, unit, the number of the build, its range, and its places in the memory of every loop."""
-    found = []
-    for path in dict.fromkeys(path for loop in loops for path in loop.ready.live.paths):
-        columns = [loop.ready.loop.memory.columns for loop in loops]
-        places = [[own.index(f"settings.{path}")] if f"settings.{path}" in own else [] for own in columns]
-        live = next(loop.ready.live for loop in loops if path in loop.ready.live.paths)
-        value = live.start[path]
-        ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *live.bounds[path]).tolist()
-        found.append((path, unit_of_setting(path, problem), value, *ends, places))
+    found, rows = [], [loop.ready.numbers for loop in loops]
+    for path, (unit, value, bounds, _) in ChainMap(*rows).items():
+        ends = np.clip(sorted((value / _SPAN, value * _SPAN)), *bounds).tolist()
+        found.append((path, unit, value, *ends, [own.get(path, ())[-1:] for own in rows]))
     for name, parameter in problem.plant.parameters.items():
         for side, value in (("exact", parameter.exact), ("approximate", parameter.approximate)):
             other = changed_at(problem, f"plant.parameters.{name}.{side}", value * (1 + 2**-10))
@@ -222,7 +203,7 @@ def _loop_data(loop: LabLoop) -> dict[str, Any]:
         "every": loop.every,
         "shown": len(loop.shown),
         "errors": len(loop.ready.loop.trace[loop.error].columns),
-        "live": list(loop.ready.live.paths),
+        "live": list(loop.ready.numbers),
     }
 
 

@@ -103,13 +103,13 @@ class Dropped:
         """Find the columns that the step behind the gate writes."""
         traces: list[Layout] = [block.inside.trace for block in loop.blocks if block.inside is not None]
         names = {name for trace in traces for name in trace.names} & set(loop.trace.names)
-        self._own = np.zeros(loop.trace.size, dtype=bool)
+        self._own, self._columns = np.zeros(loop.trace.size, dtype=bool), loop.trace.columns
         for name in names - {STOPPED}:
             self._own[loop.trace.slice(name)] = True
         self._status = loop.trace.slice("status").start if "status" in names else None
 
-    def first_bad(self, rows: np.ndarray, before: np.ndarray | None) -> tuple[int, int] | None:
-        """Return row and column of the first value that ends a run; None where there is none.
+    def first_bad(self, rows: np.ndarray, before: np.ndarray | None) -> tuple[int, str] | None:
+        """Return row and signal of the first value that ends a run, in words; None where there is none.
 
         What is not finite in dropped steps gets the value of the row before, in place.
 
@@ -128,7 +128,8 @@ class Dropped:
                 last = rows[k - 1] if k else before
                 row[bad] = 0.0 if last is None else last[bad]
             elif dropped or bad.any():
-                return k, int(np.argmax(bad) if bad.any() else np.argmax(np.abs(row)))
+                worst = np.argmax(bad) if bad.any() else np.argmax(np.abs(row))
+                return k, f"signal '{self._columns[worst]}' is not finite"
         return None
 
 

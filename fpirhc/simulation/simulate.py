@@ -7,6 +7,7 @@ is entered once per chunk: for disturbances and noise, to check that all signals
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self, TypeAlias
@@ -17,6 +18,7 @@ from fpirhc.controllers.base import Controller
 from fpirhc.controllers.contract import innermost, name_in_task, plant_model
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
+from fpirhc.errors import FpirhcError
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.simulation.loop import closed_loop, plans_exactly, start_memory
@@ -27,9 +29,11 @@ from fpirhc.simulation.run import Run, with_common_columns
 from fpirhc.simulation.step_arguments import Setpoints, set_point_record
 from fpirhc.simulation.tables import run_tables
 from fpirhc.symbolic.block import Composite
+from fpirhc.symbolic.dotted import paths_to
 from fpirhc.symbolic.evaluate import Evaluator, Latest
 from fpirhc.symbolic.native import Native, native
 from fpirhc.symbolic.program import chained
+from fpirhc.task.limits import Interval
 from fpirhc.task.problem import Problem
 
 _DESCRIBED: Latest[object] = Latest(16)
@@ -72,6 +76,24 @@ class Simulator:
         """Return the loop of problem and controller, compiled when it first runs; arguments and errors as in `simulator`."""
         settings = live_settings(problem, controller, live)
         return cls(problem, settings, settings.composed(closed_loop, any_gain=any_gain), compiled)
+
+    @classmethod
+    def adjustable(cls, problem: Problem, controller: Controller) -> Self:
+        """Return a loop in which gains and finite limits of inputs are live, those that can be so together; it is not compiled."""
+        paths = [path for path in paths_to("gain", controller) if not path.startswith("optimiser.")]
+        ends = ((name, k, end) for name, pair in problem.limits.inputs.items() for k, end in enumerate(pair))
+        paths += [f"limits.inputs.{name}.{k}" for name, k, end in ends if np.isfinite(end)]
+        ready = cls.of(problem, controller, False)
+        for path in paths:
+            with suppress(FpirhcError):
+                ready = cls.of(problem, controller, False, [*ready.live.paths, path])
+        return ready
+
+    @cached_property
+    def numbers(self) -> dict[str, tuple[str, float, Interval, int]]:
+        """Unit, number of the build, bounds, and place in the first memory of each live setting, by path."""
+        live, units, places = self.live, self.loop.memory.units, self.live.places(self.loop.memory).tolist()
+        return {p: (units[k], live.start[p], live.bounds[p], k) for p, k in zip(live.paths, places, strict=True)}
 
     @property
     def controller(self) -> Controller:
@@ -269,15 +291,9 @@ def run_cycles(
                 words = f"a solver failed ({why})" + (f" within {count} cycles, at the earliest" if count > 1 else "")
                 return log[:at].copy(), stopped(problem, at, words)
             rows = log[at:end]
-            bad = dropped.first_bad(rows, log[at - 1] if at else None)
+            bad = dropped.first_bad(rows, log[at - 1] if at else None) or ranges.first_outside(rows)
             if bad is not None:
-                row, column = bad
-                return log[: at + row].copy(), stopped(
-                    problem, at + row, f"signal '{trace.columns[column]}' is not finite"
-                )
-            outside = ranges.first_outside(rows)
-            if outside is not None:
-                row, what = outside
+                row, what = bad
                 return log[: at + row].copy(), stopped(problem, at + row, what)
             memory[:] = after
             ended = mover.after(end - 1, sent)

@@ -102,14 +102,14 @@ function remember() {
   const numbers = among((p) => sides.test(p)).map(([p, v]) => [p.replace(sides, "plant.parameters.$2.$1"), v]);
   const settings = among((p) => !sides.test(p));
   // Each loop as it was built for this page, and a run of it with other numbers; a controller that is built with them has another first
-  // plan. A change of a device leaves the plan.
+  // plan.
   const texts = DATA.loops.map((loop) => {
     const own = settings.filter(([p]) => loop.live.includes(p));
     const built = `task.problem, task.controllers[${JSON.stringify(loop.name)}]`;
     if (!numbers.length && !own.length) return [`print(fp.simulate(${built}, seed=0))`];
     const live = own.length ? `, live=${JSON.stringify(own.map(([p]) => p))}` : "";
     const variant = numbers.length ? `, variant=fp.with_settings(task.problem, ${listed(numbers)})` : "";
-    const given = own.length ? `, changes={0.0: ${listed(own)}}` : "";
+    const given = own.length ? `, settings=${listed(own)}` : "";
     return [`loop = fp.simulator(${built}${live})`, `print(loop.run(seed=0${variant}${given}))`];
   });
   const lines = ["import fpirhc as fp", "", `task = fp.load_problem(${JSON.stringify(DATA.file)})`, ...texts.flat()];
