@@ -31,6 +31,7 @@ from fpirhc.studies.compare import select
 from fpirhc.studies.variants import Variant, Variants
 from fpirhc.studies.verdict import left_alone, ranges, relative
 from fpirhc.summary import in_units
+from fpirhc.symbolic.evaluate import Latest
 from fpirhc.task.cases import as_declared, unit_of_setting
 from fpirhc.task.problem import Problem
 
@@ -47,7 +48,7 @@ class Runner:
     def __init__(self, task: Task, name: str, metrics: Sequence[Metric], *, compiled: bool | None) -> None:
         self._task, self._name, self._controller = task, name, task.controllers[name]
         self._metrics, self._compiled = metrics, compiled
-        self._loops: dict[object, Simulator | FpirhcError] = {}
+        self._loops = Latest[Simulator | FpirhcError](_LOOPS)
         self._ranges, self._held = ranges(task.problem)
 
     def rows(self, variants: Iterable[Variant]) -> Iterator[Row]:
@@ -100,13 +101,7 @@ class Runner:
 
     def _built(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:
         key = one.build, tuple(own) if live else tuple(own.items())
-        ready = self._loops.pop(key, None)
-        if ready is None:
-            if len(self._loops) >= _LOOPS:
-                self._loops.pop(next(iter(self._loops)))
-            ready = self._composed(one, own, live=live)
-        self._loops[key] = ready
-        return ready
+        return self._loops.of((), key, lambda: self._composed(one, own, live=live))
 
     def _composed(self, one: Variant, own: Mapping[str, float], *, live: bool) -> Simulator | FpirhcError:
         base, controller, paths = one.built or one.problem, self._controller, tuple(own) if live else ()
