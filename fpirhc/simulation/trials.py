@@ -183,16 +183,9 @@ def behind_actuators(plant: Plant, lags: Sequence[float]) -> Plant:
 
     vars(response)["__signature__"] = inspect.signature(plant.response)
     order = dict(zip(plant.names, plant.orders, strict=True)) | dict.fromkeys(acting.values(), 1)
-    positions = {acting[name]: plant.inputs[name] for name in taus}
+    every = {**plant.coordinates, **{acting[name]: plant.inputs[name] for name in taus}}
     # An input reaches the controlled quantities one derivative later, so they are those of the model and not its own.
-    return replace(
-        plant,
-        coordinates={**plant.coordinates, **positions},
-        response=response,
-        order=order,
-        controlled=None,
-        inverse=None,
-    )
+    return replace(plant, coordinates=every, response=response, order=order, controlled=None, inverse=None)
 
 
 def _free(name: str, plant: Plant) -> str:
@@ -268,14 +261,8 @@ class ErrorPair:
 
 def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | None = None) -> ErrorPair:
     """Return the errors of two runs, without adaptation and with it, from `measure_from` on; of some coordinates, or of all."""
-    before, after = (
-        {
-            name: value if math.isfinite(value) else math.inf
-            for name, value in rms_error(problem, run).items()
-            if names is None or name in names
-        }
-        for run in runs
-    )
+    every = ({n: v for n, v in rms_error(problem, run).items() if names is None or n in names} for run in runs)
+    before, after = ({n: v if math.isfinite(v) else math.inf for n, v in one.items()} for one in every)
     stuck = float(np.min([at_limit(problem, run) for run in runs]))  # NaN where one of them is
     return ErrorPair(before, after, _ranges(problem, runs[0]), problem.plant.followed, stuck)
 

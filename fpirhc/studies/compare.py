@@ -193,7 +193,7 @@ class Comparison(Study):
             said = ["ended early" if stop in self.findings[0].text else f"ended early: {stop.partition(';')[0]}"]
         else:
             said = ["does not follow"] * (entry.name in self.lost) + [status_shares(entry.metrics.statuses)]
-        said += [f"late {in_percent(late)}" for late in entry.cycle[3:] if late]
+        said += [f"late {in_percent(late)}" for late in entry.cycle[3:] if late > LATE]
         said += [f"leaves {', '.join(one.name for one in entry.left)}"] * bool(entry.left)
         return ", ".join(filter(None, said)) or "ok"
 
@@ -335,6 +335,7 @@ def _without_noise(task: Task, pair: tuple[str, str] | None) -> list[Finding]:
 
 
 REPLAYED = 2000  # cycles of a run that are stepped again, one by one
+LATE = 0.01  # of the cycles, up to which they are late by the operating system and the clock
 CLOCK = "A cycle is a call of the controller, from measurement to command: the median, what 99 % take at most, and the longest."
 
 

@@ -28,6 +28,7 @@ from fpirhc.summary import Column, Table, in_percent, written_out
 _TAIL, _MOVES = 0.025, "total_variation."  # on either side of an interval; the metric of movement
 _ABREAST, _EVEN = 2, 1e-6  # panels of a picture; by how much equal steps of an axis differ
 _CLEAR = {Outcome.BETTER: "is better than", Outcome.WORSE: "is worse than", Outcome.DOUBTFUL: "doubtfully beats"}
+_CLEAR[Outcome.MIXED] = "has mixed results beside"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,10 +126,8 @@ def study(
     named, known = table.loc[table.group != ""], known_metrics()
     also = tuple(one.name for one in task.metrics if one.main and one not in known)
     groups = {str(g): summarised(some, aim, also) for g, some in named.groupby("group", sort=False)}
-    facts = circumstances(task, chosen, command, begin) | {
-        "chatter": _chatter(table, task),
-        "places": (*task.controllers,),
-    }
+    facts = circumstances(task, chosen, command, begin)
+    facts |= {"chatter": _chatter(table, task), "places": (*task.controllers,)}
     summary = summarised(table, aim, also)
     return VariantStudy(table=table, summary=summary, groups=groups, figure=aim, variants=variants, **facts)
 
@@ -210,9 +209,13 @@ def _sentences(result: VariantStudy) -> Iterator[tuple[str, Outcome | None]]:
         medians = f"the median is {aim.text(row.median)}, with {summary.index[0]} {aim.text(summary['median'].iloc[0])}"
         share = f"in {row.better} of {row.variants} variants; {medians}.{''.join(_moved(result, row.controller))}"
         ends = sorted((aim.sign * row.low, aim.sign * row.high))
+        more = row.failures > (failures := summary.failures.iloc[0])
         better = Outcome.DOUBTFUL if row.controller in result.chatter else Outcome.BETTER
+        better = Outcome.MIXED if more else better
         clear = better if ends[1] < 0 else Outcome.WORSE if ends[0] > 0 else Outcome.NO_DIFFERENCE
-        said = f"{_CLEAR.get(clear, 'is not clearly different from')} {summary.index[0]}: its {aim.column} is {than}"
+        fails = f"it fails in {row.failures} variants, {summary.index[0]} in {failures}; " * (clear is Outcome.MIXED)
+        what = f"{_CLEAR.get(clear, 'is not clearly different from')} {summary.index[0]}"
+        said = f"{what}: {fails}its {aim.column} is {than}"
         if few := math.isnan(row.low):  # for an interval
             said = f"has a {than} {aim.column} than {summary.index[0]}"
         yield f"{row.controller} {said} {share}", None if few else clear
@@ -317,9 +320,6 @@ def figure_of(result: VariantStudy) -> Any:
 def _scale(set_scale: Callable[..., None], values: Sequence[float]) -> None:
     """Make an axis of a grid logarithmic where its values have equal ratios, and neither equal steps nor different signs."""
     sizes, more = np.abs(values), {} if min(values) > 0 else {"linthresh": min(map(abs, values)) or 1.0}
-    if (
-        len(values) > 2
-        and values[0] * values[-1] > 0
-        and np.ptp(np.diff(np.log(sizes))) < _EVEN < np.ptp(np.diff(sizes))
-    ):
+    one_sign = len(values) > 2 and values[0] * values[-1] > 0
+    if one_sign and np.ptp(np.diff(np.log(sizes))) < _EVEN < np.ptp(np.diff(sizes)):
         set_scale("symlog" if more else "log", **more)

@@ -82,9 +82,8 @@ class Objective:
             return math.inf
         if self.metric is not None and self.column not in row:
             names = [name for name in row if name.partition(".")[0] == self.metric.name]
-            raise InvalidName(
-                f"metric '{self.column}': a run of '{row['controller']}' has none.{nearest(self.column, names) if names else ''}"
-            )
+            close = nearest(self.column, names) if names else ""
+            raise InvalidName(f"metric '{self.column}': a run of '{row['controller']}' has none.{close}")
         value = self.sign * float(row[self.column])
         return value if math.isfinite(value) else math.inf
 
@@ -151,6 +150,7 @@ class Finding:
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
 STILL = 1e-5  # of the limits' range, or of the rms command, in a cycle: what moves less stands still
 WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own range: chatter
+UNSOLVED = 0.05  # of the plans
 AT_LIMITS = 0.2  # of the cycles: a command that is at a limit more often
 SWING = 0.05  # of the limits' range: as a sine from end to end in 11 cycles, or jumps between the ends every 10
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
@@ -288,11 +288,20 @@ def _at(pair: Pair) -> str:
     return f"its {'rate' if rate else 'value'} ({name}: {number(ends[0][k])} to {number(ends[1][k])}{unit})"
 
 
-def _null(pair: Pair) -> float:
-    """How many times as large it makes the error of a right model, where the null test fails."""
+def _unsolved(entry: Entry) -> float:
+    return entry.metrics["status"][Status.NOT_CONVERGED.name] / entry.run.cycles
+
+
+def _null(pair: Pair, *, lost: bool = False) -> float:
+    """How many times as large it makes the error of a right model, where the null test fails; 1 where it is `lost`."""
     null = pair.adaptive.null
-    fails = null is not None and not null.stuck and null.fails(pair.plain.errors)
-    return null.ratio(null.worst) if null is not None and fails else math.nan
+    if null is None or null.stuck or not null.fails(pair.plain.errors):
+        return math.nan
+    beyond = any(null.adapted[n] > PENALTY * pair.yard.scales[n] for n in null.adapted)
+    return math.nan if beyond != lost else 1.0 if lost else null.ratio(null.worst)
+
+
+_diverges = partial(_null, lost=True)
 
 
 @dataclass(frozen=True)
@@ -306,10 +315,11 @@ class Flag:
 
 
 NULL = "its own model as the plant, the problem's sensors and no disturbances"
-FLAGS = (
+_HARMS = f"with {NULL} its rms error is {{value}} times that without adaptation"
+FLAGS = (  # of rows with one measure the first that is raised
     Flag(_left_alone, 1.0, "it is no better than doing nothing: its rms error is {value:%} of that with commands held", True),
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
-    Flag(lambda pair: pair.adaptive.metrics["status"][Status.NOT_CONVERGED.name] / pair.adaptive.run.cycles, 0.05,
+    Flag(lambda pair: _unsolved(pair.adaptive), UNSOLVED,
          "{value:%} of its plans did not converge: give the optimiser more iterations", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], AT_LIMITS,
          "its command is at a limit of {at}, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
@@ -321,16 +331,18 @@ FLAGS = (
          "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
     Flag(_misfit, 1.0, "its measured contraction factor is {value}, though errors fall: noise, friction, rounding or a limit is in "
          "the fit, too"),
-    Flag(_null, 0.0, f"with {NULL} its rms error is {{value}} times that without adaptation"),
+    Flag(_diverges, 0.0, f"with {NULL} it diverges", True),
+    Flag(_null, 10.0, _HARMS, True),
+    Flag(_null, 0.0, _HARMS),
 )  # fmt: skip
 
 
 def flags_of(pair: Pair) -> list[tuple[Flag, str]]:
     """Return the flags that are raised for a pair, each with its sentence."""
     every, before = [(flag, flag.measure(pair)) for flag in FLAGS], pair.plain.metrics["at_limit"][""]
-    raised = [(f, in_words(f.text, {"value": v, "before": before}, {}, at=_at(pair))) for f, v in every if v > f.least]
-    wild = any(flag.measure is _chatters for flag, _ in raised)
-    return [one for one in raised if not (wild and one[0].measure is _moved)]
+    said = [(f, in_words(f.text, {"value": v, "before": before}, {}, at=_at(pair))) for f, v in every if v > f.least]
+    raised = {one[0].measure: one for one in reversed(said)}
+    return [one for what, one in reversed(raised.items()) if what is not _moved or _chatters not in raised]
 
 
 def by_reason(reasons: Mapping[str, str]) -> dict[str, list[str]]:
@@ -380,11 +392,9 @@ def _of_lost(lost: Collection[str], adaptive: Entry) -> Outcome:
 
 def judge_by(aim: Objective, plain: Entry, adaptive: Entry) -> Finding:
     """Return what adaptation does to the number that the problem is judged by."""
-    names, metric = (plain.name, adaptive.name), aim.metric
+    names, metric, both = (plain.name, adaptive.name), aim.metric, (plain, adaptive)
     assert metric is not None
-    before, after = (
-        math.nan if e.run.stop else float(e.metrics[metric.name].get(aim.element, math.nan)) for e in (plain, adaptive)
-    )
+    before, after = (math.nan if e.run.stop else float(e.metrics[metric.name].get(aim.element, math.nan)) for e in both)
     lost = [n for n, v in zip(names, (before, after), strict=True) if not math.isfinite(v)]
     if lost:
         return Finding(f"{' and '.join(lost)}: no {aim.column}.", _of_lost(lost, adaptive), names)
@@ -447,13 +457,14 @@ def _remarks(entries: Sequence[Entry], pairs: Sequence[tuple[Entry, Entry]], yar
     fair = {e.name: rows[e.name] for e in entries if not e.exact and math.isfinite(rows.get(e.name, math.inf))}
     if fair:
         least, best = min((v, n) for n, v in fair.items())
-        above = "" if any(follows(e, yard) for e in entries) else "No controller follows; fpirhc review says why. "
-        among = " with the wrong model" * any(e.exact for e in entries)
-        yield f"{above}Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
+        among, some = " with the wrong model" * any(e.exact for e in entries), any(follows(e, yard) for e in entries)
+        text = f"Smallest rms error{among}: {best}, {in_percent(least)} of the range of the reference ({yard.span})."
+        yield text if some else "No controller follows; fpirhc review says why."
     for exact in (e for e in entries if e.exact):
         beaten = [n for n, v in fair.items() if v < HELPS * rows.get(exact.name, math.inf)]
         if beaten and any(follows(e, yard) for e in entries):
-            yield f"{exact.name} is no lower bound: errors are smaller with {', '.join(beaten)}."
+            why = f"{in_percent(_unsolved(exact))} of its plans did not converge, and " * (_unsolved(exact) > UNSOLVED)
+            yield f"{exact.name} is no lower bound: {why}errors are smaller with {', '.join(beaten)}."
     for entry in entries:
         if entry.run.stop is None and entry.name not in {e.name for pair in pairs for e in pair}:
             lost = [n for n in entry.errors if yard.beyond(entry, n)]

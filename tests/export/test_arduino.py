@@ -24,18 +24,8 @@ def test_an_arduino_library_replays_in_float(tmp_path):
     (tmp_path / "main.c").write_text((tmp_path / "c" / "main.c").read_text())  # apart from the header in double
     files = [*src.glob("*.c"), tmp_path / "type.c", tmp_path / "main.c"]
     program = tmp_path / "replay"
-    command = [
-        COMPILERS[0],
-        *STRICT,
-        "-O2",
-        "-ffp-contract=off",
-        f"-I{src}",
-        *map(str, files),
-        "-o",
-        str(program),
-        "-lm",
-    ]
-    subprocess.run(command, check=True, cwd=tmp_path)
+    command = [COMPILERS[0], *STRICT, "-O2", "-ffp-contract=off", f"-I{src}", *map(str, files), "-lm"]
+    subprocess.run([*command, "-o", str(program)], check=True, cwd=tmp_path)
     done = subprocess.run([program, tmp_path / "c" / "samples.bin"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
     assert "2000 cycles" in done.stdout

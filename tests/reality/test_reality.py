@@ -6,20 +6,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.drives import (
-    CONTROLLERS,
-    FPI,
-    PAIRS,
-    PERIOD,
-    SENSING,
-    TAU,
-    TRACK,
-    lagged,
-    parameters,
-    run,
-    slow_sensor,
-    task,
-)
+from helpers import drives
+from helpers.drives import CONTROLLERS, FPI, PAIRS, PERIOD, SENSING, TAU, TRACK, lagged, parameters, run, task
 from scipy.linalg import expm
 
 import fpirhc as fp
@@ -56,7 +44,8 @@ def test_lagged_reality_moves_as_the_matrix_exponential_says():
 
 def test_slow_sensor_is_seen_and_the_true_coordinate_is_judged():
     """The controller is given s, s' and s''; the error that counts is that of y."""
-    result = run(task(reality=fp.Reality(slow_sensor(), start={"s": 0.1}, seen={"y": "s"})), CONTROLLERS["plain form"])
+    real = fp.Reality(drives.slow_sensor(), start={"s": 0.1}, seen={"y": "s"})
+    result = run(task(reality=real), CONTROLLERS["plain form"])
     y, s, speed = (result[f"reality_state.{name}"] for name in ("y", "s", "y'"))
     assert np.array_equal(result["state.y"], s)
     assert np.allclose(result["state.y'"], (y - s) / TAU, rtol=1e-12, atol=1e-15)

@@ -305,6 +305,9 @@ def test_chatter_in_some_plants_makes_a_study_doubtful(task):
     [(text, outcome), *_] = found.view.sentences
     assert (str(outcome), found.summary.better["CTC+FPI"]) == ("doubtful", 12)
     assert f"It chatters in {(times > 10).sum()} variants ({times.idxmax()}, " in text
+    [(text, outcome), *_] = replace(found, summary=found.summary.assign(failures=[1, 3])).view.sentences
+    told = "CTC+FPI has mixed results beside CTC: it fails in 3 variants, CTC in 1; its error is smaller in 12 of 12 variants"
+    assert (str(outcome), text.partition(";")[0]) == ("mixed", told.partition(";")[0])
 
 
 def test_a_study_speaks_of_the_headline_metric(task):
