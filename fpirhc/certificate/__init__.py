@@ -14,7 +14,8 @@ import numpy as np
 
 from fpirhc.certificate.tube import Centre, Chains, Expressions, Sweep, Tube
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import plant_model, resolved, tracking_law
+from fpirhc.controllers.believed import plant_model
+from fpirhc.controllers.contract import resolved, tracking_law
 from fpirhc.deformation.affine import Affine
 from fpirhc.deformation.base import Form
 from fpirhc.deformation.model_referenced import ModelReferenced

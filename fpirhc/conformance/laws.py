@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fpirhc.controllers.base import Controller
+from fpirhc.controllers.believed import plant_model
 from fpirhc.controllers.built import build, compose_controller
-from fpirhc.controllers.contract import plant_model
 from fpirhc.deformation.base import with_inner
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError

@@ -18,7 +18,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -30,10 +30,38 @@ from fpirhc.symbolic.block import Block
 from fpirhc.symbolic.expression import Signals, is_finite, left_after, left_in_mean
 from fpirhc.symbolic.layout import Expression, Layout, Signal, scalar
 from fpirhc.task.dead_time import DeadTime, Queue, every, whole
-from fpirhc.task.exogenous import Exogenous, model_values, rows_of, signals_of
+from fpirhc.task.exogenous import Exogenous, model_values, really_known, rows_of, signals_of
 from fpirhc.task.problem import Problem
 
+if TYPE_CHECKING:
+    from fpirhc.controllers.contract import Controller
+
 ACTED, NOW = "_signals_acted", "_parameters_now"  # what a model is told of the last cycle, and of this one
+
+
+@dataclass(frozen=True, eq=False)
+class PlantModel:
+    """What a controller knows of its plant."""
+
+    plant: Plant  # equations of the model
+    signals: Mapping[str, Exogenous]  # measured disturbances, with their preview
+    exact: bool = False  # whether its parameters are the exact ones
+
+    @property
+    def parameter(self) -> Signal:
+        """The signal of its parameters, with the values that they have at first."""
+        return replace(self.plant.parameter, start=tuple(map(float, self.parameters(self.plant))))
+
+    def parameters(self, plant: Plant) -> np.ndarray:
+        """Return the parameters with which the controller evaluates a plant, shape (np,)."""
+        return plant.exact if self.exact else plant.approximate
+
+
+def plant_model(problem: Problem, controller: Controller) -> PlantModel:
+    """Return what the controller knows of its plant: the problem's equations, parameters and signals, or the real ones."""
+    if not controller.exact_model:
+        return PlantModel(problem.plant, problem.signals)
+    return PlantModel(problem.moves.as_model(problem.plant), really_known(problem.signals), exact=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from itertools import repeat
 import casadi as ca
 
 from fpirhc.contraction.delayed import require_converging
-from fpirhc.controllers.believed import ACTED, NOW, Pairs, Path, Told, believed_path, measured
-from fpirhc.controllers.contract import Controller, PlantModel, plant_model, resolved, tracking_law
+from fpirhc.controllers.believed import ACTED, NOW, Pairs, Path, PlantModel, Told, believed_path, measured, plant_model
+from fpirhc.controllers.contract import Controller, resolved, tracking_law
 from fpirhc.controllers.reference_states import largest_response
 from fpirhc.controllers.seeing import against_believed, check_observed, seeing_blocks
 from fpirhc.deformation.base import Deformation, against_wrappers

@@ -12,8 +12,6 @@ from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, final
 
-import numpy as np
-
 from fpirhc.controllers.reference_states import request_along_reference, request_of_commands, request_of_plans
 from fpirhc.deformation.base import Deformation, Identity, RequestChange, automatic, scaled_for, with_inner
 from fpirhc.errors import require
@@ -22,9 +20,7 @@ from fpirhc.horizon.cost import Cost
 from fpirhc.plant.chain import require_derivatives
 from fpirhc.plant.plant import Plant
 from fpirhc.symbolic.block import Block, Delay
-from fpirhc.symbolic.layout import Signal
 from fpirhc.task.checks import cycles_per_plan, cycles_per_stage
-from fpirhc.task.exogenous import Exogenous, really_known
 from fpirhc.task.problem import Problem
 from fpirhc.tracking.base import Tracking
 
@@ -33,24 +29,6 @@ if TYPE_CHECKING:
     from fpirhc.optimisers import Optimiser
 
 Deforms = Literal["response", "command", "target", "turns"]
-
-
-@dataclass(frozen=True, eq=False)
-class PlantModel:
-    """What a controller knows of its plant."""
-
-    plant: Plant  # equations of the model
-    signals: Mapping[str, Exogenous]  # measured disturbances, with their preview
-    exact: bool = False  # whether its parameters are the exact ones
-
-    @property
-    def parameter(self) -> Signal:
-        """The signal of its parameters, with the values that they have at first."""
-        return replace(self.plant.parameter, start=tuple(map(float, self.parameters(self.plant))))
-
-    def parameters(self, plant: Plant) -> np.ndarray:
-        """Return the parameters with which the controller evaluates a plant, shape (np,)."""
-        return plant.exact if self.exact else plant.approximate
 
 
 @dataclass(frozen=True)
@@ -272,13 +250,6 @@ def _request(problem: Problem, controller: Controller) -> RequestChange:
         return request_of_commands(problem)
     plans = controller.planner is not None
     return request_of_plans(problem) if plans else request_along_reference(problem, tracking_law(controller))
-
-
-def plant_model(problem: Problem, controller: Controller) -> PlantModel:
-    """Return what the controller knows of its plant: the problem's equations, parameters and signals, or the real ones."""
-    if not controller.exact_model:
-        return PlantModel(problem.plant, problem.signals)
-    return PlantModel(problem.moves.as_model(problem.plant), really_known(problem.signals), exact=True)
 
 
 def tracking_law(controller: Controller) -> Tracking | None:

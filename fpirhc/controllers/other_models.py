@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.believed import Pairs
+from fpirhc.controllers.believed import Pairs, plant_model
 from fpirhc.controllers.built import Built, compose_controller, dependencies_of_command, embedded
-from fpirhc.controllers.contract import ControllerWrapper, plant_model
+from fpirhc.controllers.contract import ControllerWrapper
 from fpirhc.errors import require
 from fpirhc.learning.disturbance_kalman import DisturbanceKalman
 from fpirhc.learning.estimators import ParameterEstimator, Seen

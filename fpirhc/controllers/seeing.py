@@ -12,8 +12,8 @@ from functools import lru_cache, partial
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.believed import believe_block, stated_path
-from fpirhc.controllers.contract import Controller, plant_model
+from fpirhc.controllers.believed import believe_block, plant_model, stated_path
+from fpirhc.controllers.contract import Controller
 from fpirhc.controllers.reference_states import reference_inputs, reference_states
 from fpirhc.errors import NotSupported
 from fpirhc.plant.maps import growth_rates

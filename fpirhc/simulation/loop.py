@@ -15,8 +15,9 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller, closing_blocks, reference_block
+from fpirhc.controllers.believed import plant_model
 from fpirhc.controllers.built import Built, build
-from fpirhc.controllers.contract import Undeformed, plant_model
+from fpirhc.controllers.contract import Undeformed
 from fpirhc.controllers.gate import INNER
 from fpirhc.controllers.seeing import seeing_blocks
 from fpirhc.plant.chain import response_names
@@ -75,8 +76,9 @@ def start_memory(loop: Composite, problem: Problem, controller: Controller) -> n
 def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
     """Return whether plans know the exact parameters, and those of this problem are not those of the build."""
     model, of_build = plant_model(problem, controller), loop.memory["parameters"].start_vector()
-    exact = controller.planner is not None and model.exact
-    return exact and not np.array_equal(of_build, model.parameters(model.plant))
+    return (
+        controller.planner is not None and model.exact and not np.array_equal(of_build, model.parameters(model.plant))
+    )
 
 
 def _clock_block(time: Signal, period: float) -> Block:

@@ -15,7 +15,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from fpirhc.controllers.contract import PlantModel
+from fpirhc.controllers.believed import PlantModel
 from fpirhc.errors import InvalidProblem
 from fpirhc.plant.chain import quantities, response_names
 from fpirhc.plant.integrators import own_step

@@ -15,7 +15,8 @@ from typing import Self, TypeAlias
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import innermost, name_in_task, plant_model
+from fpirhc.controllers.believed import plant_model
+from fpirhc.controllers.contract import innermost, name_in_task
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.describe import describe
 from fpirhc.errors import FpirhcError

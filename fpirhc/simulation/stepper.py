@@ -11,7 +11,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import name_in_task, plant_model
+from fpirhc.controllers.believed import plant_model
+from fpirhc.controllers.contract import name_in_task
 from fpirhc.controllers.gate import HELD, SKIPPED, named_memory
 from fpirhc.controllers.live_settings import LiveSettings, Numbers, live_settings
 from fpirhc.errors import ConcurrentUse, FpirhcError, InvalidName, InvalidValue, require

@@ -18,7 +18,8 @@ import casadi as ca
 import numpy as np
 
 from fpirhc.controllers.base import Controller
-from fpirhc.controllers.contract import name_in_task, plant_model, without_deformation
+from fpirhc.controllers.believed import plant_model
+from fpirhc.controllers.contract import name_in_task, without_deformation
 from fpirhc.deformation.base import Deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
