@@ -180,6 +180,8 @@ SLIPS = (
     ({"reference": fp.Trajectory(lambda t: {"q": 500 * ca.sin(t)})}, "reference needs 112 times the limits of u.", KILO),
     ({"sensing": fp.Sensing({"q": fp.Sensor(fp.Noise(5.0))}, fp.SavitzkyGolay(15, 2))}, "noise of q is 5 m, and its motion 1 m.",
      "Set the noise of q to 0.005 m: is it a slip of units?"),
+    ({"plant": replace(mass().plant, coordinates={"q": "rad"}), "reference": fp.Trajectory(lambda t: {"q": 50 * ca.sin(t)})},
+     "reference needs 11.2 times the limits of u.", "Divide the reference by 57.3: is it a slip of units?"),
 )  # fmt: skip
 
 
@@ -193,9 +195,12 @@ def test_other_units_are_named_first_and_are_what_mends_a_loop_that_does_not_fol
 
 def test_a_response_without_a_value_on_the_reference_is_named_with_its_place():
     plant = replace(heater().plant, response=lambda x, u, p: {"T": u.u - ca.sqrt(0.5 - x.T)})
-    plan = {"horizon": fp.Horizon(5, 0.1), "cost": fp.Quadratic({"T": 1.0}, deviation={"u": 1.0})}
+    plan = {"horizon": fp.Horizon(5, 0.1), "cost": fp.Quadratic({"T": 1.0}, deviation={"u": 1.0}, rate={"u": 1.0})}
     [fits] = answers(replace(heater(), plant=plant, start={"T": 0.2}, **plan), plans()["RHC"]).values()
-    assert "T = 1: no finite command keeps it there; look at roots and divisions in test_advice.py, line" in fits.change
+    assert (
+        "T = 1: no command gives the response that is needed; look at signs, roots and divisions in test_adv"
+        in fits.change
+    )
 
 
 def test_a_forgotten_estimator_is_told():
