@@ -169,10 +169,11 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
     usable = (one for one in paired if converges(one, jacobian, weights))
     if wrong:
         turned = [n for n, one in problem.plant.parameters.items() if one.approximate * one.exact < 0]
-        why = f": {' and '.join(turned)} of the plant and of the model differ in sign" if turned else ""
+        why = f"{' and '.join(turned)} of the plant and of the model differ in sign: every cycle enlarges the error of {what}"
+        why = why if turned else f"{what} has the wrong sign, so every cycle enlarges the error"
         remedy = "give the model the plant's sign, because a plan with the other one goes the wrong way"
         remedy = remedy if turned else f"use a {'negative' if value > 0 else 'positive'} {name}, {interval}"
-        raise NotContractive(f"{what} has the wrong sign, so every cycle enlarges the error{why}", remedy, turned)
+        raise NotContractive(why, remedy, turned)
     if seen is None:
         top = max(eigenvalues, key=abs)
         raise NotContractive(

@@ -360,11 +360,12 @@ def _check_finite(plant: Plant, stage: _Stage, nodes: tuple[np.ndarray, np.ndarr
             hint = ""
             if name == "terminal" and np.isnan(value):
                 hint = "; the end has no input, and input_before and feedforward only where a term of the stages reads them"
-            if not np.isfinite(states).all():
+            if not np.isfinite(states[: plant.state.size]).all():
                 hint = ": the states that would keep the outputs there grow without bound"
             elif not np.isfinite(data[:, 0]).all():
                 at = ", ".join(map("{} = {:g}".format, plant.state.elements, states[:, 0]))
-                hint = f", {at}: no finite command keeps it there; look at roots and divisions in {place_of(plant.response)}"
+                hint = f", {at}: no command gives the response that is needed; look at signs, roots and divisions in "
+                hint += place_of(plant.response)
             mistakes.add(f"term '{name}' is {value} on the reference {where}{hint}")
     mistakes.raise_if_any()
 

@@ -234,7 +234,7 @@ def with_numbers_of_all(task: Task, values: Mapping[str, Any], names: Collection
             if (name := path.partition(".")[0]) in task.problem.moves.parameters:
                 mend = f"write exact.{name} for the plant, approximate.{name} for the model"
                 raise InvalidName(f"setting '{path}': {mend}")
-            raise max(errors, key=lambda error: "Did you mean" in str(error))
+            raise max(errors, key=lambda error: str(error).partition("Did you mean")[2].count("'"))
     return replace(task, problem=problem, controllers=controllers)
 
 

@@ -77,7 +77,7 @@ class DeadTime(Checked):
             if value > MOST * period:
                 mistakes.add(
                     f"'{name}' is {value:g} {unit}, more than {MOST} control cycles of {period:g} {unit}; "
-                    "use a longer period for the run"
+                    f"use a longer period for the run{'; is one of the two in ms?' * (unit == 's')}"
                 )
         mistakes.raise_if_any()
 

@@ -64,7 +64,7 @@ def test_a_gain_is_refused_exactly_beyond_its_limit(map):
     sign = "negative" if getattr(map, name) < 0 else "positive"
     with pytest.raises(NotContractive, match=rf"wrong sign.*use a {sign} {name}, 0 < "):
         run(PAIR, map.with_effective_gain(-0.2), duration=0.6)
-    with pytest.raises(NotContractive, match=r"differ in sign; give the model the plant's sign"):
+    with pytest.raises(NotContractive, match=r"^\S+ .*differ in sign: .*; give the model the plant's sign"):
         run((-np.array(PAIR)).tolist(), map, duration=0.6)
 
 

@@ -286,4 +286,4 @@ def test_a_gain_that_corrects_nothing_is_not_tested():
     told = reviewed.answers(reviewed.mass(plant=reviewed.heavy(1.0, 1.0)), law)["gain"]
     assert (told.verdict, told.change[:10], told.numbers) == ("unknown", "Every gain", {})
     told = reviewed.answers(biased(0.0).with_exact(np.array([-1.3])), sigmoid(-0.8))["follows"]
-    assert "error: mass of the plant and of the model differ in sign; give the model the plant's sign" in told.change
+    assert "mass of the plant and of the model differ in sign: every cycle enlarges the error of Model" in told.change
