@@ -167,18 +167,8 @@ def solve(
     states = np.asarray(rollout(ocp)(state, inputs, data)[0].full())
     status = Status(int(diagnostics[4]))
     cost, residual, violation = (float(v) if status != Status.NON_FINITE else None for v in diagnostics[:3])
-    return Plan(
-        inputs,
-        states,
-        cost,
-        residual,
-        violation,
-        float(diagnostics[3]),
-        count,
-        status,
-        ocp,
-        np.asarray(ca.DM(data).full()),
-    )
+    given = np.asarray(ca.DM(data).full())
+    return Plan(inputs, states, cost, residual, violation, float(diagnostics[3]), count, status, ocp, given)
 
 
 def _checked(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -288,6 +288,11 @@ def _at(pair: Pair) -> str:
     return f"its {'rate' if rate else 'value'} ({name}: {number(ends[0][k])} to {number(ends[1][k])}{unit})"
 
 
+def _not_finite(pair: Pair) -> float:
+    planned = [e.run["solve.status"] for e in (pair.plain, pair.adaptive) if "solve" in e.run.layout]
+    return max((float(np.mean(status == Status.NON_FINITE)) for status in planned), default=math.nan)
+
+
 def _unsolved(entry: Entry) -> float:
     return entry.metrics["status"][Status.NOT_CONVERGED.name] / entry.run.cycles
 
@@ -321,6 +326,8 @@ FLAGS = (  # of rows with one measure the first that is raised
     Flag(_growth, 8.0, "its error grows {value} times from the first quarter of the run to the last: as in an unstable loop", True),
     Flag(lambda pair: _unsolved(pair.adaptive), UNSOLVED,
          "{value:%} of its plans did not converge: give the optimiser more iterations", True),
+    Flag(_not_finite, UNSOLVED, "in {value:%} of cycles a plan met nan, and the last plan went on: look at roots and divisions "
+         "in the response", True),
     Flag(lambda pair: pair.adaptive.metrics["at_limit"][""], AT_LIMITS,
          "its command is at a limit of {at}, where nothing adapts, in {value:%} of cycles (without it {before:%})", True),
     Flag(_swing, SWING, "both commands swing: on average each is {value:%} of its limits' range off the mean of the one before and "

@@ -49,12 +49,8 @@ class Counting(Controller):
             total, b = s.total + s.state[0], s.state[1]
             told = (b < 0) * FINE[1] + (b == 0.375) * int(fp.Status.NON_FINITE)
             command = np.array([1.0, 0.0]) * (total + 1e-300 / (b - 0.125)) - np.array([0.0, 1.0]) * s.count
-            return {
-                "command": command,
-                "status": told,
-                "count_next": s.count + 1 + 1e-300 / (b - 0.25),
-                "total_next": total,
-            }
+            count = s.count + 1 + 1e-300 / (b - 0.25)
+            return {"command": command, "status": told, "count_next": count, "total_next": total}
 
         writes = Layout((plant.input, scalar("status")))
         return [Block("inside", reads, writes, step, memory, opaque=self.opaque)], []

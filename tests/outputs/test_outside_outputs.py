@@ -46,15 +46,10 @@ def rising(t: Any) -> Any:
 @pytest.mark.parametrize("course", [lambda t: 280 + ca.sin(t), lambda t: ca.pw_lin(t, [0.0, 300.0], [280.0, 285.0])])
 def test_an_output_whose_derivative_has_that_of_a_smooth_signal_is_refused(course: Any) -> None:
     difference = room(outputs={"d": fp.Output("K", lambda q, p: q.T - p.ambient)})
-    problem = heated(room(), "T", rising)
+    problem, track = heated(room(), "T", rising), fp.Trajectory(lambda t: {"d": rising(t)})
     for signal in (fp.Known(course), fp.Unknown(course)):
         with pytest.raises(InvalidProblem, match=r"signals: .* depend on ambient, .* state it in steps, Samples\("):
-            replace(
-                problem,
-                plant=difference,
-                reference=fp.Trajectory(lambda t: {"d": rising(t)}),
-                signals={"ambient": signal},
-            )
+            replace(problem, plant=difference, reference=track, signals={"ambient": signal})
 
 
 RATES = {"valve": 0.1, "drain": 0.05}  # 1/s

@@ -263,6 +263,14 @@ def test_plans_contraction_and_null_tests_raise_flags_and_a_cost_says_what_count
     share = comparison["far"].metrics["status"]["NOT_CONVERGED"] / 6
     assert f"far is no lower bound: {share:.3g} % of its plans did not converge, and er" in comparison.verdict[-2]
     assert [{*found[n].ratios} for n in ("law", "plan")] == [{"y", "z"}, {"y"}]
+    # The level falls to a root of the response, below which there is none.
+    root = replace(tank().plant, response=lambda q, u, p: {"y": u.u - p.rate * ca.sqrt(q.y - 0.9)})
+    dry = {"limits": fp.Limits(inputs={"u": (0.0, 4.0)}), "cost": fp.Quadratic({"y": 1e2}, {"u": 1e-2})}
+    dry |= {"reference": fp.Trajectory(lambda t: {"y": 0.7 + 0 * t}), "horizon": fp.Horizon(10, 0.05)}
+    plan = fp.RecedingHorizon(fp.FixedPoint())
+    pair = {"plan": plan, "plan+FPI": plan.with_deformation(fp.Affine(-0.5))}
+    first = fp.compare(tasks.made(replace(tank(), plant=root, **dry), pair), seed=0, compiled=False).findings[0]
+    assert "of cycles a plan met nan, and the last plan went on: look at roots" in first.text
     # The plain form lags behind a moving reference: twice the error of a right model, and .01 of the range more.
     slow = fp.ComputedTorque(fp.Exponential(rate=2.0))
     moving = tank(reference=fp.Trajectory(lambda t: {"y": 1.5 + 0.5 * ca.sin(2 * t)}), start={"y": 1.5})
