@@ -251,7 +251,10 @@ def show_review(found: Review, *, verbose: bool = False) -> None:
     """Print the answers about the problem and every controller, those that are yes as a count."""
     for name, answers in found.answers.items():
         shown = [one for one in answers if verbose or one.verdict != "yes"]
-        say(name, "bold", f": {len(answers) - len(shown)} yes" if len(shown) < len(answers) else "")
+        told = [f"{len(answers) - len(shown)} yes"] * (len(shown) < len(answers))
+        gains = [one.numbers[name] for one in answers for name in one.numbers if name == "recommended_gain"]
+        told += [f"recommended gain: {number(gain)}" for gain in gains]
+        say(name, "bold", f": {', '.join(told)}" * bool(told))
         for change in dict.fromkeys(one.change for one in shown):  # once, below its rows
             rows = [one for one in shown if one.change == change]
             brief = len(rows) > 1 and rows[0].verdict == "unknown" and not verbose

@@ -17,23 +17,12 @@ from fpirhc.controllers.reference_states import needed_commands, whole_turns
 from fpirhc.deformation.base import own_gain
 from fpirhc.errors import NotSupported, require
 from fpirhc.plant.chain import zero_dynamics
-from fpirhc.review.experiments import (
-    BUSY,
-    GOOD,
-    LITTLE,
-    MOST_LATE,
-    SLIGHT,
-    WORSE,
-    Case,
-    ladder,
-    predictor,
-    slips,
-    with_gain,
-)
+from fpirhc.plant.plant import Plant
+from fpirhc.review.experiments import BUSY, GOOD, LATE, LITTLE, SLIGHT, WORSE, Case, ladder, predictor, slips, with_gain
 from fpirhc.simulation.ranges import TOLERANCE, hard_limits, misplaced
 from fpirhc.simulation.trials import ModelAsPlant, spoils
 from fpirhc.status import Status
-from fpirhc.summary import written_out
+from fpirhc.summary import in_percent, written_out
 from fpirhc.symbolic.dotted import paths_to
 from fpirhc.symbolic.driver import compiled_plans
 from fpirhc.symbolic.expression import TINY
@@ -44,7 +33,8 @@ MOSTLY, LEFT, ROOM = 0.5, 0.1, 0.8  # shares: cycles at a limit that show no loo
 CALM, CHATTER, RINGING = 0.1, 0.01, 0.9  # step of a command a cycle: mean, rms from noise; what a swing leaves
 SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
 TURNED = "Mend the sign of the inputs in the model: with those of the plant turned it follows."
-GROWS = "a push leaves {largest_factor:5} of itself a cycle later"
+GROWS = "{left:%} of the push is left after {pushed}| of one ten times as large {most_left:%}"
+SHORTER = "the relative error is {error:%}| with twice the stages the loop is lost ({error_with_twice_the_horizon:%})"
 MOVES = "commands change by {mean_step:%} of their range in a cycle"
 RINGS = "it swings with a period of {period} {time}, and a swing leaves {swing:%} of the last"
 BEST = "| {error_without:%} without adaptation| {error_recommended:%} at {recommended_gain:4}"
@@ -93,8 +83,7 @@ def _turns(case: Case) -> Fact | None:
 
 def _posed(case: Case) -> Fact | None:
     finite = np.isfinite(needed_commands(case.problem, case.bench.nominal["plant_state"])).all(axis=1)
-    bad = Verdict.CAUTION if case.problem.plant.equations.hidden else Verdict.NO  # states that are taken from the run
-    verdict = Verdict.YES if finite.all() else bad
+    verdict = Verdict.YES if finite.all() else Verdict.CAUTION if case.problem.plant.equations.hidden else Verdict.NO
     return Fact(verdict, {"share_finite": finite.mean()}, root=True) if len(finite) else None
 
 
@@ -105,8 +94,10 @@ def _inside(case: Case) -> Fact | None:
 
 def _noiseless(case: Case) -> Fact | None:
     sensing = case.problem.sensing
-    noisy = {n for n, sensor in sensing.sensors.items() if getattr(sensor.noise, "deviation", 0.0)}  # and no bias
-    noisy -= {n.rstrip("'") for n in sensing.sensors if "'" in n}
+    noise = {
+        n: one.quantum or getattr(one.noise, "deviation", 0.0) for n, one in sensing.sensors.items()
+    }  # and no bias
+    noisy = {n for n, size in noise.items() if size} - {n.rstrip("'") for n in noise if "'" in n}
     found = [n for n in sensing.measures(case.problem.plant) if "'" in n and n.rstrip("'") in noisy]
     return Fact(Verdict.CAUTION, {"without": len(found)}, ", ".join(found)) if found else None
 
@@ -114,7 +105,8 @@ def _noiseless(case: Case) -> Fact | None:
 def _sizes(case: Case) -> Fact | None:
     found = [*slips(case.problem)]
     told, changes = "; ".join(one[0] for one in found), " ".join(one[1] for one in found)
-    return Fact(Verdict.CAUTION, {"apart": len(found)}, told, changes, root=True) if found else None
+    verdict = Verdict.NO if any("sensing" in one[2] for one in found) else Verdict.CAUTION  # noise hides all else
+    return Fact(verdict, {"apart": len(found)}, told, changes, root=True) if found else None
 
 
 def _follows(case: Case) -> Fact:
@@ -136,9 +128,8 @@ def _saturates(case: Case) -> Fact | None:
     limits, names = np.array(bench.problem.limits.input_bounds(plant)), list(plant.inputs)
     if not run.cycles or not np.isfinite(limits).any():
         return None
-    stuck, states, plain = max(bench.draws, key=bench.held), run["plant_state"][bench.first(run.cycles) :], case.plain
-    own, alone = (one.quiet if drawn else one.nominal for one in (bench, plain))
-    held, calm = bench.held(stuck), bench.held(own)
+    stuck, states = max(bench.draws, key=bench.held), run["plant_state"][bench.first(run.cycles) :]
+    held, calm = bench.held(stuck), bench.held(bench.quiet if drawn else run)
     stands = bench.at_limits(stuck)[bench.first(stuck.cycles) :].mean(axis=0)
     known = case.problem.reality is None and not case.outside
     asked = needed_commands(case.problem, states, exact=known)
@@ -154,16 +145,10 @@ def _saturates(case: Case) -> Fact | None:
         ends, least, most = limits[:, at], asked[:, at].min(), asked[:, at].max()
         numbers |= {"needed": needs[at], "needed_least": least, "needed_most": most}
         numbers |= {"lower": ends[0], "upper": ends[1]} if np.isfinite(ends).all() else {}
-    once = np.abs(np.diff(asked[:, at])).mean() / case.problem.period
-    moves, short = plain.moves(alone)[at], 2 * calm >= held and numbers.get("needed", 0.0) > ROOM
-    room = "needed" in numbers and np.abs(asked[:, at]).max() <= ROOM * np.abs(limits[:, at]).max()  # by its size alone
-    swings = plain.controller.planner is not None and room and moves > 4 * once
-    swings = swings and min(calm, plain.held(alone)) > SATURATED  # by itself
-    numbers |= {"period": 2 * plain.span[at] / moves} if swings else {}  # of a square wave
+    short = bool(2 * calm >= held and numbers.get("needed", 0.0) > ROOM)
     lost = held > MOSTLY and bench.share(run) > GOOD / 2  # a plant at rest below a sine has .35
-    verdict = Verdict.NO if lost or swings else Verdict.CAUTION if held > SATURATED else Verdict.YES
-    ways = "model prediction weight" if swings else "model sign speed limits" * bool(short)
-    return Fact(verdict, numbers, names[at], ways=ways, root=bool(swings or short))
+    verdict = Verdict.NO if lost else Verdict.CAUTION if held > SATURATED else Verdict.YES
+    return Fact(verdict, numbers, names[at], ways="model sign speed limits" * short, root=short)
 
 
 def _returns(case: Case) -> Fact:
@@ -176,9 +161,10 @@ def _returns(case: Case) -> Fact:
     numbers = {"left": back.left, "left_of_ten_times": far.left, "factor": back.factor, "largest_factor": worst}
     numbers |= {"swing": back.swing, "period": back.cycles * case.problem.period} if back.swing else {}
     numbers |= {"mean_step": step} | ({"at_a_limit": stuck} if stuck else {})
+    numbers |= {"most_left": max(one.left for one in bench.along)} if worst >= 1 else {}
     says = GROWS * (worst >= 1) or MOVES * (step > CALM) if back.left <= GOOD else ""
-    limited = stuck > max(SATURATED, bench.held(bench.start))
-    return Fact(verdict, numbers, ways="limits" * limited, says=says or RINGS * rings)
+    ways = "limits" * (stuck > max(SATURATED, bench.held(bench.start)))
+    return Fact(verdict, numbers, ways=ways, says=says or RINGS * rings)
 
 
 def _plans(case: Case) -> Fact | None:
@@ -211,29 +197,39 @@ def _horizon(case: Case) -> Fact | None:
     with compiled_plans(yes=False):  # a loop for one run
         run = replace(bench, problem=replace(bench.problem, horizon=longer)).run(cycles=short.cycles)
     numbers |= {"error_with_twice_the_horizon": (long := bench.share(run))}
-    helps = long < own / WORSE and own - long > SLIGHT
+    helps, lost = long < own / WORSE and own - long > SLIGHT, own <= BAD < long
     numbers |= {"recommended_stages": longer.stages} if helps else {}
-    return Fact(Verdict.YES if not helps else Verdict.NO if own > BAD >= long else Verdict.CAUTION, numbers)
+    change = f"Give the horizon {longer.stages} stages." * helps + "Do not lengthen it." * lost
+    verdict = Verdict.NO if helps and own > BAD >= long else Verdict.CAUTION if change else Verdict.YES
+    return Fact(verdict, numbers, change=change, says=SHORTER * lost)
 
 
 def _box(case: Case) -> Fact | None:
-    bench, found = case.bench, list[tuple[float, float]]()
-    told = bench.built.controller.exact_model  # and is a bound that nobody can run
-    if told or case.problem.reality is not None or not len(case.draws):
+    bench, found, plant = case.bench, list[tuple[float, float]](), case.problem.plant
+    if bench.built.controller.exact_model or case.problem.reality is not None or not len(case.draws):  # a bound alone
         return None
     for exact in case.draws:
         base = bench.run(exact=exact)
         found.append((bench.pushed(base=base, exact=exact)[0].left, bench.share(base)))
-    good, most = float(np.mean([left <= 1 and share <= 1 for left, share in found])), np.max(found, axis=0)
+    lost = [_called(plant, exact) for exact, one in zip(case.draws, found, strict=True) if max(one) > 1]
+    good, most = 1 - len(lost) / len(found), np.max(found, axis=0)
     verdict = Verdict.YES if good == 1 else Verdict.CAUTION if good else Verdict.NO
     numbers = {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]}
-    return Fact(verdict, numbers, f"{len(found) - round(good * len(found))} of {len(found)}")
+    return Fact(verdict, numbers, f"{len(lost)} of {len(found)} trial plants{': ' * bool(lost)}{'; '.join(lost)}")
+
+
+def _called(plant: Plant, exact: np.ndarray) -> str:
+    """Which trial plant it is: the model, that between, or by how much its parameters are larger than the exact ones."""
+    known = {"the model itself": plant.approximate, "the one half way to it": (plant.exact + plant.approximate) / 2}
+    away = {n: v / e - 1 for n, v, e in zip(plant.parameters, exact, plant.exact, strict=True) if e not in (0, v)}
+    told = [f"{n} {in_percent(abs(by))} {'larger' if by > 0 else 'smaller'}" for n, by in away.items()]
+    some = f"one with {', '.join(told[:4])}{' ...' * (len(told) > 4)}"
+    return next((name for name, one in known.items() if np.array_equal(one, exact)), some)
 
 
 def _gains(case: Case) -> Fact:
     runs = {gain: case.bench.pushed(gain=gain)[0] for gain in (0.7, 1.4)}
-    steps = BUSY * max(CALM, case.bench.back.steps)
-    lost = [gain for gain, run in runs.items() if run.left > 1 or run.steps > steps]
+    lost = [g for g, run in runs.items() if run.left > 1 or run.steps > BUSY * max(CALM, case.bench.back.steps)]
     least, most = (1.0 if gain in lost else gain for gain in runs)
     says = f"with {' and '.join(map(str, lost))} times their gain a push grows or the movement doubles" * bool(lost)
     return Fact(Verdict.CAUTION if lost else Verdict.YES, {"most": most, "least": least}, says=says)
@@ -242,7 +238,7 @@ def _gains(case: Case) -> Fact:
 def _latency(case: Case) -> Fact:
     bench, plain, told, bears, cycles = case.bench, case.plain, dict[str, float](), 0, 0
     calm, most = bench.steps(bench.start), max(2 * bench.share(bench.start), 0.1)
-    for cycles in (1, 3, MOST_LATE):
+    for cycles in (1, 3, LATE):
         base = bench.run(latency=cycles)
         numbers = {"error": bench.share(base), "mean_step": bench.steps(base), "mean_step_without": calm}
         fine = numbers["error"] <= most and numbers["mean_step"] <= BUSY * max(CALM / 20, calm)
@@ -388,7 +384,7 @@ def _added(case: Case, without: Numbers, adapted: Numbers, slight: float = 0.0) 
 def _model(case: Case) -> Fact:
     task = ModelAsPlant(case.problem, seed=case.bench.seed).of(case.bench.built.controller)
     benches = [case.other(one.controller, model=task) for one in (case.plain, case.bench)]
-    runs = [one.run(cycles=one.whole, disturbed=False, quiet=True) for one in benches]
+    runs = [one.run(cycles=one.whole, disturbed=False) for one in benches]
     stuck = min(one.held(run) for one, run in zip(benches, runs, strict=True))
     require(stuck <= MOSTLY, "With the model as plant the command stands at a limit: run it where commands are free.")
     without, adapted = (one.errors(run) for one, run in zip(benches, runs, strict=True))
@@ -416,15 +412,15 @@ QUESTIONS = (
              "the angle that jumps by a whole turn, or weigh 1 - cos of its error.", of="problem"),
     Question("posed", "Has the reference finite commands?", _posed, "by the model in {share_finite:%} of the cycles", "Give it the "
              "derivatives that the plant's order needs, away from singular states.", "model", "problem"),
-    Question("noiseless", "Has what is derived from a noisy quantity noise, too?", _noiseless, "none is stated of {of}", "State "
-             "what computes it from the noisy samples: Sensing(sensors, SavitzkyGolay(15, degree=2)).", of="problem"),
+    Question("noiseless", "Has what is derived from a noisy or rounded quantity its noise, too?", _noiseless, "none is stated of "
+             "{of}", "State what computes it from the samples: Sensing(sensors, SavitzkyGolay(15, degree=2)).", of="problem"),
     Question("plans", "Are its plans good enough?", _plans, "{not_converged:%} did not converge| the relative error is {error:%}| "
              "{error_with_more_iterations:%} with 8 times the iterations", "Give the optimiser more iterations, or a smaller "
              "tolerance, before anything else."),
-    Question("input_limits", "Do the input limits fit the task?", _saturates, "the loop swings with a period of {period} {time} "
-             "without adaptation| a command or its change is at a limit in {at_a_limit:%} of the cycles| in "
-             "{at_a_limit_without_noise:%} without noise| the reference needs {needed_least} to {needed_most:u} of {of}| and its "
-             "limits are {lower} to {upper:u}", "", "model gain rate weight estimator prediction limits speed"),
+    Question("input_limits", "Do the input limits fit the task?", _saturates, "a command or its change is at a limit in "
+             "{at_a_limit:%} of the cycles| in {at_a_limit_without_noise:%} without noise| the reference needs {needed_least} to "
+             "{needed_most:u} of {of}| and its limits are {lower} to {upper:u}", "", "model gain rate weight estimator "
+             "prediction limits speed"),
     Question("gain", "Is the gain admissible?", recommended_gain, "the relative error is {error:%}" + BEST, "No gain that was run "
              "helps, is calm, and has reserve.", "model filter form lag prediction estimator sensors no_adaptation", "adaptive"),
     Question("follows", "Does it follow the reference?", _follows, "the rms error of {of} is {rms_error:u}| {error:%} of its "
@@ -433,9 +429,9 @@ QUESTIONS = (
     Question("returns", "Does it come back from a push?", _returns, "{left:%} of the push is left after {pushed}", "", "model gain "
              "lag rate weight estimator prediction form no_adaptation limits"),
     Question("horizon", "Is the horizon long enough?", _horizon, "the relative error is {error:%}| "
-             "{error_with_twice_the_horizon:%} with twice the stages", "Give the horizon {recommended_stages:.0f} stages."),
-    Question("box", "Does it come back for every plant in the range of the parameters?", _box, "it is lost on {of} trial plants",
-             "Narrow the range of the parameters.", "gain rate limits no_adaptation", of="loop"),
+             "{error_with_twice_the_horizon:%} with twice the stages", ""),
+    Question("box", "Does it come back for every plant in the range of the parameters?", _box, "it is lost on {of}",
+             "Identify the parameters better.", "gain rate limits no_adaptation", of="loop"),
     Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it bears {least} to {most} times "
              "their gain", "", "gain form rate weight estimator", of="loop"),
     Question("latency", "Does it bear a cycle of delay that nobody stated?", _latency, "it bears {bears} of {cycles} cycles| the "
@@ -450,9 +446,9 @@ QUESTIONS = (
     Question("noise", "Is the movement from noise small?", _noise, "noise changes {of} by {rms_step:%} of its motion from cycle to "
              "cycle| its total variation is {movement:r}| {movement_without_noise:r} without noise", "Measure the response with "
              "less noise.", "model gain filter estimator rate weight"),
-    Question("model", "Would it do little harm if the model were right?", _model, "then, without noise, the rms error of {of} is "
-             "{error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides.", "form estimator gain "
-             "no_adaptation", "adaptive"),
+    Question("model", "Would it do little harm if the model were right?", _model, "then, with the problem's sensors, the rms error "
+             "of {of} is {error_without:u} without adaptation| {error_with:u} with it", "A run on the plant decides.", "form "
+             "estimator gain filter no_adaptation", "adaptive"),
     Question("pays", "Does adaptation lower the error, or leave it small?", _pays, "the rms error of {of} is {error_without:u} "
              "without adaptation| {error_with:u} with it", "", "gain form lag estimator prediction sensors no_adaptation",
              "adaptive"),

@@ -6,7 +6,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from helpers import reviewed
+from helpers import reviewed, tasks
 
 import fpirhc as fp
 from fpirhc.contracts import Controller, Deformation
@@ -70,6 +70,16 @@ def test_a_null_test_goes_on_until_errors_count():
     both = fp.ComputedTorque(law.tracking), law
     pair = [fp.measure(right, fp.simulate(right, one, seed=0, compiled=False)).rms_error["y"] for one in both]
     assert [found.numbers["error_without"], found.numbers["error_with"]] == pytest.approx(pair, rel=1e-6)
+
+
+def test_a_null_test_has_the_sensors_of_the_problem_and_the_errors_of_a_comparison():
+    seen, law = fp.Sensing({"q": fp.Sensor(fp.Noise(1e-4), quantum=1e-4)}, fp.SavitzkyGolay(15, 2)), fp.Exponential(6.0)
+    problem, laws = reviewed.mass(sensing=seen), {"CTC": fp.ComputedTorque(law)}
+    laws |= {"CTC+FPI": fp.ComputedTorque(law, fp.ModelReferenced(fp.Affine(-0.2)))}
+    null = fp.compare(tasks.made(problem, laws), seed=0, compiled=False).entries[1].null
+    told = alone(problem, laws["CTC+FPI"])
+    assert [told.numbers["error_without"], told.numbers["error_with"]] == [null.without["q"], null.adapted["q"]]
+    assert f"with the problem's sensors, {null.sentence}" in told.evidence
 
 
 def test_harm_is_a_no_however_small_the_errors_are():

@@ -24,7 +24,7 @@ import fpirhc as fp
 
 KEPT = Path(__file__).parents[1] / "data" / "reviews.json"
 UNWRAP = "Unwrap the angle that jumps by a whole turn, or weigh 1 - cos of its error."
-WRAP = "Wrap the controllers: Predicted(controller, inputs=1.5)  # s, all dead times"
+SEVEN = "Take the estimator SavitzkyGolay(window=7, degree=1)."
 Pick = Callable[[], tuple[fp.Problem, dict[str, Any]]]
 LEAVE = "Leave the deformation out."
 MORE = "Give the optimiser more iterations, or a smaller tolerance, before anything else."
@@ -114,7 +114,7 @@ CASES: dict[str, Case] = {
         lambda: (reviewed.tank(), {"it": sigmoid(-0.3), "predicted": fp.Predicted(sigmoid(-0.6), inputs=1.5)}),
         {("it", "gain"): "no", ("predicted", "gain"): "yes", ("predicted", "returns"): "caution"},
         {("it", "gain", "error_without"): (0.0865, 1e-3), ("it", "gain", "error"): (0.0956, 1e-3)},
-        changes=dict.fromkeys([("it", "gain"), ("it", "pays")], WRAP),
+        changes=dict.fromkeys([("it", "gain"), ("it", "pays")], SEVEN),
     ),
     "a map of a right model behind a window that is too long": Case(
         lambda: (replace(reviewed.lift(), sensing=fp.Sensing({}, fp.SavitzkyGolay(41, 3))), {"it": sigmoid(-2.0)}),
@@ -136,9 +136,6 @@ CASES: dict[str, Case] = {
         lambda: (biased(1.0), plans()),
         {("RHC+FPI", "pays"): "no"},
         changes={("RHC+FPI", "pays"): "Mend the sensors: without their noise and bias it passes."},
-    ),
-    "a bias with which the loop runs away, and which without adaptation does nothing": Case(
-        lambda: (biased(100.0), plans()), changes={("RHC+FPI", "gain"): "Leave the deformation out."}
     ),
     "upper tanks that move by themselves": Case(
         foreign("quadruple_tank", "RHC", "CTC+FPI"),
@@ -174,9 +171,6 @@ CASES: dict[str, Case] = {
         shipped("leaking_tanks", "RHC+FPI"),
         {("RHC+FPI", "inner"): "yes", ("RHC+FPI", "follows"): "caution", ("RHC+FPI", "pays"): "caution"},
         changes={("RHC+FPI", "pays"): LEAVE},
-    ),
-    "a wrong map that asks for more than the light lets in": Case(
-        shipped("problems/gallery/freeway.py", "static map+FPI"), {("static map+FPI", "model"): "unknown"}
     ),
     "slots": Case(
         shipped("crane_slots", "slots+FPI"),
@@ -227,6 +221,8 @@ def test_what_is_said_is_true(name):
     for (about, key, number), (value, tolerance) in case.numbers.items():
         assert found[about, key].numbers[number] == pytest.approx(value, abs=tolerance), (about, key, number)
     assert {key: found[key].change for key in case.changes} == case.changes
+    grows = [a for a in found.values() if "most_left" in a.numbers and a.numbers["left"] <= 0.5]
+    assert all("of one ten times as large " in a.evidence for a in grows)
     good = {k: a for k, a in found.items() if a.verdict == "yes"}
     assert {k for k, a in found.items() if not a.change} == {*good}
     way_back = [a.numbers.items() for (_, key), a in good.items() if key in ("returns", "box")]
@@ -234,25 +230,6 @@ def test_what_is_said_is_true(name):
 
 
 # Own runs beside the answers
-
-
-def test_a_weight_on_changes_stills_what_swings_without_adaptation():
-    """Its speed is late: it is the cause of all else, and an own run with the weight that is named leaves the limits, as near."""
-    late, light = fp.Sensing({}, fp.SavitzkyGolay(13, 2)), fp.Quadratic({"x": 1e3, "x'": 1.0}, deviation={"F": 1e-4})
-    problem = replace(biased(0.0), duration=3.0, sensing=late, horizon=fp.Horizon(10, 0.03), cost=light)
-    both = fp.review(problem, plans(iterations=10), mismatch=0.0, seed=0).answers
-    told = [{a.key: a for a in both[name]} for name in plans()]
-    assert told[0]["input_limits"].evidence.startswith("The loop swings with a period of ")
-    wrong = [{a.change for a in some.values() if a.verdict in ("no", "caution")} for some in told]
-    assert wrong == [{some["input_limits"].change} for some in told]
-    words = told[0]["input_limits"].change.partition('rate={"F": ')[2]
-    rate = float(words.removesuffix("}). (the cost is that of all controllers)"))
-    slow = replace(problem, cost=replace(light, rate={"F": rate}))
-    one, other = (fp.measure(case, fp.simulate(case, plans()["RHC"], seed=0)) for case in (problem, slow))
-    assert other["at_limit"][""] < 0.2 < one["at_limit"][""]
-    assert other.rms_error["x"] <= 1.2 * one.rms_error["x"]
-    weak = reviewed.answers(replace(problem, limits=fp.Limits({"F": (-2.6, 2.6)})), plans()["RHC"])["input_limits"]
-    assert (weak.verdict, weak.change[-18:]) == ("caution", 'rate={"F": 0.01}).')
 
 
 def test_a_plant_outside_is_asked_by_its_model():
