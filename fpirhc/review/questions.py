@@ -94,9 +94,8 @@ def _inside(case: Case) -> Fact | None:
 
 def _noiseless(case: Case) -> Fact | None:
     sensing = case.problem.sensing
-    noise = {
-        n: one.quantum or getattr(one.noise, "deviation", 0.0) for n, one in sensing.sensors.items()
-    }  # and no bias
+    # A bias is in no derivative.
+    noise = {n: one.quantum or getattr(one.noise, "deviation", 0.0) for n, one in sensing.sensors.items()}
     noisy = {n for n, size in noise.items() if size} - {n.rstrip("'") for n in noise if "'" in n}
     found = [n for n in sensing.measures(case.problem.plant) if "'" in n and n.rstrip("'") in noisy]
     return Fact(Verdict.CAUTION, {"without": len(found)}, ", ".join(found)) if found else None

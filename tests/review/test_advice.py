@@ -209,12 +209,13 @@ def test_a_forgotten_estimator_is_told():
     noisy, biased = {"q": fp.Sensor(fp.Noise(1e-4))}, {"q": fp.Sensor(fp.Step(0.0, 1e-4))}
     seen = (
         fp.Sensing(noisy),
+        fp.Sensing({"q": fp.Sensor(quantum=1e-4)}),
         fp.Sensing(noisy, NOISY.estimator),
         fp.Sensing(noisy | {"q'": fp.Sensor()}),
         fp.Sensing(biased),
     )
     found = [answers(motor(0.7, sensing=one, duration=1.5), law(1.0)).get("noiseless") for one in seen]
-    assert [told and (told.verdict, told.of) for told in found] == [("caution", "q', q''"), None, None, None]
+    assert [told and (told.verdict, told.of) for told in found] == [("caution", "q', q''")] * 2 + [None] * 3
 
 
 def pushed_away(force: float, **settings: Any) -> fp.Problem:
