@@ -433,10 +433,10 @@ QUESTIONS = (
              "Identify the parameters better.", "gain rate limits no_adaptation", of="loop"),
     Question("input_gain", "Does it bear 0.7 and 1.4 times the gain of the inputs?", _gains, "it bears {least} to {most} times "
              "their gain", "", "gain form rate weight estimator", of="loop"),
-    Question("latency", "Does it bear a cycle of delay that nobody stated?", _latency, "it bears {bears} of {cycles} cycles| the "
-             "relative error is then {error:%}| {error_without:%} without adaptation| {left:%} of a push is left| commands change "
-             "by {mean_step:%} of their range in a cycle| {mean_step_without:%} without delay", "Run it where no command is late.",
-             "gain form rate weight estimator", of="loop"),
+    Question("latency", "Does it bear a cycle of delay that nobody stated?", _latency, "it bears {bears} cycles, run with up "
+             "to {cycles}| the relative error is then {error:%}| {error_without:%} without adaptation| {left:%} of a push is left| "
+             "commands change by {mean_step:%} of their range in a cycle| {mean_step_without:%} without delay", "Run it where no "
+             "command is late.", "gain form rate weight estimator", of="loop"),
     Question("limits", "Do states, rates and paths keep their limits?", _left, "a limit of {of} is left in {share_of_cycles:%} of "
              "the cycles| by at most {excess:u}", "Leave room: commands keep limits of inputs and their rates alone.", "gain rate "
              "weight speed"),
