@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from fpirhc.contraction.spectrum import Array, jacobians_along, linear_limit
+from fpirhc.contraction.spectrum import MEND, Array, jacobians_along, linear_limit
 from fpirhc.deformation.base import Deformation, against_wrappers, own_gain, with_its_gain
 from fpirhc.deformation.delayed import Paired
 from fpirhc.errors import NotContractive
@@ -172,7 +172,8 @@ def require_converging(problem: Problem, deformation: Deformation) -> None:
         why = f"{' and '.join(turned)} of the plant and of the model differ in sign: every cycle enlarges the error of {what}"
         why = why if turned else f"{what} has the wrong sign, so every cycle enlarges the error"
         remedy = "give the model the plant's sign, because a plan with the other one goes the wrong way"
-        remedy = remedy if turned else f"use a {'negative' if value > 0 else 'positive'} {name}, {interval}"
+        opposite = f"use a {'negative' if value > 0 else 'positive'} {name}, {interval}"
+        remedy = remedy if turned else MEND if gain > 0 else opposite
         raise NotContractive(why, remedy, turned)
     if seen is None:
         top = max(eigenvalues, key=abs)

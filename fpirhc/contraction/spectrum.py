@@ -23,6 +23,7 @@ from fpirhc.task.problem import Problem
 
 Array: TypeAlias = np.ndarray
 
+MEND = "the plant answers in the direction opposite to that of its model: mend the sign in the model"
 _NO_SIGN = 1e-9  # real parts below this share of the largest eigenvalue have no sign
 
 
@@ -205,10 +206,12 @@ def assess_gain(
         text += ", but only a small one: beyond the sector limit large errors may end in a bounded oscillation"
     if gain * sum(linear) < 0:
         fault = f"{what} has the wrong sign, so every cycle enlarges the error"
+        converging = MEND if gain > 0 else f"use {converging}"
     elif abs(gain) >= abs(sum(linear)):
         fault = f"{what} is too large: errors grow by the factor {written_out(predicted)} per cycle"
+        converging = f"use {converging}"
     if fault:
-        text, converging = f"{fault}; use {converging}{behind if largest == np.inf else ''}", ""
+        text, converging = f"{fault}; {converging}{behind if largest == np.inf else ''}", ""
     return ContractionReport(predicted, gain, (name, scale), near, any_size, text, converging)
 
 

@@ -64,8 +64,11 @@ def test_a_gain_is_refused_exactly_beyond_its_limit(map):
     sign = "negative" if getattr(map, name) < 0 else "positive"
     with pytest.raises(NotContractive, match=rf"wrong sign.*use a {sign} {name}, 0 < "):
         run(PAIR, map.with_effective_gain(-0.2), duration=0.6)
+    against = (-np.array(PAIR)).tolist()
     with pytest.raises(NotContractive, match=r"^\S+ .*differ in sign: .*; give the model the plant's sign"):
-        run((-np.array(PAIR)).tolist(), map, duration=0.6)
+        run(against, map, duration=0.6)
+    with pytest.raises(NotContractive, match="opposite to that of its model: mend the sign in the model"):
+        run(PAIR, map, duration=0.6, reality=fp.Reality(masses(against).plant))
 
 
 @pytest.mark.parametrize("jacobian", [[[1.0, 0.0], [0.0, -0.5]], [[0.0, 0.3], [-0.3, 0.0]]])
