@@ -34,6 +34,7 @@ CALM, CHATTER, RINGING = 0.1, 0.01, 0.9  # step of a command a cycle: mean, rms 
 SATURATED, OFFSET, FAILS = 0.2, 0.8, 0.05  # share of cycles at a limit; mean as one of rms; share of plans that fail
 TURNED = "Mend the sign of the inputs in the model: with those of the plant turned it follows."
 GROWS = "{left:%} of the push is left after {pushed}| of one ten times as large {most_left:%}"
+MODEL = "the model itself"  # among the trial plants
 SHORTER = "the relative error is {error:%}| with twice the stages the loop is lost ({error_with_twice_the_horizon:%})"
 MOVES = "commands change by {mean_step:%} of their range in a cycle"
 RINGS = "it swings with a period of {period} {time}, and a swing leaves {swing:%} of the last"
@@ -214,12 +215,17 @@ def _box(case: Case) -> Fact | None:
     good, most = 1 - len(lost) / len(found), np.max(found, axis=0)
     verdict = Verdict.YES if good == 1 else Verdict.CAUTION if good else Verdict.NO
     numbers = {"share_that_come_back": good, "plants": len(found), "left": most[0], "error": most[1]}
-    return Fact(verdict, numbers, f"{len(lost)} of {len(found)} trial plants{': ' * bool(lost)}{'; '.join(lost)}")
+    change = "Mend the window, the gain or the weights first: the loop is lost with a right model, too." * (
+        MODEL in lost
+    )
+    return Fact(
+        verdict, numbers, f"{len(lost)} of {len(found)} trial plants{': ' * bool(lost)}{'; '.join(lost)}", change
+    )
 
 
 def _called(plant: Plant, exact: np.ndarray) -> str:
     """Which trial plant it is: the model, that between, or by how much its parameters are larger than the exact ones."""
-    known = {"the model itself": plant.approximate, "the one half way to it": (plant.exact + plant.approximate) / 2}
+    known = {MODEL: plant.approximate, "the one half way to it": (plant.exact + plant.approximate) / 2}
     away = {n: v / e - 1 for n, v, e in zip(plant.parameters, exact, plant.exact, strict=True) if e not in (0, v)}
     told = [f"{n} {in_percent(abs(by))} {'larger' if by > 0 else 'smaller'}" for n, by in away.items()]
     some = f"one with {', '.join(told[:4])}{' ...' * (len(told) > 4)}"
