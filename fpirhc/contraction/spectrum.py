@@ -204,14 +204,15 @@ def assess_gain(
     text = f"{what} leaves at most {written_out(predicted)} of an error of the request per cycle{behind}"
     if not sector[0] < gain < sector[1]:
         text += ", but only a small one: beyond the sector limit large errors may end in a bounded oscillation"
+    remedy = f"use {converging}{behind if largest == np.inf else ''}"
     if gain * sum(linear) < 0:
         fault = f"{what} has the wrong sign, so every cycle enlarges the error"
-        converging = MEND if gain > 0 else f"use {converging}"
+        converging = MEND if gain > 0 else remedy
     elif abs(gain) >= abs(sum(linear)):
         fault = f"{what} is too large: errors grow by the factor {written_out(predicted)} per cycle"
-        converging = f"use {converging}"
+        converging = remedy
     if fault:
-        text, converging = f"{fault}; {converging}{behind if largest == np.inf else ''}", ""
+        text, converging = f"{fault}; {converging}", ""
     return ContractionReport(predicted, gain, (name, scale), near, any_size, text, converging)
 
 

@@ -76,9 +76,8 @@ def start_memory(loop: Composite, problem: Problem, controller: Controller) -> n
 def plans_exactly(loop: Composite, problem: Problem, controller: Controller) -> bool:
     """Return whether plans know the exact parameters, and those of this problem are not those of the build."""
     model, of_build = plant_model(problem, controller), loop.memory["parameters"].start_vector()
-    return (
-        controller.planner is not None and model.exact and not np.array_equal(of_build, model.parameters(model.plant))
-    )
+    exact = controller.planner is not None and model.exact
+    return exact and not np.array_equal(of_build, model.parameters(model.plant))
 
 
 def _clock_block(time: Signal, period: float) -> Block:
