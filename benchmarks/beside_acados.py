@@ -128,7 +128,7 @@ def cost(states: np.ndarray, commands: np.ndarray) -> float:
     return PERIOD * float((states[:-1] ** 2 @ np.array(WEIGHTS)).sum() + EFFORT * (commands**2).sum())
 
 
-plain = fp.RecedingHorizon(fp.FixedPoint(iterations=60, tolerance=1e-6))
+plain = fp.RecedingHorizon(fp.FixedPointSolver(iterations=60, tolerance=1e-6))
 filter_ = fp.DisturbanceKalman(
     drift={"x": 100.0, "angle": 100.0}, measured={"x": 1e-3, "angle": 1e-3, "x'": 1e-2, "angle'": 1e-2}
 )

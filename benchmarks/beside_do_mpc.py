@@ -151,7 +151,7 @@ def terms(v: Any) -> dict[str, Any]:
     return {"errors": (v.state.C_b - v.reference.C_b) ** 2 + 1e4 * ca.sumsqr(ca.vertcat(*beyond)), "rate": rate}
 
 
-plain = fp.RecedingHorizon(fp.FixedPoint(iterations=30, tolerance=1e-4))
+plain = fp.RecedingHorizon(fp.FixedPointSolver(iterations=30, tolerance=1e-4))
 filter_ = fp.DisturbanceKalman(
     drift={"C_a": 1.0, "C_b": 1.0, "T_R": 100.0, "T_K": 100.0},
     measured={"C_a": 1e-3, "C_b": 1e-3, "T_R": 0.1, "T_K": 0.1},

@@ -55,7 +55,7 @@ def task(name: str) -> tuple[fp.Problem, fp.RecedingHorizon]:
     problem = fp.Problem(plant=plant, reference=case.reference, start=start, duration=loop.duration, **facts)
     plans = {"tracking": fp.Exponential(loop.rate, integral=False), "room": loop.room}
     map_ = fp.ModelReferenced(fp.Affine(-2 * loop.gain))
-    return problem, fp.RecedingHorizon(fp.FixedPoint(iterations=200, tolerance=1e-7), map_, **plans)
+    return problem, fp.RecedingHorizon(fp.FixedPointSolver(iterations=200, tolerance=1e-7), map_, **plans)
 
 
 def drawn(box: dict[str, tuple[float, float]], count: int) -> np.ndarray:

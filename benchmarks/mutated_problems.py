@@ -49,7 +49,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"y": 10.0, "z": 10.0, "y'": 0.1}, deviation={"force": 1e-3, "lift": 1e-3}),
     measure_from=0.02, judged=("y", "z"),
 )
-tracking, optimiser = fp.Exponential(rate=6.0), fp.FixedPoint(iterations=1, tolerance=1e-2)
+tracking, optimiser = fp.Exponential(rate=6.0), fp.FixedPointSolver(iterations=1, tolerance=1e-2)
 controllers = {
     "CTC": fp.ComputedTorque(tracking),
     "CTC+FPI": fp.ComputedTorque(tracking, fp.Paired(fp.Sigmoid(gain=-0.2, scale=10.0), cycles=1)),

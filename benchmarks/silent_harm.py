@@ -54,7 +54,7 @@ def small(random: np.random.Generator) -> tuple[fp.Problem, Any]:
     gain, law = -float(random.uniform(0.1, 1.2)), fp.Exponential(float(random.uniform(4, 10)))
     form = (fp.Affine(gain), fp.Sigmoid(gain, scale=20.0), fp.RFPT(1e4, -1, -1e-4 * gain))[random.integers(3)]
     forms = form, fp.Filtered(form, pole=0.7), fp.ModelReferenced(form), fp.ModelReferenced(form, cycles=0)
-    plain = fp.ComputedTorque(law) if random.uniform() < 0.6 else fp.RecedingHorizon(fp.FixedPoint(iterations=2))
+    plain = fp.ComputedTorque(law) if random.uniform() < 0.6 else fp.RecedingHorizon(fp.FixedPointSolver(iterations=2))
     pair = plain, plain.with_deformation(forms[random.integers(4)])
     return fp.Problem(plant, fp.Trajectory(motion), start, period=0.01, duration=5.0, measure_from=2.0, **plans), pair
 

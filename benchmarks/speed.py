@@ -1,4 +1,4 @@
-"""Speed of plans and their distance from IPOPT's: FixedPoint, DAQP, acados, fatrop and IPOPT on the same states of closed loops.
+"""Speed of plans and their distance from IPOPT's: FixedPointSolver, DAQP, acados, fatrop and IPOPT on states of closed loops.
 
     pip install daqp             without it the column of DAQP is left out
     acados by its own instructions (a version of 2026, its option for DAQP on), and its acados_template, with ACADOS_SOURCE_DIR and
@@ -10,7 +10,7 @@ Every loop is flown once for 100 plans, with the right model and with a wrong on
 in one process on one core, each warm-started with its own last plan one stage later and at its default tolerance, with compiled
 functions. The clock of a plan is CPU time, the lower quartile of the passes. What it contains:
 
-    FixedPoint    the whole call: rollouts, verification of the plan, memory for the next one
+    FixedPointSolver    the whole call: rollouts, verification of the plan, memory for the next one
     DAQP          Model.update and Model.solve of the condensed program, with their Python; not the product that makes its vectors
     acados        its own time_tot, wall time of preparation and feedback in C, or the CPU time of solve() where that is less; not
                   the calls that set states and data; the quickest of three QP solvers, which is printed
@@ -44,7 +44,7 @@ FLAGS = ["-O3", "-march=native"]
 LARGE = 500  # instructions of a stage; above it CasADi's solvers are compiled with -O1, else that takes minutes
 JIT = {"jit": True, "compiler": "shell", "jit_temp_suffix": True}
 Solve = Callable[..., tuple[np.ndarray, float]]  # (s0, data, cold) -> inputs (nu, N), seconds; no plan: NaN
-OURS, ONCE, IPOPT, ALIKE = "FixedPoint()", "one iteration", "IPOPT", ("DAQP", "acados SQP", "fatrop", "IPOPT")
+OURS, ONCE, IPOPT, ALIKE = "FixedPointSolver()", "one iteration", "IPOPT", ("DAQP", "acados SQP", "fatrop", "IPOPT")
 
 
 def masses(wall: float = np.inf) -> fp.Problem:
@@ -142,7 +142,7 @@ class Loop:
     def adapted(self) -> float:
         """The same error with fixed-point iteration around the plans."""
         p = self.problem
-        plan = fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Affine(gain=-0.5)))
+        plan = fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Affine(gain=-0.5)))
         same = replace(
             p, period=p.horizon.step, duration=PLANS * p.horizon.step, measure_from=PLANS // 4 * p.horizon.step
         )
@@ -296,8 +296,8 @@ def acados(ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]]) -> dict[str,
 
 def ways(name: str, ocp: Any, horizons: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, Solve]:
     """Every solver, warm-started."""
-    once = fp.FixedPoint(iterations=1, most_iterations=1 if ocp.bounds_states else 100)
-    found = {OURS: ours(fp.FixedPoint(), ocp), ONCE: ours(once, ocp)}
+    once = fp.FixedPointSolver(iterations=1, most_iterations=1 if ocp.bounds_states else 100)
+    found = {OURS: ours(fp.FixedPointSolver(), ocp), ONCE: ours(once, ocp)}
     if name in LINEAR and _there("daqp"):
         found["DAQP"] = condensed(ocp)
     if _there("acados_template.acados_code_gen_options"):
@@ -341,7 +341,7 @@ def rows_of(name: str) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
     times, errors, problem = [], [], LOOPS[name]()
     loops = {f"{word} model": Loop(problem, word == "right") for word in ("right", "wrong")}
     ocp = loops["right model"].ocp
-    first, exact = ours(fp.FixedPoint(), ocp), shooting(fp.Ipopt, ocp, compiled=False, accuracy=1e-10)
+    first, exact = ours(fp.FixedPointSolver(), ocp), shooting(fp.Ipopt, ocp, compiled=False, accuracy=1e-10)
     solvers = ways(name, ocp, loops["right model"].flown(first)[0])
     for which, loop in loops.items():
         horizons = loop.flown(first)[0]

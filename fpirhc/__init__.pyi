@@ -36,7 +36,7 @@ from .learning.estimators import RecursiveLeastSquares as RecursiveLeastSquares
 from .learning.estimators import Uncertain as Uncertain
 from .learning.rules import LyapunovRule as LyapunovRule
 from .learning.rules import Projection as Projection
-from .optimisers.fixed_point import FixedPoint as FixedPoint
+from .optimisers.fixed_point import FixedPointSolver as FixedPointSolver
 from .optimisers.nlp import Fatrop as Fatrop
 from .optimisers.nlp import Ipopt as Ipopt
 from .optimisers.plan import Plan as Plan

@@ -115,7 +115,7 @@ problem = fp.Problem(
     # sensing=fp.Sensing({"y": fp.Sensor(noise=fp.Noise(1e-4))}, fp.SavitzkyGolay(window=21, degree=2)),  # positions alone
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 # `fpirhc review NAME.py` says where another gain is better: ask again when the plant is yours.
 sigmoid = fp.Sigmoid(gain=-1.0)
 # Compares the plant with its model: an exact model is left alone. docs/choosing.md says when another form is better.

@@ -64,7 +64,7 @@ _REMEDIES = {
     "cycle was skipped. Give every step the time of its cycle.",
     Status.RESTARTED: "the memory was not finite and was forgotten: the controller began anew; look at where the memory is kept.",
     Status.SOLVER_FAILED: "a solver raised an error: the cycle was skipped, with the last command and every memory as it was; "
-    "use FixedPoint(), or look at the measurement that the solver was given.",
+    "use FixedPointSolver(), or look at the measurement that the solver was given.",
     Status.SATURATED: "the command has been at a limit for longer than the stated time; integrals go no further into it: check the "
     "actuator, the sign of its gain, and whether the limits allow the task.",
     Status.BRIDGED: "cycles without a sample came before this one, lost or not called: the step was run once more for each; "

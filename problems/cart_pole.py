@@ -69,7 +69,7 @@ problem = fp.Problem(
     measure_from=5.0,  # s
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in m/s^2: the plan may jump from limit to limit
 
 controllers = {

@@ -61,7 +61,7 @@ problem = fp.Problem(
     judged=("cart", "angle"),
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in m/s^2 or rad/s^2
 
 

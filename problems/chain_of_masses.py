@@ -124,7 +124,7 @@ def chain(masses, droop=0.2):
 
 
 problem = chain(3)
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=5.0)  # scale in m/s
 
 controllers = {

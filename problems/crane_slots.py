@@ -66,7 +66,7 @@ problem = fp.Problem(
 )
 
 turns = {"cart": 1.4, "angle": 3.9}  # s
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=10.0)  # scale in m/s^2 or rad/s^2
 
 

@@ -63,7 +63,7 @@ law = fp.Exponential(rate=6.0)  # 1/s
 sigmoid = fp.Sigmoid(gain=-0.5, scale=20.0)  # scale in m/s^2
 fastest = sigmoid.with_effective_gain(1 / 1.5)  # 1 over the largest eigenvalue of M^-1 M^, the ratio of the masses
 increment = fp.Increment(fastest, cycles=DEAD_TIME / PERIOD)
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 
 controllers = {
     "RHC": fp.Predicted(fp.RecedingHorizon(optimiser), inputs=DEAD_TIME),

@@ -72,7 +72,7 @@ problem = fp.Problem(
 
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=0.05)  # scale in m/s^2
 increment = fp.Increment(sigmoid, cycles=DEAD_TIME / PERIOD)
-plain = fp.RecedingHorizon(fp.FixedPoint())
+plain = fp.RecedingHorizon(fp.FixedPointSolver())
 adaptive = fp.RecedingHorizon(plain.optimiser, increment)
 RESIDUAL = 5.0  # s
 

@@ -71,7 +71,7 @@ problem = fp.Problem(
     judged=("h2",),
 )
 
-plain = fp.RecedingHorizon(fp.FixedPoint())
+plain = fp.RecedingHorizon(fp.FixedPointSolver())
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=0.1)  # m/s
 filter = fp.DisturbanceKalman(
     drift={"h1": 1e-4, "h2": 1e-4}, measured={"h1": 1e-4, "h2": 1e-4}, noise={"h1": 2e-4, "h2": 2e-4}

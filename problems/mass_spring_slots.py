@@ -57,7 +57,7 @@ problem = fp.Problem(
 )
 
 turns = {"q2": 1.0, "q1": 3.0}  # s
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=100.0)  # scale in m/s^2 or m/s^4
 
 

@@ -88,7 +88,7 @@ problem = fp.Problem(
 )
 
 late = problem.response_delay  # cycles; the estimator's own delay is certain, so nothing leaks
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=5e3)  # scale in rad/s^3
 gentle = fp.Sigmoid(gain=-0.25, shift=0.3, scale=5e3)
 adaptive = fp.Increment(sigmoid, cycles=late, uncertainty=0)

@@ -77,7 +77,7 @@ problem = fp.Problem(
     measure_from=2.0,  # s
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=300.0)  # scale in rad/s^2: the plan may jump from limit to limit
 
 controllers = {

@@ -71,8 +71,8 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=6.0)  # 1/s
-# N; the real-time form: an exported loop has the same work in every cycle, and its errors are those of FixedPoint().
-optimiser = fp.FixedPoint(iterations=1, tolerance=5e-2)
+# N; the real-time form: an exported loop has the same work in every cycle, and its errors are those of FixedPointSolver().
+optimiser = fp.FixedPointSolver(iterations=1, tolerance=5e-2)
 # As published, in the plain form: it serves where the model is far away and the gain is large. Begin with fp.ModelReferenced.
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=20.0)  # scale in m/s^2
 

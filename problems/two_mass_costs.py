@@ -21,7 +21,7 @@ absolute = fp.Quadratic(states={"q1": 1e2, "q2": 1e2, **weights}, effort={"Q1": 
 stiff = fp.Quadratic(states={"q1": 1e4, "q2": 1e4, **weights}, deviation={"Q1": 1e-3, "Q2": 1e-3})
 problem = replace(task.problem, cost=absolute)
 
-optimiser = fp.FixedPoint(iterations=1, tolerance=5e-2)  # N
+optimiser = fp.FixedPointSolver(iterations=1, tolerance=5e-2)  # N
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=20.0)  # scale in m/s^2
 controllers = {
     "RHC": fp.RecedingHorizon(optimiser),

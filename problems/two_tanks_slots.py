@@ -61,7 +61,7 @@ problem = fp.Problem(
 )
 
 turns = {"h2": 80.0, "h1": 40.0}  # s
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=1.0)  # scale in dm/s or dm/s^2
 
 

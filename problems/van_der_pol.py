@@ -52,7 +52,7 @@ problem = fp.Problem(
     measure_from=3.0,  # s
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)  # scale in m/s^2: the plan may jump from limit to limit
 
 controllers = {

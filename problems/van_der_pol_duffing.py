@@ -55,7 +55,7 @@ problem = fp.Problem(
     measure_from=4.0,  # s
 )
 
-plain = fp.RecedingHorizon(fp.FixedPoint())
+plain = fp.RecedingHorizon(fp.FixedPointSolver())
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=50.0)  # scale in m/s^2
 filter = fp.DisturbanceKalman(drift={"q": 3e3}, measured={"q": 1e-3, "q'": 1e-2})
 known = {

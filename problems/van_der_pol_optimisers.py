@@ -1,7 +1,7 @@
 """The van der Pol-Duffing oscillator, planned by four optimisers: fixed-point iteration in place of the reduced gradient.
 
 The optimum of a horizon is a zero of the gradient of its auxiliary function. The rows find it in different ways, to the same
-tolerance: by the reduced gradient with a line search; by fixed-point iteration on the scaled gradient; by `FixedPoint`, the
+tolerance: by the reduced gradient with a line search; by fixed-point iteration on the scaled gradient; by `FixedPointSolver`, the
 same iteration with a Riccati sweep before each step; and by IPOPT. The plans agree, so do the errors. What differs is the
 number of steps and the time of a cycle. The iteration around the plan (FPI) is another one: it corrects the model, whoever
 plans. Plant and parameters are those of `van_der_pol`; `--plans` certifies the first plan of each.
@@ -23,7 +23,7 @@ task = fp.load_problem("van_der_pol")
 problem = replace(task.problem, duration=4.0, measure_from=2.0)
 TOLERANCE = 1e-2  # N, of 15 N
 
-fixed_point = fp.FixedPoint(tolerance=TOLERANCE)
+fixed_point = fp.FixedPointSolver(tolerance=TOLERANCE)
 reduced_gradient = fp.ReducedGradient(iterations=100, tolerance=TOLERANCE)
 sigmoid = task.controllers["RHC+FPI"].deformation
 
@@ -36,4 +36,4 @@ controllers = {
     "RHC+FPI, reduced gradient": fp.RecedingHorizon(reduced_gradient, sigmoid),
 }
 headline = ("RHC", "RHC+FPI")
-why = "Every optimiser finds the same plan, so none wins by its error; `FixedPoint` needs the fewest steps and the least time."
+why = "Every optimiser finds the same plan, so none wins by its error; `FixedPointSolver` needs fewest steps and least time."

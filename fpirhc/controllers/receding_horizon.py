@@ -19,7 +19,7 @@ from fpirhc.horizon.nominal import consistent_state, offset_limits, shifted_refe
 from fpirhc.horizon.problem import OptimalControl
 from fpirhc.horizon.transcription import transcribe
 from fpirhc.optimisers import Optimiser, built, first_memory
-from fpirhc.optimisers.fixed_point import FixedPoint
+from fpirhc.optimisers.fixed_point import FixedPointSolver
 from fpirhc.plant.chain import without_disturbances
 from fpirhc.plant.integrators import USUAL
 from fpirhc.plant.plant import Plant
@@ -341,4 +341,4 @@ def first_memory_of(problem: Problem, optimiser: Optimiser, ocp: OptimalControl)
     return _LATEST.of((ocp, optimiser), (state.tobytes(), inputs.tobytes(), plans_are_compiled()), made).copy()
 
 
-EXAMPLES = (RecedingHorizon(FixedPoint(iterations=2, tolerance=1e-3), Sigmoid(gain=-0.5, scale=50.0)),)
+EXAMPLES = (RecedingHorizon(FixedPointSolver(iterations=2, tolerance=1e-3), Sigmoid(gain=-0.5, scale=50.0)),)

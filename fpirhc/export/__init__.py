@@ -210,9 +210,9 @@ def write(device: Device, target: Target, folder: Path) -> list[Path]:
 def _instead(controller: Controller) -> str:
     """What to use in place of an optimiser that needs a library; empty for a controller without one."""
     optimiser = None if controller.planner is None else type(controller.planner.optimiser).__name__
-    if optimiser in (None, "FixedPoint"):
+    if optimiser in (None, "FixedPointSolver"):
         return ""
-    return f". In place of {optimiser} use FixedPoint(iterations=1, tolerance=...), which is C of its own"
+    return f". In place of {optimiser} use FixedPointSolver(iterations=1, tolerance=...), which is C of its own"
 
 
 # No fused multiply-add: the numbers are those of Python. Symbols that FMI or a caller does not need stay inside.

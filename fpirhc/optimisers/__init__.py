@@ -71,10 +71,10 @@ class Optimiser(Checked, ABC):
 
 
 _REMEDIES = {
-    "inputs": "serves problems without limits only (it is a baseline); for limits use FixedPoint()",
-    "states": "keeps input limits only; for state limits use FixedPoint(), Ipopt() or Fatrop(), or remove "
+    "inputs": "serves problems without limits only (it is a baseline); for limits use FixedPointSolver()",
+    "states": "keeps input limits only; for state limits use FixedPointSolver(), Ipopt() or Fatrop(), or remove "
     "them from Problem(limits=...)",
-    "prices": "keeps limits, but takes no prices ({}); use FixedPoint()",
+    "prices": "keeps limits, but takes no prices ({}); use FixedPointSolver()",
 }
 
 

@@ -1,4 +1,4 @@
-/* The iteration of FixedPoint as loops around generated stage functions.
+/* The iteration of FixedPointSolver as loops around generated stage functions.
 
    The same mathematics as the composed graph in plain.py and search.py, which is the reference it is tested against:
    names follow those files. What is generated stands before this text: the stage functions evaluate, pull, linearise, hessian, end

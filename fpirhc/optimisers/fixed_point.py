@@ -208,7 +208,7 @@ _CONVEX = 1e-6  # relative eigenvalue below zero that is taken for rounding
 
 
 @dataclass(frozen=True)
-class FixedPoint(Optimiser):
+class FixedPointSolver(Optimiser):
     """Plans by fixed-point iteration on their inputs, with the model alone. The adaptation (FPI) is a deformation.
 
     Args:
@@ -245,14 +245,14 @@ class FixedPoint(Optimiser):
                 a cost whose quadratic model has no minimum; a model-referenced map.
             InvalidValue: a tolerance below the rounding of inputs.
         """
-        require_map_of_plan("FixedPoint", self.map)
+        require_map_of_plan("FixedPointSolver", self.map)
         if ocp.bounds_states:
             require_compiler()
         reach = np.abs(np.concatenate([ocp.input_lower, ocp.input_upper, ocp.nodes[1].ravel()]))
         rounding = _DIGITS * float(reach[np.isfinite(reach)].max(initial=0.0))
         if self.tolerance is not None and self.tolerance < rounding:
             raise InvalidValue(
-                f"FixedPoint(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
+                f"FixedPointSolver(tolerance={self.tolerance:g}): inputs of this size are rounded to {rounding:.1g}; "
                 f"use {1e3 * rounding:.0g}"
             )
         # With limits of states a plan has states of its own and feedback between them, which holds a plant that runs away itself.
@@ -260,9 +260,9 @@ class FixedPoint(Optimiser):
         least = ocp.along.least_curvature()
         require(
             least >= -_CONVEX or not (self.hessian is None or self.hessian.needs_convex_cost),
-            f"FixedPoint needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue of "
-            f"{least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPoint(hessian=ExactHessian()) for an "
-            f"economic cost or an output that saturates, or add a convex term to the cost",
+            "FixedPointSolver needs a cost that bends upwards; along the reference the stage or terminal cost has an eigenvalue "
+            f"of {least:.2g} times its largest. Use ReducedGradient() or Ipopt(), or FixedPointSolver(hessian=ExactHessian()) for "
+            f"an economic cost or an output that saturates, or add a convex term to the cost",
         )
 
     def memory(self, ocp: OptimalControl) -> Layout:
@@ -309,14 +309,14 @@ def _require_rollouts(growth: np.ndarray) -> None:
     """Raise if a motion of the model grows so much over the horizon, by these factors per stage, that rollouts have no digits."""
     require(
         np.prod(growth) <= _GROWTH or not np.isfinite(growth).all(),
-        f"FixedPoint rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
+        f"FixedPointSolver rolls its plans out; the discretised model multiplies a motion by {growth.max():.3g} in a stage and by "
         f"{np.prod(growth):.1g} over the horizon, so plans have no digits. Where the plant itself does not run away so, a fast "
         f"mode is the cause: use Horizon(discretisation=Collocation()), or RungeKutta4(substeps=...) with more sub-steps; else "
         f"limit a state, however widely, Limits(states=...), so that plans have states of their own, or use fewer stages",
     )
 
 
-EXAMPLES = (FixedPoint(iterations=20, tolerance=1e-6), FixedPoint(iterations=1, tolerance=1e-6))
+EXAMPLES = (FixedPointSolver(iterations=20, tolerance=1e-6), FixedPointSolver(iterations=1, tolerance=1e-6))
 
 
 def _better(ocp: OptimalControl, layout: Layout, limited: ca.Function, call: Columns, first: Columns) -> Columns:

@@ -290,7 +290,7 @@ class Fatrop(MultipleShooting):
     iterations: Count = 200
 
     unbounded = (
-        "fatrop has no time limit, and after an outlier its call may never return: use FixedPoint(), "
+        "fatrop has no time limit, and after an outlier its call may never return: use FixedPointSolver(), "
         "or Ipopt(time_limit=...)"
     )
 

@@ -1,4 +1,4 @@
-"""The iteration of `FixedPoint` on horizons without limits of states: as loops in C, or as one composed graph."""
+"""The iteration of `FixedPointSolver` on horizons without limits of states: as loops in C, or as one composed graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The published optimisers, to which `FixedPoint` is compared: two fixed-point iterations, and the gradient method they replace.
+"""The published optimisers, to compare `FixedPointSolver` with: two fixed-point iterations, and the gradient method they replace.
 
     FullSpaceFixedPoint     z = (S, U, mu),   g = grad Psi(z),   H = Hessian of Psi (the KKT matrix),   h = H'g,   z+ = G(z, h, 0)
     GradientFixedPoint      U+ = clip(G(U, h, 0)),   h = D g,   D = 1/(step c)

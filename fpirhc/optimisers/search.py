@@ -1,4 +1,4 @@
-"""The line search of `FixedPoint` as a graph: one plan per iteration is tried, and the best one so far is the anchor.
+"""The line search of `FixedPointSolver` as a graph: one plan per iteration is tried, and the best one so far is the anchor.
 
 The search is built from Functions of a whole horizon, so that an iteration adds calls to the graph, and no copies. A Riccati
 sweep solves the horizon's quadratic model stage by stage, within the input bounds.

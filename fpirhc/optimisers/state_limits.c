@@ -1,4 +1,4 @@
-/* FixedPoint with limits of states, or where its plain iteration does not contract: pure and interior steps.
+/* FixedPointSolver with limits of states, or where its plain iteration does not contract: pure and interior steps.
 
    Before this text stand kernels.c, state_limits_sweep.c, what they need, and the stage function guess, the sizes ITERATIONS and
    MEMORY, and the settings. One turn of the loop expands one plan, judges it, and finds the next one by a sweep. A phase of pure

@@ -110,7 +110,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=1.5)  # 1/min
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 sigmoid = fp.Sigmoid(gain=-4.0, shift=0.3, scale=20.0)  # scale in 1/min^2
 
 controllers = {

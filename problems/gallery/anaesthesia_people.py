@@ -300,7 +300,7 @@ class InConcentration(Wrapper):
         return curve(ca.fmin(ca.fmax(target, LEAST), MOST), MEDIAN), remembered
 
 
-plan = fp.RecedingHorizon(fp.FixedPoint())
+plan = fp.RecedingHorizon(fp.FixedPointSolver())
 filter = fp.DisturbanceKalman(drift={"bis": 1.0}, measured={"bis": 3.0})
 controllers = {
     "pump alone": pump,

@@ -91,7 +91,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"x": 1e3, "y": 1e3, "x'": 10.0, "y'": 10.0}, deviation=dict.fromkeys(inputs, 1.0)),
 )
 
-plain = fp.RecedingHorizon(fp.FixedPoint())
+plain = fp.RecedingHorizon(fp.FixedPointSolver())
 iteration = fp.ModelReferenced(fp.Filtered(fp.Affine(gain=-0.15), pole=0.8))
 filter = fp.DisturbanceKalman(drift={"x": 0.02, "y": 0.02}, measured={"x": 2e-4, "y": 2e-4, "x'": 5e-3, "y'": 5e-3})
 both = ("x", "y")

@@ -134,7 +134,7 @@ problem = fp.Problem(
     judged=("room",),
 )
 
-plain = fp.RecedingHorizon(fp.FixedPoint())
+plain = fp.RecedingHorizon(fp.FixedPointSolver())
 filter = fp.DisturbanceKalman(drift={"room": 1.0, "wall": 0.03}, measured={"room": 0.03, "wall": 0.03})
 controllers = {
     "PI": fp.rivals.PID({"room": 3.0}, {"room": 1.0}),

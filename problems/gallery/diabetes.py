@@ -265,7 +265,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(outputs={"sensor": 1.0}, rate={"extra": 30.0}),
     judged=("glucose",),
 )
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 controllers = {
     "PID": PerBasal({"sensor": -0.00275}),  # basal doses per mg/dl
     "RHC": fp.RecedingHorizon(optimiser),

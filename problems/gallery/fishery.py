@@ -70,7 +70,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.ShiftPolynomial(poles=0.5, step=1.0, integral=False)
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 iteration = fp.ModelReferenced(fp.Affine(gain=-2.0))
 controllers = {
     "CTC": fp.ComputedTorque(tracking),

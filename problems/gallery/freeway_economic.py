@@ -99,7 +99,7 @@ problem = replace(
     measure_from=0.0,
 )
 
-optimiser = fp.FixedPoint(iterations=30, tolerance=1e-4, hessian=fp.ExactHessian(), second_start=True)
+optimiser = fp.FixedPointSolver(iterations=30, tolerance=1e-4, hessian=fp.ExactHessian(), second_start=True)
 plain = fp.RecedingHorizon(optimiser)
 iteration = fp.ModelReferenced(fp.Affine(gain=-2.0))
 estimator = fp.DisturbanceKalman(drift={"density": 100.0}, measured={"density": 0.1})

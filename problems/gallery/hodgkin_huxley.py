@@ -91,7 +91,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=1.0)  # 1/ms
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=100.0)  # scale in mV/ms
 filter = fp.DisturbanceKalman(

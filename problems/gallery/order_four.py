@@ -63,7 +63,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=3.0)  # 1/s
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 sigmoid = fp.Sigmoid(gain=-1.0, shift=0.3, scale=50.0)  # scale in m/s^4
 filter = fp.DisturbanceKalman(drift={"q": 0.39}, measured={"q": 1e-3, "q'": 1e-3, "q''": 1e-2, "q'''": 0.28})

@@ -92,7 +92,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=10.0)  # 1/s
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 sigmoid = fp.Sigmoid(gain=-2.2, shift=0.3, scale=50.0)  # scale in m/s^2
 filter = fp.DisturbanceKalman(

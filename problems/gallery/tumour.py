@@ -72,7 +72,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=0.15)  # 1/day
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 sigmoid = fp.Sigmoid(gain=-2.0, shift=0.3, scale=1.0)  # scale in 1/day^2
 filter = fp.DisturbanceKalman(drift={"size": 0.1}, measured={"size": 1e-3, "size'": 1e-2, "size''": 2e-3})

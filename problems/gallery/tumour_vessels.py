@@ -66,7 +66,7 @@ problem = fp.Problem(
     input_before={"dose": 10.0},
 )
 tracking = fp.Exponential(rate=0.5)  # 1/day
-plain = fp.RecedingHorizon(fp.FixedPoint())
+plain = fp.RecedingHorizon(fp.FixedPointSolver())
 iteration = fp.ModelReferenced(fp.Affine(gain=-1.0))
 filter = fp.DisturbanceKalman(drift={"size'''": 1.0}, measured={"size'''": 1e-3})  # 1/day^3.5, 1/day^3
 controllers = {

@@ -85,7 +85,7 @@ problem = fp.Problem(
 )
 
 tracking = fp.Exponential(rate=1.5)  # 1/s
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 sigmoid = fp.Sigmoid(gain=-1.6, shift=0.3, scale=6000.0)  # scale in N/s^2
 filter = fp.DisturbanceKalman(drift={"T": 1.1e3}, measured={"T": 1e-2, "T'": 3e-3, "T''": 10.0})

@@ -55,7 +55,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"side": 10.0, "side'": 1.0}, deviation={"steer": 100.0}),
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 filter = fp.DisturbanceKalman(drift={"side": 100.0}, measured={"side": 1e-2, "side'": 1e-2, "side''": 0.1})
 controllers = {

@@ -45,7 +45,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"T1": 1.0, "T2": 1.0}, deviation={"Q1": 1e-4, "Q2": 1e-4}),
 )
 
-optimiser = fp.FixedPoint()
+optimiser = fp.FixedPointSolver()
 plain = fp.RecedingHorizon(optimiser)
 filter = fp.DisturbanceKalman(drift={"T1": 1e-5, "T2": 1e-5}, measured={"T1": 0.1, "T2": 0.1})
 controllers = {

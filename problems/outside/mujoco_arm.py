@@ -56,7 +56,7 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=12, step=PERIOD, lengths=tuple(1.2**k for k in range(12))),
     cost=fp.Quadratic(states=weights, deviation={"M1": 1e-3, "M2": 1e-3}),
 )
-plain = fp.RecedingHorizon(optimiser := fp.FixedPoint())
+plain = fp.RecedingHorizon(optimiser := fp.FixedPointSolver())
 seen = {f"{joint}{dash}": size for joint in rest for dash, size in {"": 0.01, "'": 0.01, "''": 0.1}.items()}
 filter = fp.DisturbanceKalman(drift=dict.fromkeys(rest, 100.0), measured=seen)
 controllers = {

@@ -55,7 +55,7 @@ problem = fp.Problem(
     horizon=fp.Horizon(stages=20, step=5e-2),
     cost=fp.Quadratic(states=weights, deviation=dict.fromkeys(plant.inputs, 1.0)),
 )
-plain = fp.RecedingHorizon(optimiser := fp.FixedPoint())
+plain = fp.RecedingHorizon(optimiser := fp.FixedPointSolver())
 deviations = {**{f"{n}{dash}": 0.01 for n in AXES for dash in ("", "'")}, "x''": 1.0, "y''": 1.0, "z''": 0.1}
 filter = fp.DisturbanceKalman(drift={"x": 1.0, "y": 1.0, "z": 10.0}, measured=deviations)  # slower where attitude lags
 controllers = {

@@ -76,7 +76,7 @@ def task(plant, period=PERIOD):
 
 problem = task(reactor(1.0, 1.0))
 
-optimiser = fp.FixedPoint(iterations=3, tolerance=1e-2)
+optimiser = fp.FixedPointSolver(iterations=3, tolerance=1e-2)
 plain = fp.RecedingHorizon(optimiser)
 controllers = {
     "RHC": plain,

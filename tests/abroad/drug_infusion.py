@@ -80,7 +80,7 @@ problem = fp.Problem(
     measure_from=20.0,  # min
 )
 
-optimiser = fp.FixedPoint(iterations=2, tolerance=1e-1)  # mg/min
+optimiser = fp.FixedPointSolver(iterations=2, tolerance=1e-1)  # mg/min
 plain = fp.RecedingHorizon(optimiser)
 controllers = {
     "CTC": fp.ComputedTorque(fp.Exponential(rate=0.5)),

@@ -48,7 +48,7 @@ problem = fp.Problem(
     measure_from=5.0,  # s
 )
 
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-1)  # V
+optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-1)  # V
 plain = fp.RecedingHorizon(optimiser)
 controllers = {
     "RHC": plain,

@@ -62,7 +62,7 @@ problem = fp.Problem(
 )
 
 own = InverseTangent(gain=0.1, width=20.0)  # width in m/s^2
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # N
+optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-2)  # N
 plain = fp.RecedingHorizon(optimiser)
 controllers = {
     "CTC": fp.ComputedTorque(fp.Exponential(rate=4.0)),

@@ -76,7 +76,7 @@ def task(plant, levels):
 problem = task(tanks(), (12.4, 12.7, 1.8, 1.4))
 nonminimum = task(tanks((3.14, 3.29), (0.43, 0.34)), (12.6, 13.0, 4.8, 4.9))
 
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)  # V
+optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-2)  # V
 plain = fp.RecedingHorizon(optimiser)
 controllers = {
     "CTC": fp.ComputedTorque(fp.Exponential(rate=0.1)),

@@ -18,7 +18,7 @@ SHORT = "period=1e-3, duration=0.3"
 PLANNED = """measure_from=0.1, limits=fp.Limits(inputs={"u": (-25.0, 25.0)}), horizon=fp.Horizon(stages=8, step=1e-2),
     cost=fp.Quadratic(states={"y": 100.0, "y'": 1.0}, deviation={"u": 1e-2})"""
 SIGMOID = "fp.Sigmoid(gain=-0.5, shift=0.3, scale=50.0)"
-PLANS = f'controllers["RHC+FPI"] = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), {SIGMOID})\n'
+PLANS = f'controllers["RHC+FPI"] = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3), {SIGMOID})\n'
 LINE = line_text(f"{SHORT}, {PLANNED}", SIGMOID, more=PLANS)
 NOISE = "disturbances={'u': fp.Noise(0.5), 'y': fp.Noise(2.0)}"
 NOISY = line_text(f"{SHORT}, {NOISE}", more='del controllers["CTC+FPI"]\n')

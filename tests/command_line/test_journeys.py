@@ -24,8 +24,8 @@ HORIZON = """measure_from=0.5,
     limits=fp.Limits(inputs={"u": (-30.0, 30.0)}),
 """
 PLANNERS = """controllers = {
-    "RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)),
-    "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), fp.Sigmoid(gain=-0.5, scale=50.0)),
+    "RHC": fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3)),
+    "RHC+FPI": fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3), fp.Sigmoid(gain=-0.5, scale=50.0)),
 """
 
 
@@ -67,9 +67,9 @@ WEAK = edited("measure_from", 'limits=fp.Limits(inputs={"u": (-0.01, 0.01)}), me
 DIVERGING = edited("- p.k * q.y", "- p.k * q.y + 1e-9 * ca.sqrt(0.5001 - q.y)")
 SPANS = 'tuning = {"CTC+FPI": {"deformation.gain": fp.LogSpan(-1.0, -0.1)}}'
 TUNABLE = edited("controllers = {", f"{SPANS}\ncontrollers = {{")
-PLAN = "fp.FixedPoint(iterations=1, tolerance=1e-3)"
+PLAN = "fp.FixedPointSolver(iterations=1, tolerance=1e-3)"
 IPOPT = '    "IPOPT": fp.RecedingHorizon(fp.Ipopt(tolerance=1e-6)),\n'
-PRECISE = edited(f"{PLAN}),\n", f"fp.FixedPoint(tolerance=1e-6)),\n{IPOPT}")
+PRECISE = edited(f"{PLAN}),\n", f"fp.FixedPointSolver(tolerance=1e-6)),\n{IPOPT}")
 OF_AN_END = edited(
     'fp.Quadratic(states={"y": 100.0, "y\'": 1.0}, deviation={"u": 1e-2})',
     """fp.CustomCost(
@@ -108,7 +108,7 @@ JOURNEYS: dict[str, list[tuple[Callable[[], None] | None, str, int, str]]] = {
         (edited("controllers = {\n", PLANNERS), "run line.py RHC", 2, "fpirhc: line.py, line 14: RecedingHorizon needs"),
         (None, "compare line.py -c RHC", 2, "fpirhc: line.py, line 14: RHC: RecedingHorizon needs Problem(horizon=...)"),
         (edited("measure_from=0.5,\n", HORIZON), "compare line.py --no-compile -c RHC", 0, MASS),
-        (OF_AN_END, "compare line.py --plans -c RHC", 2, "fpirhc: FixedPoint needs a cost that"),
+        (OF_AN_END, "compare line.py --plans -c RHC", 2, "fpirhc: FixedPointSolver needs a cost that"),
         (BENDS, "compare line.py --plans -c RHC+FPI", 0, "line, first horizon"),
     ],
     "run": [

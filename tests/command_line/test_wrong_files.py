@@ -155,7 +155,7 @@ headline of no pair
     headline ('RHC+FPI', 'RHC') is no pair of a controller and the same one with adaptation: ('RHC', 'RHC+FPI')
 headline of two that differ in a setting
   controllers = {"RHC": fp.RecedingHorizon(optimiser -> headline = ("RHC", "RHC+FPI"); controllers = {"RHC": fp.RecedingHorizon(plan
-  optimiser = fp -> plan = fp.FixedPoint(); optimiser = fp
+  optimiser = fp -> plan = fp.FixedPointSolver(); optimiser = fp
     same one with adaptation: "iterations": null against "iterations": 1; none is here, so leave headline out
 controllers under another name
   controllers = { -> controller = {

@@ -146,7 +146,7 @@ PLANNED = {
     "cost": fp.Quadratic(states={"a": 9.0, "b": 9.0}, effort={"u": 0.1, "w": 0.1}),
     "duration": 0.5,
 }
-PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=4, tolerance=1e-6), fp.Sigmoid(gain=-0.5))
+PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=4, tolerance=1e-6), fp.Sigmoid(gain=-0.5))
 
 
 @pytest.mark.parametrize(

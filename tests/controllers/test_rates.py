@@ -28,8 +28,8 @@ PROBLEM = fp.Problem(
 )
 LAW = fp.Exponential(rate=5.0)
 CONTROLLERS = {
-    "RHC": fp.RecedingHorizon(fp.FixedPoint()),
-    "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Affine(gain=-0.8))),
+    "RHC": fp.RecedingHorizon(fp.FixedPointSolver()),
+    "RHC+FPI": fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Affine(gain=-0.8))),
     "CTC+FPI": fp.ComputedTorque(LAW, fp.Affine(gain=-0.5)),
     "PID": fp.PID({"x": 50.0}, {"x": 40.0}, {"x": 14.0}),
     "ADRC": fp.rivals.ADRC(5.0, observer=50.0),

@@ -18,8 +18,8 @@ two_mass RHC+FPI --to cc =>
 two_mas RHC+FPI =>
     problem 'two_mas' is unknown. Did you mean 'two_mass'? Give the path of a problem file, or a name from 'fpirhc list'
 own.py ipopt =>
-    'ipopt' cannot be exported: it calls a solver that is not written as C, but linked as a library
-    (coin-or/IpStdCInterface.h is its header). In place of Ipopt use FixedPoint(iterations=1, tolerance=...), which is C of its own
+    'ipopt' cannot be exported: it calls a solver that is not written as C, but linked as a library (coin-or/IpStdCInterface.h
+    is its header). In place of Ipopt use FixedPointSolver(iterations=1, tolerance=...), which is C of its own
 two_mass RHC+FPI --to wasm =>
     the target wasm needs ziglang, not installed here: pip install 'fpirhc[compiler]'
 two_mass RHC+FPI --to fmu2 =>

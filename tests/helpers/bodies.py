@@ -9,7 +9,7 @@ import numpy as np
 import fpirhc as fp
 
 PERIOD = 1e-2
-RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))
+RHC = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-2))
 
 
 @dataclass

@@ -18,7 +18,7 @@ CONTROLLERS = {
     "computed torque": fp.ComputedTorque(TRACK),
     "plain form": fp.ComputedTorque(TRACK, FPI),
     "model-referenced form": fp.ComputedTorque(TRACK, fp.ModelReferenced(FPI)),
-    "receding horizon": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), FPI),
+    "receding horizon": fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3), FPI),
 }
 SENSING: dict[str, dict[str, Any]] = {
     "ideal": {},

@@ -32,7 +32,7 @@ _guards: list[_Guard] = []  # CasADi keeps no reference
 
 
 @dataclass(frozen=True)
-class Failing(fp.FixedPoint):
+class Failing(fp.FixedPointSolver):
     """The fixed-point iteration; its solver fails from call `at` on, or while `Failing.now` is true."""
 
     at: int | None = None

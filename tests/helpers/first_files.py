@@ -33,7 +33,7 @@ problem = fp.Problem(
     cost=fp.Quadratic(states={"angle": 1e3, "angle'": 1.0}, deviation={"torque": 1e-2}),
     measure_from=0.05,
 )
-optimiser = fp.FixedPoint(iterations=1, tolerance=1e-2)
+optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-2)
 adaptive = fp.ModelReferenced(fp.Sigmoid(gain=-2.6))
 controllers = {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": fp.RecedingHorizon(optimiser, adaptive)}
 '''
@@ -71,8 +71,8 @@ problem = fp.Problem(
     input_before={"Tc": 300.0},
 )
 controllers = {
-    "RHC": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=0.1)),
-    "RHC+FPI": fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=0.1), fp.ModelReferenced(fp.Affine(gain=-0.7))),
+    "RHC": fp.RecedingHorizon(fp.FixedPointSolver(iterations=5, tolerance=0.1)),
+    "RHC+FPI": fp.RecedingHorizon(fp.FixedPointSolver(iterations=5, tolerance=0.1), fp.ModelReferenced(fp.Affine(gain=-0.7))),
 }
 '''
 

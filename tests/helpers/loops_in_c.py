@@ -100,7 +100,7 @@ def ring(limits: fp.Limits | None = None, stages: int = 3) -> tuple[Any, np.ndar
 
 @cache
 def pair(
-    kind: str, optimiser: fp.FixedPoint, limits: fp.Limits | None = None, stages: int = 4, of: Any = coupled
+    kind: str, optimiser: fp.FixedPointSolver, limits: fp.Limits | None = None, stages: int = 4, of: Any = coupled
 ) -> Pair:
     """Graph and loops of `step` or `converging`."""
     ocp, data = of(limits, stages)

@@ -7,7 +7,7 @@ import casadi as ca
 
 import fpirhc as fp
 
-OPTIMISER = fp.FixedPoint(iterations=3, tolerance=1e-2)
+OPTIMISER = fp.FixedPointSolver(iterations=3, tolerance=1e-2)
 ARM = {"l1": 0.5, "l2": 0.4}  # m
 
 

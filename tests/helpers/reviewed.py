@@ -40,7 +40,7 @@ def cart(limits: fp.Limits, reference: Any, exact: float, **settings: Any) -> fp
 
 
 def plans(*, iterations: int | None = 5, tolerance: float | None = 1e-3, gain: float = -0.8) -> dict[str, Any]:
-    optimiser = fp.FixedPoint(iterations=iterations, tolerance=tolerance)
+    optimiser = fp.FixedPointSolver(iterations=iterations, tolerance=tolerance)
     adapted = fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=gain)))
     return {"RHC": fp.RecedingHorizon(optimiser), "RHC+FPI": adapted}
 

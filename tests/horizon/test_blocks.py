@@ -29,7 +29,7 @@ def test_inputs_are_held_over_blocks_at_the_best_values(limits):
 
     ocp, data = horizon(BLOCKS, limits)
     first = ocp.start([0.4, 0.0], [0.0]).full().ravel()
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-7), first, data)
     assert plan.status == fp.Status.OK
     ends = np.cumsum(BLOCKS)
     parts = np.split(plan.inputs[0], ends[:-1])
@@ -47,5 +47,5 @@ def test_inputs_are_held_over_blocks_at_the_best_values(limits):
     rows = {"type": "ineq", "fun": inside}
     best = minimize(cost, np.zeros(5), method="SLSQP", constraints=rows, options={"ftol": 1e-13, "maxiter": 300})
     assert plan.cost == pytest.approx(best.fun, rel=1e-6)
-    without = fp.solve(free, fp.FixedPoint(iterations=1, tolerance=1e-7), np.array([0.4, 0.0]), free_data)
+    without = fp.solve(free, fp.FixedPointSolver(iterations=1, tolerance=1e-7), np.array([0.4, 0.0]), free_data)
     assert known(plan.cost) > known(without.cost)

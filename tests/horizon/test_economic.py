@@ -31,7 +31,7 @@ STEADY = fp.Trajectory(lambda t: {"cA": 0.5 + 0 * t, "cB": 0.5 + 0 * t})
 STARTS = ([0.4, 0.2], [0.1, 0.8])
 TOLERANCE = 1e-6
 HALF = {"cA": 0.5, "cB": 0.4}
-ECONOMIC = fp.FixedPoint(iterations=1, tolerance=TOLERANCE, hessian=fp.ExactHessian())
+ECONOMIC = fp.FixedPointSolver(iterations=1, tolerance=TOLERANCE, hessian=fp.ExactHessian())
 
 
 def horizon(regular: float, states: dict[str, tuple[float, float]], stages: int = 30):
@@ -75,4 +75,4 @@ def test_a_long_horizon_passes_the_published_steady_state():
 def test_gauss_newton_refuses_an_economic_cost_and_names_the_remedy():
     ocp, data = horizon(0.505, {})
     with pytest.raises(NotSupported, match=r"bends upwards.*hessian=ExactHessian\(\)"):
-        fp.solve(ocp, fp.FixedPoint(1, TOLERANCE), np.array(STARTS[0]), data)
+        fp.solve(ocp, fp.FixedPointSolver(1, TOLERANCE), np.array(STARTS[0]), data)

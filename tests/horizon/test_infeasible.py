@@ -24,7 +24,7 @@ def plan_of(start: tuple[float, float], states: dict[str, tuple[float, float]], 
     limits = fp.Limits(inputs={"u": (-1.0, 1.0)}, states=states, **more)
     ocp, data = horizon_of(SLEDGE, reference, horizon, cost, limits)
     first = np.asarray(ocp.start(list(start), [0.0]).full()).ravel()
-    return fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
+    return fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-7), first, data)
 
 
 OUT_OF_REACH = {  # first state, limits of y, stages, the limit, the largest violation in m

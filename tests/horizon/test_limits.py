@@ -12,7 +12,7 @@ from fpirhc.errors import FpirhcError, NotSupported
 PLANT, REFERENCE = pendulum(), fp.Trajectory(lambda t: {"angle": ca.sin(2 * t)})
 COST = fp.Quadratic(states={"angle": 10.0, "angle'": 0.1}, effort={"torque": 0.05})
 FIRST = np.array([0.6, 0.0])
-FIXED = fp.FixedPoint(iterations=1, tolerance=1e-7)
+FIXED = fp.FixedPointSolver(iterations=1, tolerance=1e-7)
 IPOPT = fp.Ipopt(tolerance=1e-4, accuracy=1e-11)
 
 

@@ -16,7 +16,7 @@ STAGES, STEP, PERIOD = 6, 0.08, 0.02
 WEIGHTS = {"angle": 40.0, "angle'": 1.0}
 EFFORT, RATE, FASTEST = 1e-3, 0.05, 12.0
 GROWING = (1.0, 1.0, 1.5, 2.0, 3.0, 4.0)
-CONVERGED = fp.FixedPoint(iterations=30, tolerance=1e-9)
+CONVERGED = fp.FixedPointSolver(iterations=30, tolerance=1e-9)
 
 
 def swing(t):
@@ -106,7 +106,7 @@ def test_every_plan_is_that_of_an_independent_program_at_its_own_time(replan, ra
 
 def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
     """Plans that are solved do not depend on how they were warm started: the same state and time give the same plan."""
-    each, per_stage = (planning(fp.FixedPoint(iterations=30, tolerance=1e-10)) for _ in range(2))
+    each, per_stage = (planning(fp.FixedPointSolver(iterations=30, tolerance=1e-10)) for _ in range(2))
     one = fp.simulate(task("stage"), per_stage, seed=0, compiled=None)
     later = fp.simulate(task("cycle"), each, seed=0, compiled=None)
     assert later["command"][0] == pytest.approx(one["command"][0], abs=1e-9)
@@ -115,7 +115,7 @@ def test_a_plan_at_a_boundary_of_stages_is_that_of_a_plan_per_stage():
 
 
 OPTIMISERS = {
-    "fixed point": fp.FixedPoint(iterations=3, tolerance=1e-6),
+    "fixed point": fp.FixedPointSolver(iterations=3, tolerance=1e-6),
     "gradient": fp.GradientFixedPoint(iterations=400, tolerance=1e-4),
     "full space": fp.FullSpaceFixedPoint(iterations=4000, tolerance=1e-3),
     "reduced gradient": fp.ReducedGradient(iterations=60, tolerance=1e-5),
@@ -163,7 +163,7 @@ def pond(lengths):
     )
 
 
-@pytest.mark.parametrize("optimiser", [fp.FixedPoint(iterations=200, tolerance=1e-10), fp.Ipopt(tolerance=1e-9)])
+@pytest.mark.parametrize("optimiser", [fp.FixedPointSolver(iterations=200, tolerance=1e-10), fp.Ipopt(tolerance=1e-9)])
 def test_long_stages_of_a_map_hold_the_input_over_whole_steps(optimiser):
     """The first plan is the minimum of the cost over whole steps, by a general optimiser on plain arithmetic."""
     lengths = (1.0, 2.0, 1.0, 3.0)

@@ -29,7 +29,7 @@ def pendulum(length, horizon, limits):
     )
 
 
-PLANNED = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-4))
+PLANNED = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-4))
 
 
 def test_a_plant_that_runs_away_itself_is_planned_with_states_of_its_own():
@@ -47,7 +47,7 @@ def test_a_plant_that_runs_away_itself_is_planned_without_them(horizon):
     problem = pendulum(0.25, horizon, {})
     ocp, first, data = posed(problem)
     for tolerance in (1e-4, 1e-8):
-        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance), first, data)
+        plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=tolerance), first, data)
         best = fp.solve(ocp, fp.Ipopt(tolerance=1e-8), first, data)
         assert plan.status is best.status is fp.Status.OK
         assert plan.cost == pytest.approx(best.cost, rel=1e-6)

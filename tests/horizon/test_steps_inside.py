@@ -41,7 +41,7 @@ def largest(limits: fp.Limits, lengths: tuple[float, ...] = ()) -> float:
     horizon = fp.Horizon(stages=3, step=STEPS * T, lengths=lengths)
     ocp, data = horizon_of(PLANT, STILL, horizon, PUSHED, limits)
     first = np.asarray(ocp.start([0.0, 0.0], [0.0]).full()).ravel()
-    own = fp.FixedPoint(iterations=30, tolerance=1e-6, hessian=fp.ExactHessian())
+    own = fp.FixedPointSolver(iterations=30, tolerance=1e-6, hessian=fp.ExactHessian())
     plan = fp.solve(ocp, own if limits.prices else fp.Ipopt(accuracy=1e-9), first, data)
     assert plan.status == fp.Status.OK
     a, v, seen = 0.0, 0.0, [0.0]

@@ -33,7 +33,7 @@ def test_a_margin_narrows_the_plan_by_its_number_at_every_stage():
     horizon = replace(problem.horizon, margins={"q": margin})
     ocp, _, data = posed(replace(problem, horizon=horizon), time=0.3)
     first = np.asarray(ocp.start([0.55, 1.4], [0.0]).full()).ravel()
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-7), first, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-7), first, data)
     assert plan.status == fp.Status.OK
     room = LIMIT - margin - np.asarray(plan.states)[0, 1:]
     assert room.min() == pytest.approx(0.0, abs=1e-5)
@@ -54,6 +54,6 @@ def test_the_rate_of_a_plan_counts_from_the_command_without_its_shift(weights):
     still, horizon = fp.Trajectory(lambda t: {"q": 0 * t}), fp.Horizon(stages=20, step=0.05)
     more = {"horizon": horizon, "cost": fp.Quadratic(states={"q": 10.0}, **weights), "duration": 6.0}
     problem = fp.Problem(plant, still, {"q": 0.0}, period=0.01, **more)
-    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=50, tolerance=1e-9), fp.Affine(-1.0))
+    plan = fp.RecedingHorizon(fp.FixedPointSolver(iterations=50, tolerance=1e-9), fp.Affine(-1.0))
     run = fp.simulate(problem, plan, seed=0)
     assert np.abs(run["state"][-50:, 0]).max() < 1e-6

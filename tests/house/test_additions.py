@@ -69,7 +69,7 @@ from abroad.saturated import Saturated
 
 task = fp.load_problem("two_mass")
 problem = replace(task.problem, duration=1.0, measure_from=0.5)
-planned = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2))
+planned = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-2))
 controllers = {
     "poles": fp.ComputedTorque(Poles(rate=6.0)),
     "poles+clipped": fp.ComputedTorque(Poles(rate=6.0), Clipped(gain=0.2, limit=5.0)),

@@ -124,7 +124,7 @@ def test_wrong_tracking_laws_are_caught(wrong, law):
 # Optimisers
 
 
-SETTLED = fp.FixedPoint(iterations=20, tolerance=FINE)
+SETTLED = fp.FixedPointSolver(iterations=20, tolerance=FINE)
 SERVES_NO_STATE_LIMITS = fp.ReducedGradient(iterations=200, tolerance=FINE)
 OPTIMISERS = (
     *examples("optimisers", SETTLED),

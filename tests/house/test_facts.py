@@ -11,7 +11,7 @@ from fpirhc.contracts import Controller
 from fpirhc.errors import NotSupported
 
 TRACK = fp.Exponential(rate=6.0)
-PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3))
+PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3))
 LIMITS = fp.Limits(inputs={"u": (-20.0, 20.0)})
 LOOKING_AHEAD = {
     "horizon": fp.Horizon(stages=10, step=1e-2),

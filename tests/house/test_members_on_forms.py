@@ -30,7 +30,7 @@ TESTS = Path(__file__).parents[1]
 
 # Members, with settings for a thing of one mass
 
-TRACK, MAP, PLAN = fp.Exponential(6.0), fp.Affine(gain=-0.2), fp.FixedPoint(iterations=2, tolerance=1e-3)
+TRACK, MAP, PLAN = fp.Exponential(6.0), fp.Affine(gain=-0.2), fp.FixedPointSolver(iterations=2, tolerance=1e-3)
 TORQUE = fp.ComputedTorque(TRACK, MAP)
 UNCERTAIN = fp.Uncertain(lower=0.5, upper=3.0, deviation=0.5)
 

@@ -42,7 +42,7 @@ def task(plant: fp.Plant, **changes) -> fp.Problem:
     return fp.Problem(**(settings | changes))
 
 
-RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-6))
+RHC = fp.RecedingHorizon(fp.FixedPointSolver(iterations=2, tolerance=1e-6))
 SPRING = {"k": fp.Uncertain(0.0, 10.0, 1.0), "b": fp.Uncertain(0.1, 5.0, 0.5)}
 NOISE = {"y": 0.1}
 

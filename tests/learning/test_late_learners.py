@@ -82,7 +82,7 @@ def test_the_gain_of_a_measured_response_is_that_of_the_stationary_filter():
 
 
 def offset_free(at_once: bool, tracking: Any = None) -> fp.Estimating:
-    plan = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-6), tracking=tracking)
+    plan = fp.RecedingHorizon(fp.FixedPointSolver(iterations=3, tolerance=1e-6), tracking=tracking)
     return fp.Estimating(plan, fp.DisturbanceKalman({"y": 20.0}, {"y": 1e-4, "y'": 1e-3}), at_once=at_once)
 
 

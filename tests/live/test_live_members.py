@@ -107,8 +107,8 @@ def test_every_number_of_a_member(member):
 SOLVERS = {
     "reduced gradient": fp.ReducedGradient(iterations=30, tolerance=1e-3),
     "gradient FPI": fp.GradientFixedPoint(iterations=5, tolerance=1e-3),
-    "damped": fp.FixedPoint(iterations=1, tolerance=1e-3, damping=0.1),
-    "solved": fp.FixedPoint(),  # to a tolerance that follows from the limits
+    "damped": fp.FixedPointSolver(iterations=1, tolerance=1e-3, damping=0.1),
+    "solved": fp.FixedPointSolver(),  # to a tolerance that follows from the limits
 }
 
 
@@ -135,7 +135,7 @@ class Lossy(fp.Affine):
         return request + ca.DM([0.5 * self.gain]) * (response - desired) + 0 * self.gain * response, memory
 
 
-ONCE = fp.FixedPoint(iterations=1, tolerance=1e-3)
+ONCE = fp.FixedPointSolver(iterations=1, tolerance=1e-3)
 PLANNED = fp.RecedingHorizon(ONCE, cost=fp.Quadratic(**WEIGHTS, terminal=fp.LQRTerminal()))
 REFUSED = [  # a number that Python computes with, one that stays live beside it, and the place
     (PLANNED, "cost.states.a", "limits.inputs.Fa.1", "cost.weight needs its number while"),

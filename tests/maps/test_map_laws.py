@@ -166,7 +166,7 @@ def planned_by_hand(problem: fp.Problem, growth: float) -> float:
     return float(best.x[0])
 
 
-OPTIMISER = fp.FixedPoint(iterations=20, tolerance=1e-12)
+OPTIMISER = fp.FixedPointSolver(iterations=20, tolerance=1e-12)
 
 
 @pytest.mark.parametrize("steps", [1, 3])
@@ -202,7 +202,7 @@ def test_a_disturbance_of_a_map_is_the_growth_that_the_model_lacks() -> None:
 
 def test_a_receding_horizon_with_the_iteration_is_the_loop_by_hand() -> None:
     """From the planned inputs on: nominal response, deformation, command and stock, in numpy."""
-    problem, few = stock(), fp.FixedPoint(iterations=4, tolerance=1e-6)
+    problem, few = stock(), fp.FixedPointSolver(iterations=4, tolerance=1e-6)
     run = simulated(problem, fp.RecedingHorizon(few, fp.ModelReferenced(fp.Affine(gain=-1.6))))
 
     def response(x: float, u: float, growth: float) -> float:

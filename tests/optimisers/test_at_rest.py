@@ -55,7 +55,7 @@ PLANTS = {
     ),
 }
 CONSTANTS = {"ball under a magnet": 1.7e-3, "heater": 0.1, "fan under a ball": 0.02, "tank": 0.7, "pendulum": 2.0}
-OPTIMISERS = {"default": fp.FixedPoint(), "one iteration": fp.FixedPoint(iterations=1, tolerance=1e-2)}
+OPTIMISERS = {"default": fp.FixedPointSolver(), "one iteration": fp.FixedPointSolver(iterations=1, tolerance=1e-2)}
 
 
 def problem_of(name: str, at: float) -> fp.Problem:
@@ -104,7 +104,7 @@ def test_the_first_command_of_a_plan_at_rest_is_the_feedforward(name, optimiser)
 @pytest.mark.parametrize("iterations", [None, 1])
 def test_a_loop_begins_with_the_feedforward(gap, iterations):
     """By the controller itself, whatever its iterations: a ball held at 9 mm fell with one, and at 9.00001 mm it did not."""
-    optimiser = fp.FixedPoint(iterations=iterations, tolerance=None if iterations is None else 1e-2)
+    optimiser = fp.FixedPointSolver(iterations=iterations, tolerance=None if iterations is None else 1e-2)
     problem = problem_of("ball under a magnet", gap)
     stepper = fp.Stepper(problem, fp.RecedingHorizon(optimiser), compiled=False)
     command, _ = stepper.step(0.0, problem.start_state, np.zeros(1), stepper.start())

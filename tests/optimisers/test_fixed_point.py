@@ -43,7 +43,7 @@ GAIN = {"b": fp.Parameter(1.0, 1.0, "1")}
 
 def setup_module():
     ocp, data = pendulum_problem()
-    optimiser = fp.FixedPoint(iterations=25, tolerance=1e-8)
+    optimiser = fp.FixedPointSolver(iterations=25, tolerance=1e-8)
     CACHE.update(ocp=(ocp, data), step=optimiser.step(ocp), memory=optimiser.memory(ocp).start(), judge=judge(ocp))
 
 
@@ -51,7 +51,7 @@ def test_linear_quadratic_problems_need_one_step():
     """The Riccati sweep is exact there: from any plan, the next one is the optimum."""
     ocp, data, first = linear_problem()
     _, diagnostics, _ = call(
-        fp.FixedPoint(iterations=1, tolerance=1e-6), ocp, data, first, ocp.input_lower, ocp.input_upper
+        fp.FixedPointSolver(iterations=1, tolerance=1e-6), ocp, data, first, ocp.input_lower, ocp.input_upper
     )
     assert diagnostics.ravel()[1] < 1e-10
 
@@ -61,7 +61,7 @@ def test_gradient_newton_transition():
     ocp, data, first = linear_problem()
     counts = []
     for damping in (0.0, 1.0, 10.0):
-        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-8, damping=damping), first, data, calls=500)
+        plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-8, damping=damping), first, data, calls=500)
         assert plan.status == fp.Status.OK
         counts.append(plan.iterations)
     assert counts[0] < counts[1] < counts[2]
@@ -71,7 +71,7 @@ def test_a_saturating_map_limits_the_step():
     """With a small scale S the first move is at most S (atanh 1/2 + x*); the optimum is the same."""
     ocp, data, first = linear_problem()
     sigmoid = fp.Sigmoid(gain=-2.5, scale=0.2)
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-8, map=sigmoid)
+    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-8, map=sigmoid)
     inputs, _, _ = call(optimiser, ocp, data, first, ocp.input_lower, ocp.input_upper)
     assert 0.1 < np.linalg.norm(inputs) <= sigmoid.largest_step() + 1e-12
     limited = fp.solve(ocp, optimiser, first, data, calls=300)
@@ -85,10 +85,10 @@ def test_exact_hessian_converges_quadratically():
     """Near the optimum Gauss-Newton shrinks the error by a constant; the exact Hessian squares it."""
     ocp, data = pendulum_problem(SWING, horizon=fp.Horizon(stages=15, step=0.1))
     first = np.array([2.5, 0.0])
-    near = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=0.1), first, data).inputs
+    near = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=0.1), first, data).inputs
     iterations = {}
     for model in (None, fp.ExactHessian()):
-        plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-10, hessian=model), first, data, start=near)
+        plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-10, hessian=model), first, data, start=near)
         assert plan.status == fp.Status.OK
         iterations[model is None] = plan.iterations
     assert iterations[False] <= 5 < 2 * 5 <= iterations[True]
@@ -107,7 +107,7 @@ def test_single_iterations_get_out_of_a_bad_plan():
     cost = fp.Quadratic(states={"height": 1e3, "height'": 1.0}, deviation={"thrust": 1e-2})
     horizon, limits = fp.Horizon(stages=20, step=2e-2), fp.Limits(inputs={"thrust": (0.0, 40.0)})
     ocp, data = horizon_of(plant, reference, horizon, cost, limits)
-    one, first = fp.FixedPoint(iterations=1, tolerance=1e-6), np.array([2.0, 0.0])
+    one, first = fp.FixedPointSolver(iterations=1, tolerance=1e-6), np.array([2.0, 0.0])
     best = fp.solve(ocp, fp.Ipopt(), first, data)
     # As after a plan for another model: nearly all thrust at once.
     *_, (inputs, numbers) = repeated(one, ocp, data, first, 40, np.linspace(40.0, 0.0, horizon.stages))
@@ -121,7 +121,7 @@ def test_overflowing_models_are_told_and_survived():
     reference = fp.Trajectory(lambda t: {"y": 0 * t})
     cost, horizon = fp.Quadratic(states={"y": 1.0}, effort={"u": 0.1}), fp.Horizon(stages=40, step=0.1)
     ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits(inputs={"u": (-1.0, 1.0)}))
-    optimiser = fp.FixedPoint(iterations=6, tolerance=1e-6)
+    optimiser = fp.FixedPointSolver(iterations=6, tolerance=1e-6)
     plan = fp.solve(ocp, optimiser, np.array([30.0]), data, calls=3)
     assert (plan.cost, plan.stationarity, plan.feasibility) == (None, None, None)  # 0 would be the least cost of all
     said, _, stage = plan.overflow().rpartition(" at stage ")
@@ -144,7 +144,7 @@ def test_a_plan_is_begun_anew_where_no_input_leaves_the_model():
     reference = fp.Trajectory(lambda t: {"y": 0.3 + 0 * t})
     cost, horizon = fp.Quadratic(states={"y": 1.0}, effort={"u": 0.01}), fp.Horizon(stages=20, step=0.05)
     ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits(inputs={"u": (0.0, 3.0)}))
-    optimiser = fp.FixedPoint(iterations=20, tolerance=1e-6)
+    optimiser = fp.FixedPointSolver(iterations=20, tolerance=1e-6)
     step = optimiser.step(ocp)
     memory, statuses = np.zeros(optimiser.memory(ocp).size), []
     for _ in range(3):
@@ -160,7 +160,7 @@ def test_feedback_keeps_unstable_plants_together():
     reference = fp.Trajectory(lambda t: {"y": 0 * t})
     cost, horizon = fp.Quadratic(states={"y": 1.0}, effort={"u": 0.1}), fp.Horizon(stages=60, step=0.1)
     ocp, data = horizon_of(plant, reference, horizon, cost, fp.Limits())
-    optimiser = fp.FixedPoint(iterations=3, tolerance=1e-6)
+    optimiser = fp.FixedPointSolver(iterations=3, tolerance=1e-6)
     _, _, memory = call(optimiser, ocp, data, np.zeros(1), ocp.input_lower, ocp.input_upper)
     _, diagnostics, _ = call(optimiser, ocp, data, np.array([0.1]), ocp.input_lower, ocp.input_upper, memory)
     assert diagnostics.ravel()[1] < 1.0
@@ -171,7 +171,7 @@ def test_feedback_keeps_unstable_plants_together():
 
 def test_a_second_start_takes_the_iterations_of_both():
     """Those of a call with the remembered plan and of one without, and the plan that is cheaper."""
-    one, box = fp.FixedPoint(iterations=4, tolerance=1e-8), ([-3.0], [3.0])
+    one, box = fp.FixedPointSolver(iterations=4, tolerance=1e-8), ([-3.0], [3.0])
     memory, two = call(one, *CACHE["ocp"], np.array([4.0, 4.0]), *box)[2], replace(one, second_start=True)
     for state in ([2.0, 0.0], [0.5, 0.0]):  # the remembered plan is the cheaper one, and the other one is
         ways = (one, memory), (one, None), (two, memory)
@@ -203,7 +203,7 @@ def test_a_move_that_lowers_the_cost_by_nothing_is_no_error(beside, status):
     cost = fp.CustomCost(terms=lambda v: {"flat": (v.input.u - 1) ** 4, "beside": beside + 0 * v.state.y})
     reference, limits = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Limits(inputs={"u": (-3.0, 3.0)})
     ocp, data = horizon_of(plant, reference, fp.Horizon(stages=1, step=1.0), cost, limits)
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-4)
+    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-4)
     memory = optimiser.memory(ocp).start()
     memory[optimiser.memory(ocp).slice("plan_inputs")] = 1.01
     for step in (optimiser.step(ocp), compiled(optimiser.step(ocp))):
@@ -219,7 +219,7 @@ def test_of_two_starts_the_plan_that_costs_less_with_its_violations_is_taken(sid
     cost = fp.CustomCost(terms=lambda v: {"valleys": (v.input.u**2 - 1) ** 2 - 0.3 * side * v.input.u})
     states = {"y": (-0.5, 9.0) if side < 0 else (-9.0, 0.5)}
     limits = fp.Limits(inputs={"u": (-3.0, 3.0)}, states=states, prices={"y": price})
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6, hessian=fp.ExactHessian(), second_start=True)
+    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-6, hessian=fp.ExactHessian(), second_start=True)
     reference, horizon = fp.Trajectory(lambda t: {"y": 0 * t}), fp.Horizon(stages=1, step=1.0)
     ocp, data = horizon_of(plant, reference, horizon, cost, limits)
     memory, layout = optimiser.memory(ocp).start(), optimiser.memory(ocp)

@@ -48,7 +48,7 @@ def tolerance_of(ocp):
 def test_horizons_of_other_people_are_solved_from_nothing(name):
     """IPOPT's cost, inside all limits, and stationary to a judge that knows neither sweeps nor multipliers."""
     ocp, data, first = first_horizon(name)
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=tolerance_of(ocp)), first, data)
     assert plan.status == fp.Status.OK
     assert plan.calls == 1
     judged = Judge(ocp)(plan.inputs, first, data)
@@ -61,7 +61,7 @@ def test_nine_states_and_three_inputs_with_walls_have_the_optimum_of_ipopt():
     """The chain of masses of Wirsching, Bock and Diehl below a ceiling and behind a wall: from nothing, in one call."""
     p, states = fp.load_problem("chain_of_masses").problem, {"z1": (-0.22, 5.0), "xe": (-5.0, 1.0)}
     ocp, first, data = posed(replace(p, limits=fp.Limits(inputs=p.limits.inputs, states=states)))
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=tolerance_of(ocp)), first, data)
     best = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data)
     judged = Judge(ocp)(plan.inputs, first, data)
     assert (ocp.state.size, plan.status, plan.calls) == (9, fp.Status.OK, 1)
@@ -85,7 +85,7 @@ def behind_a_wall(speed: float):
 def test_a_wall_that_the_inputs_feel_late_is_solved_in_one_call(speed):
     """Multipliers of neighbouring stages are nearly dependent: the barrier must go down to 1e-13 and less."""
     ocp, data, first = behind_a_wall(speed)
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), first, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=tolerance_of(ocp)), first, data)
     best = fp.solve(ocp, fp.Ipopt(accuracy=1e-9), first, data)
     assert (plan.status, plan.calls) == (fp.Status.OK, 1)
     assert known(plan.cost) == pytest.approx(known(best.cost), rel=1e-6)
@@ -114,7 +114,7 @@ def linear_horizon():
     reference = fp.Trajectory(lambda t: {"x1": 0.7 * ca.sin(2 * t), "x2": 0.6 * ca.cos(3 * t)})
     horizon, start = fp.Horizon(stages=12, step=0.1), {"x1": 0.0, "x2": 0.0}
     problem = fp.Problem(plant, reference, start, 0.1, 0.1, limits=limits, horizon=horizon, cost=cost)
-    ocp, optimiser = posed(problem)[0], fp.FixedPoint(iterations=1, tolerance=1e-9)
+    ocp, optimiser = posed(problem)[0], fp.FixedPointSolver(iterations=1, tolerance=1e-9)
     return problem, compiled(optimiser.converging(ocp)), optimiser.memory(ocp).start()
 
 
@@ -194,7 +194,7 @@ def test_what_the_roll_out_of_a_solved_plan_adds_to_a_limit_is_no_failure():
     near = start * (1 + 1e-3 * np.random.default_rng(number).normal(size=start.size))
     limited = np.isfinite(ocp.state_lower)
     low, high = ocp.state_lower[limited, None], ocp.state_upper[limited, None]
-    graph = (optimiser := fp.FixedPoint(tolerance=2e-3)).step(ocp)
+    graph = (optimiser := fp.FixedPointSolver(tolerance=2e-3)).step(ocp)
     for step in (graph, compiled(graph)):
         memory = optimiser.memory(ocp).start()
         for first in (start, near):
@@ -240,7 +240,7 @@ def test_a_horizon_that_cannot_be_kept_ends_with_the_least_violation():
     """The reactor begins above its limit and cannot cool at once: INFEASIBLE, and no plan violates the limit less in sum."""
     ocp, data, first = first_horizon("reactor")
     hot = first + np.array([0.0, 10.0, 0.0])
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=tolerance_of(ocp)), hot, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=tolerance_of(ocp)), hot, data)
     assert plan.status == fp.Status.INFEASIBLE
     beyond = np.maximum(plan.states[1, 1:] - 351.5, 0).sum()
     assert beyond > 1e-3
@@ -255,7 +255,7 @@ def test_horizons_with_limits_of_inputs_only_are_rescued(start):
     """An unstable reactor, cold: the plain iteration ends at a hundred times the cost, the solve at IPOPT's, and goes on there."""
     case = FOREIGN["reactor"]()
     ocp, data = horizon_of(case.plant, case.reference, case.horizon, case.cost, fp.Limits(inputs=case.limits.inputs))
-    first, optimiser = case.first(ocp, first_states(case, 40, 3)[:, start]), fp.FixedPoint(1, tolerance_of(ocp))
+    first, optimiser = case.first(ocp, first_states(case, 40, 3)[:, start]), fp.FixedPointSolver(1, tolerance_of(ocp))
     call = first, data, ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start()
     plain, plan = optimiser.converging(ocp)(*call), fp.solve(ocp, optimiser, first, data)
     solved, numbers, memory = optimiser.improve(ocp, call)
@@ -290,7 +290,7 @@ def _run_in_units(cost=1.0, force=1.0, length=1.0, time=1.0):
             deviation={"F": 1e-3 * cost / force**2},
         ),
     )
-    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPoint()), seed=0, compiled=False)
+    run = fp.simulate(problem, fp.RecedingHorizon(fp.FixedPointSolver()), seed=0, compiled=False)
     return np.ravel(run["command.F"]) / force, np.ravel(run["status"])
 
 

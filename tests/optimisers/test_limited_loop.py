@@ -11,7 +11,7 @@ from helpers.horizons import called, horizon_of
 import fpirhc as fp
 from fpirhc.conformance import compiled
 
-OPTIMISER = fp.FixedPoint(iterations=1, tolerance=1e-3)
+OPTIMISER = fp.FixedPointSolver(iterations=1, tolerance=1e-3)
 
 
 def problem_of(name, duration, **limits):
@@ -43,7 +43,7 @@ def warm(name):
 def test_every_plan_of_a_loop_with_a_wrong_model_is_converged(iterations):
     """The quadrotor, 13 % lighter than its model: what `iterations` says without limits of states does not matter with them."""
     p = problem_of("quadrotor", duration=3.0)
-    run = fp.simulate(p, fp.RecedingHorizon(fp.FixedPoint(iterations, tolerance=1e-4)), seed=0)
+    run = fp.simulate(p, fp.RecedingHorizon(fp.FixedPointSolver(iterations, tolerance=1e-4)), seed=0)
     assert run.stop is None
     assert set(fp.measure(p, run).statuses) == {"OK"}
     lower, upper = p.limits.state_bounds(p.plant)

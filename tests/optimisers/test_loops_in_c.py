@@ -24,7 +24,7 @@ def same(one: list[np.ndarray], other: list[np.ndarray], allowed: float = 1e-9) 
 def stepping(request):
     """Loops of one iteration per call, of four with the exact Hessian, and of as many as a plan needs."""
     iterations, hessian = request.param
-    return pair("step", fp.FixedPoint(iterations=iterations, tolerance=1e-7, damping=0.02, hessian=hessian))
+    return pair("step", fp.FixedPointSolver(iterations=iterations, tolerance=1e-7, damping=0.02, hessian=hessian))
 
 
 WAYS = {
@@ -54,7 +54,7 @@ def test_calls_one_after_the_other(stepping, bounds, request):
 
 def test_matrices_of_many_rows():
     """Thirteen states and three inputs, of which some are at their bounds."""
-    wide, random = pair("step", fp.FixedPoint(iterations=1, tolerance=1e-7), of=ring), np.random.default_rng(0)
+    wide, random = pair("step", fp.FixedPointSolver(iterations=1, tolerance=1e-7), of=ring), np.random.default_rng(0)
     bounds = np.array([-1.0, -20.0, -0.3]), np.array([1.5, 10.0, 0.4])
     for size in (0.3, 1.0, 3.0):
         memory = np.zeros(wide.size)
@@ -132,7 +132,7 @@ def test_calls_without_results(stepping):
 @pytest.mark.parametrize("bounds", [WIDE, NARROW], ids=["wide", "narrow"])
 def test_converging_loops_stop_where_the_graph_stops(bounds):
     """The same count, at the tolerance and at the most plain steps, cold and warm."""
-    converging = pair("converging", fp.FixedPoint(iterations=1, tolerance=1e-7))
+    converging = pair("converging", fp.FixedPointSolver(iterations=1, tolerance=1e-7))
     random = np.random.default_rng(2)
     memory, counts = np.zeros(converging.size), set()
     for size in (0.0, 0.3, 0.6, 1.0, 1.5):

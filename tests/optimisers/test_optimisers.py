@@ -16,7 +16,7 @@ from fpirhc.contracts import judge
 SHIPPED: Any = tasks  # whose horizons and controllers are of known kinds
 GRADIENT = fp.ReducedGradient(iterations=60, tolerance=1e-4)
 BACKENDS = (fp.Ipopt(), fp.Fatrop())
-FIXED = fp.FixedPoint(iterations=8, tolerance=1e-6)
+FIXED = fp.FixedPointSolver(iterations=8, tolerance=1e-6)
 EVERY: tuple[Any, ...] = (GRADIENT, FIXED, *BACKENDS)
 BOXES = {
     "free": fp.Limits(),

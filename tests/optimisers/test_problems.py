@@ -25,7 +25,7 @@ def test_same_optimum_as_ipopt(name, share):
     middle, half = (ocp.input_upper + ocp.input_lower) / 2, (ocp.input_upper - ocp.input_lower) / 2
     ocp = replace(ocp, input_lower=middle - share * half, input_upper=middle + share * half)
     scale = float(half.max())
-    plan = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-8 * scale), first, data)
+    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-8 * scale), first, data)
     # IPOPT starts where the other ended: a swing-up has several local optima.
     other = fp.solve(ocp, fp.Ipopt(tolerance=1e-6 * scale, accuracy=1e-11), first, data, start=plan.inputs, calls=3)
     assert plan.status == fp.Status.OK
@@ -57,7 +57,7 @@ def test_indefinite_costs_are_refused_with_what_to_use_instead():
     cost = fp.CustomCost(terms=lambda v: {"down": -(v.state.angle**2), "effort": v.input.torque**2})
     ocp, _ = horizon_of(pendulum(), fp.Trajectory(lambda t: {"angle": 0 * t}), fp.Horizon(5, 0.1), cost)
     with pytest.raises(fp.FpirhcError, match=r"bends upwards.*Use ReducedGradient"):
-        fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), np.zeros(2), np.zeros((ocp.data.size, 6)))
+        fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-6), np.zeros(2), np.zeros((ocp.data.size, 6)))
 
 
 def test_a_first_plan_at_its_limits_alone_is_sought_again():
@@ -67,7 +67,7 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
     valves["s2"] = replace(valves["s2"], approximate=4.4e-5)
     problem = replace(task.problem, plant=replace(task.problem.plant, parameters=valves), duration=60.0)
     ocp, first, data = posed(problem)
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-6)
+    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-6)
     empty = fp.solve(ocp, optimiser, first, data, start=np.zeros((1, ocp.stages)))
     assert empty.status == fp.Status.OK
     assert not empty.inputs.any()
@@ -90,7 +90,7 @@ def test_a_first_plan_at_its_limits_alone_is_sought_again():
 )
 def test_what_is_solved_has_its_shape(change, error, text):
     ocp, first, data = posed(fp.load_problem("two_mass").problem)
-    optimiser = fp.FixedPoint(iterations=1, tolerance=1e-8)
+    optimiser = fp.FixedPointSolver(iterations=1, tolerance=1e-8)
     every = {"state": first, "data": data, **change}
     with pytest.raises(error, match=re.escape(text)):
         fp.solve(ocp, optimiser, every.pop("state"), every.pop("data"), **every)

@@ -49,7 +49,7 @@ def levitated(optimiser):
 
 def test_no_cycle_is_ok_after_the_ball_is_lost():
     """One iteration in ten cycles is too little here: the ball falls, and no plan of a ball that falls is OK."""
-    error, status = levitated(fp.FixedPoint(iterations=1, tolerance=1e-3))
+    error, status = levitated(fp.FixedPointSolver(iterations=1, tolerance=1e-3))
     assert error.max() > 100.0
     lost = int(np.argmax(error > 0.5))
     assert (status[:lost] == fp.Status.OK).mean() > 0.5
@@ -57,7 +57,7 @@ def test_no_cycle_is_ok_after_the_ball_is_lost():
 
 
 @pytest.mark.parametrize(
-    "optimiser", [fp.FixedPoint(), fp.FixedPoint(iterations=10, tolerance=1e-3)], ids=["default", "ten"]
+    "optimiser", [fp.FixedPointSolver(), fp.FixedPointSolver(iterations=10, tolerance=1e-3)], ids=["default", "ten"]
 )
 def test_a_ball_that_is_held_is_held_by_plans_that_are_ok(optimiser):
     error, status = levitated(optimiser)
@@ -76,7 +76,7 @@ def test_limits_of_states_need_a_compiler(monkeypatch, compiler, error, words):
     monkeypatch.setenv("FPIRHC_CC", compiler)
     short = replace(PROBLEM, duration=3e-3, measure_from=0.0)
     limited = replace(short, limits=fp.Limits(inputs=short.limits.inputs, states={"g": (2.0, 20.0)}))
-    controller = fp.RecedingHorizon(fp.FixedPoint(tolerance=1e-3))
+    controller = fp.RecedingHorizon(fp.FixedPointSolver(tolerance=1e-3))
     with pytest.raises(error, match=words):
         fp.simulate(limited, controller, seed=0, compiled=False)
     assert not fp.simulate(short, controller, seed=0).compiled

@@ -19,7 +19,7 @@ def test_the_reduced_form_finds_the_same_optimum(high):
     """Slower than the default, and the same plan, bounds active or not."""
     ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (-high, high)}))
     plan = fp.solve(ocp, fp.GradientFixedPoint(iterations=400, tolerance=1e-7), FIRST, data)
-    best = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-8), FIRST, data)
+    best = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-8), FIRST, data)
     assert plan.status == fp.Status.OK
     np.testing.assert_allclose(plan.inputs, best.inputs, atol=1e-5)
 
@@ -52,7 +52,7 @@ def test_rate_of_the_reduced_form():
 
 
 def rate(optimiser, ocp, data, first, iterations=25):
-    best = fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-11), first, data).inputs
+    best = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-11), first, data).inputs
     distances = [np.linalg.norm(plan - best) for plan, _ in repeated(optimiser, ocp, data, first, iterations)]
     return (distances[-1] / distances[-11]) ** 0.1
 
@@ -70,16 +70,16 @@ def test_the_baseline_is_orders_of_magnitude_slower_and_scaling_helps():
     kinds = [fp.FullSpaceFixedPoint(iterations=2000, tolerance=1e-6, scaled=scaled) for scaled in (False, True)]
     left = [fp.solve(ocp, one, FIRST, data, calls=1).stationarity or 0.0 for one in kinds]
     assert left[0] > left[1] > 1e-6
-    assert fp.solve(ocp, fp.FixedPoint(iterations=1, tolerance=1e-6), FIRST, data).iterations < 10
+    assert fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-6), FIRST, data).iterations < 10
 
 
 def test_what_the_baselines_do_not_serve_is_refused():
     """Each says who can."""
     ocp, data = pendulum_problem(limits=fp.Limits(inputs={"torque": (-1.0, 1.0)}))
-    with pytest.raises(NotSupported, match="for limits use FixedPoint"):
+    with pytest.raises(NotSupported, match="for limits use FixedPointSolver"):
         fp.solve(ocp, fp.FullSpaceFixedPoint(iterations=1, tolerance=1e-6), FIRST, data)
     ocp, data = pendulum_problem(limits=fp.Limits(states={"angle": (-1.0, 1.0)}))
-    with pytest.raises(NotSupported, match="FixedPoint"):
+    with pytest.raises(NotSupported, match="FixedPointSolver"):
         fp.solve(ocp, fp.GradientFixedPoint(iterations=1, tolerance=1e-6), FIRST, data)
     ocp, data = pendulum_problem()
     with pytest.raises(NotContractive, match="outside"):

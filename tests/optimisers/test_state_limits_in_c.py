@@ -25,7 +25,7 @@ END = 60  # more turns than any of these horizons needs
 def loops(turns: int, *of: Any) -> Pair:
     """Loops that are cut off after so many turns."""
     limits, horizon = of or (LIMITS, coupled)
-    return pair("step", fp.FixedPoint(iterations=1, tolerance=1e-7, most_iterations=turns), limits, 3, horizon)
+    return pair("step", fp.FixedPointSolver(iterations=1, tolerance=1e-7, most_iterations=turns), limits, 3, horizon)
 
 
 def called(both: Pair, first: np.ndarray, memory: np.ndarray, bounds=None, data=None) -> tuple[np.ndarray, ...]:
@@ -103,7 +103,7 @@ def test_a_call_that_is_cut_off_calls_infeasible_what_its_multipliers_prove():
     random, verdicts = np.random.default_rng(3), []
     for turns in (1, 3, 8):
         both = loops(turns, RINGED, ring)
-        places = fp.FixedPoint().memory(both.ocp).slice("plan_multipliers")
+        places = fp.FixedPointSolver().memory(both.ocp).slice("plan_multipliers")
         for size in (0.2, 0.3, 0.4, 0.6, 1.0) * 4:
             memory = np.zeros(both.size)
             for _ in range(3):

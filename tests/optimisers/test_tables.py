@@ -28,7 +28,7 @@ def test_a_plan_of_a_model_with_a_table_is_solved_in_c(limits):
     reference = fp.Trajectory(lambda t: {"x": 0.8 * ca.sin(2 * t)})
     cost = fp.Quadratic(states={"x": 30.0, "x'": 0.3}, effort={"F": 1e-2})
     ocp, data = horizon_of(plant, reference, fp.Horizon(stages=10, step=0.1), cost, limits)
-    optimiser, first = fp.FixedPoint(tolerance=1e-7), np.array([0.4, 0.5])
+    optimiser, first = fp.FixedPointSolver(tolerance=1e-7), np.array([0.4, 0.5])
     graph = optimiser.converging(ocp)
     arguments = first, data, ocp.input_lower, ocp.input_upper, optimiser.memory(ocp).start()
     plan, numbers, _ = (np.asarray(v.full()) for v in compiled(graph)(*arguments))

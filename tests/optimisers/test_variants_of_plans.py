@@ -15,7 +15,7 @@ def test_plans_with_the_exact_model_begin_with_the_parameters_of_their_run(name,
     """The first plan too: to the tolerance of plans that are solved, to the bit with five iterations, statuses equal."""
     task = fp.load_problem(name)
     problem = replace(task.problem, duration=50 * task.problem.period, measure_from=0.0)
-    controller = fp.ExactModel(replace(task.controllers["RHC"], optimiser=fp.FixedPoint(iterations)))
+    controller = fp.ExactModel(replace(task.controllers["RHC"], optimiser=fp.FixedPointSolver(iterations)))
     built, random = fp.simulator(problem, controller, compiled=False), np.random.default_rng(0)
     exact, close = np.ravel(problem.plant.exact), 0 if iterations else 1e-4
     tolerance = close * np.ptp(problem.limits.input_bounds(problem.plant)) / 2

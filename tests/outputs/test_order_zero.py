@@ -96,7 +96,7 @@ def test_a_wrong_static_map_is_made_up_for() -> None:
 
 # Plans
 
-OPTIMISER = fp.FixedPoint(iterations=20, tolerance=1e-10)
+OPTIMISER = fp.FixedPointSolver(iterations=20, tolerance=1e-10)
 WEIGHT = 0.02  # of the rate of the voltage
 
 

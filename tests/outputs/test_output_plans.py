@@ -11,7 +11,7 @@ from helpers.plants import simulated
 import fpirhc as fp
 
 ADAPTIVE = fp.ModelReferenced(fp.Affine(-1.6))
-SOLVED = fp.FixedPoint(iterations=20, tolerance=1e-4)  # V
+SOLVED = fp.FixedPointSolver(iterations=20, tolerance=1e-4)  # V
 
 
 def servo(believed: float, **settings: Any) -> fp.Problem:

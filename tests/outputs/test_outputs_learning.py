@@ -17,7 +17,7 @@ STATES = {"C": 0.01, "E": 0.01}
 SLOW = {"C": 1e-3, "E": 1e-3}
 ANSWER = fp.DisturbanceKalman({"depth''": 100.0}, {"depth''": 0.1, **STATES}, noise=SLOW)
 SHIFT = fp.DisturbanceKalman({"depth": 1.0}, {"depth": 0.01, **STATES}, noise=SLOW)
-PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2))
+PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=3, tolerance=1e-2))
 
 
 def test_the_filter_on_the_hand_of_an_arm_is_the_recursion_by_hand() -> None:

@@ -45,7 +45,7 @@ LOOPS: dict[str, Callable[[], tuple[Controller, fp.Problem]]] = {
         for name, controller, changes in (
             ("rate", fp.rivals.ResolvedAccelerationRate(rate=6.0), {}),  # the measured responses move the states of a wrong model
             ("disturbed", "RHC+FPI", PUSHED),
-            ("plan", fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-2), MAP, TRACK), {}),
+            ("plan", fp.RecedingHorizon(fp.FixedPointSolver(iterations=3, tolerance=1e-2), MAP, TRACK), {}),
             ("late", "RHC+FPI", LATE),
             ("paired", fp.Predicted(fp.ComputedTorque(TRACK, fp.Paired(MAP, cycles=5)), inputs=3e-3, measurement=2e-3), LATE),
             ("at once", fp.Estimating(fp.ComputedTorque(TRACK), FILTER, at_once=True), {}),
@@ -148,7 +148,7 @@ def both(plant: fp.Plant, start: Mapping[str, float] | None = None, **settings: 
 
 
 PLANTS = {"order 2": lambda w: chain(2, w[:2]), "order 3": lambda w: chain(3, w), "orders 2 and 1": unequal}
-OPTIMISER = fp.FixedPoint(iterations=12, tolerance=1e-11)
+OPTIMISER = fp.FixedPointSolver(iterations=12, tolerance=1e-11)
 WHOLE = fp.ModelReferenced(fp.Affine(-2.0))  # the whole response error in one cycle: an increment of the command
 
 

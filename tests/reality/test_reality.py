@@ -179,7 +179,7 @@ def other(**changes: Any) -> fp.Problem:
 
 @pytest.mark.parametrize(
     "controller",
-    [replace(BLOOD, deformation=DRUG), fp.RecedingHorizon(fp.FixedPoint(iterations=2, tolerance=1e-4), DRUG)],
+    [replace(BLOOD, deformation=DRUG), fp.RecedingHorizon(fp.FixedPointSolver(iterations=2, tolerance=1e-4), DRUG)],
     ids=["computed torque", "receding horizon"],
 )
 def test_what_nobody_measures_may_have_any_name(controller):

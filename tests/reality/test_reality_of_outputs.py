@@ -12,7 +12,7 @@ import fpirhc as fp
 PERIOD = 1 / 12  # min
 TRACK = fp.ComputedTorque(fp.Exponential(rate=1.5))
 FPI = fp.Sigmoid(gain=-2.0, shift=0.3, scale=20.0)
-PLAN = fp.RecedingHorizon(fp.FixedPoint(iterations=3, tolerance=1e-1))
+PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=3, tolerance=1e-1))
 FILTER = fp.KalmanFilter(measured={"bis": 1.0}, noise={"c": 0.01, "e": 0.01})
 BELIEVED = fp.Sensing(observer=FILTER)
 FIRST = {"C1": 2.0, "C2": 0.6, "C3": 0.1, "Ce": 1.5}

@@ -26,7 +26,7 @@ PLANNED = """period=5e-3, duration=1.0, measure_from=0.5,
     limits=fp.Limits(inputs={"u": (-30.0, 30.0)})"""
 NOISY = f"""{PLANNED[:-1]}, states={{"y'": (-0.9, 1.0)}}, rates={{"u": (-60.0, 60.0)}}),
     sensing=fp.Sensing({{"y''": fp.Sensor(noise=fp.Noise(0.2))}})"""
-MORE = """optimiser = fp.FixedPoint(iterations=3, tolerance=1e-3)
+MORE = """optimiser = fp.FixedPointSolver(iterations=3, tolerance=1e-3)
 controllers["RHC"] = fp.RecedingHorizon(optimiser)
 controllers["RHC+FPI"] = fp.RecedingHorizon(optimiser, fp.ModelReferenced(fp.Affine(gain=-0.7)))
 """

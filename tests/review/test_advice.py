@@ -168,8 +168,10 @@ def test_a_slip_of_units_is_named_where_a_controller_does_not_fit_and_where_it_i
     light = fp.Plant({"q": "m"}, {"u": "N"}, known, falls)
     problem = mass(plant=light, horizon=fp.Horizon(20, 0.02), cost=fp.Quadratic({"q": 1e2}, deviation={"u": 1e-2}))
     mend = "Mend m of the model: is it a slip of units?"
-    [fits] = answers(problem, fp.RecedingHorizon(fp.FixedPoint())).values()  # that it does not fit is all that is said
-    assert (fits.key, fits.verdict, fits.change.startswith(f"{mend} FixedPoint")) == ("fits", "no", True)
+    [fits] = answers(
+        problem, fp.RecedingHorizon(fp.FixedPointSolver())
+    ).values()  # that it does not fit is all that is said
+    assert (fits.key, fits.verdict, fits.change.startswith(f"{mend} FixedPointSolver")) == ("fits", "no", True)
     first, *others = (a for a in answers(problem).values() if a.change)
     assert (first.evidence, {a.change for a in others}) == ("In the model m is 0.001 times the plant's.", {mend})
 
@@ -282,6 +284,6 @@ def test_rows_of_one_controller_agree_on_its_gain():
     plan = {"horizon": fp.Horizon(15, 2e-2), "cost": fp.Quadratic({"q": 1e2, "q'": 1.0}, deviation={"u": 1e-2})}
     ends = fp.Limits(inputs={"u": (-30.0, 30.0)}, states={"q'": (-1.0, 1.0)}, prices={"q'": 1e4})
     fast = {"reference": fp.Trajectory(lambda t: {"q": 0.5 * ca.sin(5 * t)}), "start": {"q": 0.3}, "period": 5e-3}
-    own = fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(-1.0)))
+    own = fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Sigmoid(-1.0)))
     told = answers(mass(limits=ends, measure_from=1.0, **plan, **fast), own)
     assert {told[key].change for key in ("follows", "pays")} == {"Leave the deformation out."}

@@ -25,7 +25,7 @@ def drifting(*, exact: float = POLE) -> fp.Problem:
 
 
 def planned(*deformation: Deformation) -> Controller:
-    return fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3), *deformation)
+    return fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3), *deformation)
 
 
 def alone(problem: fp.Problem, controller: Controller) -> Any:

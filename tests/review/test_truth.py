@@ -53,7 +53,7 @@ def foreign(name: str, *controllers: str, variant: str = "problem") -> Pick:
     return shipped(name, *controllers, of=lambda n: load(n, variant))
 
 
-sigmoid = lambda gain: fp.RecedingHorizon(fp.FixedPoint(), fp.ModelReferenced(fp.Sigmoid(gain=gain)))  # noqa: E731
+sigmoid = lambda gain: fp.RecedingHorizon(fp.FixedPointSolver(), fp.ModelReferenced(fp.Sigmoid(gain=gain)))  # noqa: E731
 LOADED = lambda q, v, u, p: {"q": u.u, "load": 100 * (q.q - q.load) - 0.3 * v.load}  # noqa: E731
 PLANT = fp.Plant({"q": "rad", "load": "rad"}, {"u": "rad/s^2"}, {}, LOADED, controlled=["q"])
 SINES = fp.Trajectory(lambda t: {"q": ca.sin(t), "load": ca.sin(t)})

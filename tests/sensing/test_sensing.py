@@ -304,7 +304,7 @@ def test_another_reality_begins_with_its_own_estimates():
     task, other = sensed_slowly(gain=1.0), sensed_slowly(gain=1.3)
     for law in (
         ADAPTIVE.with_deformation(fp.ModelReferenced(fp.Affine(gain=-0.05))),
-        fp.RecedingHorizon(fp.FixedPoint(1, 1e-3)),
+        fp.RecedingHorizon(fp.FixedPointSolver(1, 1e-3)),
     ):
         shared = fp.simulator(task, law, compiled=False).run(seed=0, variant=other)
         own = run(other, law)

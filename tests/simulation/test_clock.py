@@ -15,7 +15,7 @@ PROBLEM = replace(two_masses(), duration=0.4)
 PERIOD = PROBLEM.period
 CONTROLLERS = {
     "computed torque": fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Sigmoid(gain=-0.5, scale=50.0)),
-    "plan": fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-3)),
+    "plan": fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-3)),
 }
 
 

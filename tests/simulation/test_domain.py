@@ -17,7 +17,7 @@ from fpirhc.contracts import Controller, Deformation, Layout, Wrapper, scalar
 
 SHAPE = fp.Sigmoid(gain=-0.5, scale=2.0)
 TRACK = fp.Exponential(rate=3.0)
-PLAN = fp.FixedPoint(iterations=2, tolerance=1e-3)
+PLAN = fp.FixedPointSolver(iterations=2, tolerance=1e-3)
 TANK = fp.Problem(
     plant=fp.Plant(
         coordinates={"h": "m"},

@@ -34,13 +34,13 @@ def test_settings_are_changed_by_path_and_nothing_else_is(way):
     """Fields, keys of mappings and what any wrappers hold, named or not; the controller that was given stays as it was."""
     cost = fp.Quadratic(states={"q": 1.0, "q'": 2.0}, deviation={"u": 3.0})
     form = fp.ModelReferenced(fp.Filtered(fp.Sigmoid(gain=-0.5), pole=0.5))
-    inner = fp.RecedingHorizon(fp.FixedPoint(iterations=1, tolerance=1e-2), form, cost=cost)
+    inner = fp.RecedingHorizon(fp.FixedPointSolver(iterations=1, tolerance=1e-2), form, cost=cost)
     values = {"deformation.gain": -0.7, "deformation.shift": 0.2, "cost.states.q'": 5.0, "optimiser.iterations": 3}
     wrapped = fp.Predicted(fp.ExactModel(inner), inputs=0.1)
     changed: Any = fp.with_settings(wrapped, {f"{way}{path}": value for path, value in values.items()})
     assert changed.deformation == fp.ModelReferenced(fp.Filtered(fp.Sigmoid(gain=-0.7, shift=0.2), pole=0.5))
     assert dict(changed.controller.controller.cost.states) == {"q": 1.0, "q'": 5.0}
-    assert changed.controller.controller.optimiser == fp.FixedPoint(iterations=3, tolerance=1e-2)
+    assert changed.controller.controller.optimiser == fp.FixedPointSolver(iterations=3, tolerance=1e-2)
     assert inner.deformation == form
 
 

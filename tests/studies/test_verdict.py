@@ -251,7 +251,7 @@ def test_plans_contraction_and_null_tests_raise_flags_and_a_cost_says_what_count
     track = fp.Trajectory(lambda t: {"y": 1 - ca.cos(t), "z": ca.sin(t)})
     planned = {"horizon": fp.Horizon(5, 1e-2), "cost": fp.Quadratic({"y": 100.0}, deviation={"u": 1.0, "w": 1.0})}
     one = fp.Problem(plant, track, {"y": 0.0, "z": 0.1}, period=1e-2, duration=6.0, judged=("y", "z"), **planned)
-    law, plan = fp.ComputedTorque(fp.Exponential(rate=6.0)), fp.RecedingHorizon(fp.FixedPoint(1, 1e-12))
+    law, plan = fp.ComputedTorque(fp.Exponential(rate=6.0)), fp.RecedingHorizon(fp.FixedPointSolver(1, 1e-12))
     pairs = {n: one.with_deformation(fp.Affine(-0.9)) for n, one in (("law+FPI", law), ("plan+FPI", plan))}
     far = fp.ExactModel(replace(plan, cost=fp.Quadratic({"y": 1.0}, {"u": 1.0})))
     laws = {"law": law, "plan": plan, **pairs, "far": far}
@@ -267,7 +267,7 @@ def test_plans_contraction_and_null_tests_raise_flags_and_a_cost_says_what_count
     root = replace(tank().plant, response=lambda q, u, p: {"y": u.u - p.rate * ca.sqrt(q.y - 0.9)})
     dry = {"limits": fp.Limits(inputs={"u": (0.0, 4.0)}), "cost": fp.Quadratic({"y": 1e2}, {"u": 1e-2})}
     dry |= {"reference": fp.Trajectory(lambda t: {"y": 0.7 + 0 * t}), "horizon": fp.Horizon(10, 0.05)}
-    plan = fp.RecedingHorizon(fp.FixedPoint())
+    plan = fp.RecedingHorizon(fp.FixedPointSolver())
     pair = {"plan": plan, "plan+FPI": plan.with_deformation(fp.Affine(-0.5))}
     first = fp.compare(tasks.made(replace(tank(), plant=root, **dry), pair), seed=0, compiled=False).findings[0]
     assert "of cycles a plan met nan, and the last plan went on: look at roots" in first.text
@@ -337,7 +337,7 @@ def test_a_hard_limit_that_a_run_breaks_is_told():
         limits, still = fp.Limits(states={"q'": (-limit, limit)}, prices=prices), fp.Trajectory(lambda t: {"q": 0 * t})
         planned = {"period": 0.05, "duration": 1.0, "limits": limits, "horizon": horizon, "cost": cost}
         one = fp.Problem(mass, still, {"q": 0.0, "q'": -1.5 * size}, **planned)
-        plan = fp.RecedingHorizon(fp.FixedPoint(iterations=5, tolerance=1e-3))
+        plan = fp.RecedingHorizon(fp.FixedPointSolver(iterations=5, tolerance=1e-3))
         return [n for n in fp.compare(tasks.made(one, {"p": plan}), seed=0, compiled=False)["p"].notes if "hard" in n]
 
     assert notes(1.0) == ["q' reaches -1.5 m/s, beyond its hard limit of -1 m/s, in 5 % of the cycles"]
@@ -354,7 +354,7 @@ limits = fp.Limits(inputs={"F": (-20.0, 20.0)}, states={"x'": (-1.5, 1.5)})
 problem = fp.Problem(plant, fp.Trajectory(lambda t: {"x": 1 - ca.cos(2 * t)}), {"x": 0.0}, period=0.01, duration=4.0,
     limits=limits, horizon=fp.Horizon(stages=10, step=0.05), cost=fp.Quadratic(states={"x": 100.0, "x'": 1.0}))
 law, adapted = fp.ComputedTorque(fp.Exponential(6.0)), fp.ModelReferenced(fp.Affine(gain=-0.8))
-controllers = {"law": law, "law+FPI": law.with_deformation(adapted), "plan": fp.RecedingHorizon(fp.FixedPoint())}
+controllers = {"law": law, "law+FPI": law.with_deformation(adapted), "plan": fp.RecedingHorizon(fp.FixedPointSolver())}
 '''
 
 

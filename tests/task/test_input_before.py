@@ -29,7 +29,7 @@ PROBLEM = fp.Problem(
 COMPUTED = fp.ComputedTorque(fp.Exponential(rate=6.0))
 
 
-def planned(problem: fp.Problem, optimiser: fp.Ipopt | fp.FixedPoint) -> float:
+def planned(problem: fp.Problem, optimiser: fp.Ipopt | fp.FixedPointSolver) -> float:
     """The first planned input."""
     run = fp.simulate(replace(problem, duration=PERIOD), fp.RecedingHorizon(optimiser), seed=0, compiled=False)
     return float(run["command.u"][0])
@@ -64,7 +64,7 @@ def test_the_first_weight_of_a_rate_is_counted_from_it():
     cost = replace(COST, rate={"u": 1e9})
     for before in (0.0, 3.0, -7.0):
         problem = replace(PROBLEM, cost=cost, input_before={"u": before})
-        for optimiser in (fp.Ipopt(), fp.FixedPoint(iterations=3, tolerance=1e-3)):
+        for optimiser in (fp.Ipopt(), fp.FixedPointSolver(iterations=3, tolerance=1e-3)):
             assert planned(problem, optimiser) == pytest.approx(before, abs=1e-4)
 
 

@@ -57,7 +57,7 @@ def task(plant: fp.Plant, signals: Any = None, **changes: Any) -> fp.Problem:
 OUTSIDE = fp.outside(nominal=283.0, unit="K")
 POINTS = [0.0, 6.0, 12.0, 18.0, 24.0, 30.0], [283.0, 276.0, 274.0, 281.0, 285.0, 279.0]
 NIGHT = lambda t: ca.pw_lin(t, *POINTS)  # noqa: E731
-RHC = fp.RecedingHorizon(fp.FixedPoint(iterations=4, tolerance=1e-6))
+RHC = fp.RecedingHorizon(fp.FixedPointSolver(iterations=4, tolerance=1e-6))
 CTC = fp.ComputedTorque(fp.Exponential(rate=0.6))
 CONTROLLERS = {
     "CTC": CTC,
@@ -187,7 +187,7 @@ def test_a_cost_sees_signals_from_outside():
     def flat(view):
         return {"comfort": (view.state.air - 293.0) ** 2, "heat": 0.05 * 0.2 * view.input.heat**2}
 
-    controller = fp.RecedingHorizon(fp.FixedPoint(iterations=20, tolerance=1e-3))
+    controller = fp.RecedingHorizon(fp.FixedPointSolver(iterations=20, tolerance=1e-3))
     bought = {}
     for terms in (economic, flat):
         problem = priced(fp.CustomCost(terms))

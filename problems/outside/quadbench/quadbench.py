@@ -73,7 +73,7 @@ problem = fp.Problem(
 )
 
 GAIN, UPWARDS = -0.1, 1.8  # upwards only the motors lag, so the height bears more
-optimiser = fp.FixedPoint(
+optimiser = fp.FixedPointSolver(
     iterations=1, tolerance=1e-2
 )  # m/s^2; the real-time form: a flight computer has the same work in every cycle
 law = fp.Exponential(rate=3.0, integral=False)
