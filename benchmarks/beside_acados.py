@@ -8,7 +8,7 @@ Model, first state, weights, limits, 40 stages of 20 ms and a plan in every stag
 (examples/acados_python/getting_started): from hanging at rest to upright, |F| <= 80 N. Both discretise by one Runge-Kutta step
 per stage, so they solve the same problem. The simulator is scipy's DOP853 at 1e-10. The cost is the example's, summed over the
 states and commands of 3 s, from rest at three angles. Difference is the largest one of a command from that of acados, and time the
-median CPU time of a command, both from .3 rad with the right masses.
+median CPU time of a command, both from 0.3 rad with the right masses.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def main() -> None:
         )
         for name, own in flights.items()
     ]
-    heads = ["controller", "from pi", "from 1 rad", "from .3 rad", "from .3 rad, wrong masses", "difference, N"]
+    heads = ["controller", "from pi", "from 1 rad", "from 0.3 rad", "from 0.3 rad, wrong masses", "difference, N"]
     write_table("beside acados", [*heads, "time of a command"], rows, ROOT / "docs" / "beside.md")
     print(f"A command of fpirhc's RHC takes {unit:.3g} ms; {version()}.")
 

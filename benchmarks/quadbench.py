@@ -40,10 +40,10 @@ TURN = 2 * np.pi * 0.2  # rad/s, of the circle
 BUTTER = ((0.39133577, 0.78267155, 0.39133577), (0.36952738, 0.19581571))  # numerator; denominator without its one
 # Medians over the 140 trials, cm, of a study of a fork of the benchmark (commit 78819cb).
 PUBLISHED = {
-    "plain": "INDI 3.18, L1-MPC 3.96, xadap 5.48, MPC 6.01, SE3-like 12.3; NMPC with a Kalman filter .52 (the bound)",
+    "plain": "INDI 3.18, L1-MPC 3.96, xadap 5.48, MPC 6.01, SE3-like 12.3; NMPC with a Kalman filter 0.52 (the bound)",
     "noise": "L1-MPC 3.92, xadap 5.64, MPC 6.00, SE3-like 12.4, INDI 12.9; NMPC with a Kalman filter 1.00 (the bound)",
 }
-CIRCLE = "INDI .137, SE3 .147, L1-geometric .240, geometric .255, adaptive geometric .281 (arXiv 2510.03471)"
+CIRCLE = "INDI 0.137, SE3 0.147, L1-geometric 0.240, geometric 0.255, adaptive geometric 0.281 (arXiv 2510.03471)"
 
 
 class Rival(vehicle.Vehicle):
