@@ -110,9 +110,9 @@ problem = fp.Problem(
     # A derivative has a prime. The deviation is counted from the force that the model needs along the reference.
     cost=fp.Quadratic(states={"y": 1e2, "y'": 1.0}, deviation={"F": 1e-2}),
     measure_from=1.0,  # s: errors count from here on
-    # A real plant has more, each off until it is stated:
+    # A real plant has more, each off until it is stated (the window is 1 / (2 x period x bandwidth of the plan), docs/sensing.md):
     # dead_time=fp.DeadTime(inputs={"F": 0.01}),  # s, by which commands act late
-    # sensing=fp.Sensing({"y": fp.Sensor(noise=fp.Noise(1e-4))}, fp.SavitzkyGolay(window=21, degree=2)),  # positions alone
+    # sensing=fp.Sensing({"y": fp.Sensor(noise=fp.Noise(1e-4))}, fp.SavitzkyGolay(window=31, degree=2)),  # positions alone
 )
 
 optimiser = fp.FixedPointSolver()
