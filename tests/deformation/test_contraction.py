@@ -78,7 +78,33 @@ def test_both_signs_cannot_be_cured_by_a_gain(jacobian):
         run(jacobian, MAPS["Affine"], duration=0.6)
 
 
-def test_known_limits_of_the_sigmoid():
-    """J = diag(1.5, 1.3): |A_c| < 3.36."""
-    with pytest.raises(NotContractive, match=r"0 < \|gain\| < 3.36$"):
-        run([[1.5, 0.0], [0.0, 1.3]], fp.Sigmoid(gain=0.5, scale=100.0))
+# A gain matrix and coupled responses
+
+GAINS = [[0.8, 0.3], [-0.5, 0.4]]
+
+
+def test_the_inverse_of_the_gains_is_deadbeat():
+    """With A_c = -2 and W the inverse of the gains an error is gone after one cycle; one number for both leaves more."""
+    start = {"q0": 0.0, "q1": 0.0, "q0'": 2.0, "q1'": 3.0}  # on the reference
+    settings = {"period": 1e-2, "duration": 3.0, "measure_from": 1.0, "start": start}
+
+    def found(form):
+        return fp.measure(replace(masses(GAINS), **settings), run(GAINS, form, **settings))
+
+    inverse = tuple(map(tuple, np.linalg.inv(GAINS).round(3).tolist()))
+    weighted, *others = (
+        found(one) for one in (fp.Affine(-2.0, inverse), *(fp.Affine(g) for g in (-0.8, -1.6, -2.4, -2.8)))
+    )
+    errors = [np.linalg.norm([*one.rms_error.values()]) for one in (weighted, *others)]
+    assert errors[0] < 0.75 * min(errors[1:])
+    assert weighted["contraction.predicted"][""] < 2e-3
+    assert weighted["contraction.measured"][""] < 0.1
+
+
+def test_a_gain_that_converges_with_its_weights_alone_is_not_refused():
+    """The limit is that of the eigenvalues of J W: a sign turned by the weights is right, and refused without them."""
+    assert run(GAINS, fp.Affine(gain=0.5, weights=(-1.0, -1.0)), duration=0.6).stop is None
+    with pytest.raises(NotContractive, match="wrong sign"):
+        run(GAINS, fp.Affine(gain=0.5), duration=0.6)
+    with pytest.raises(NotContractive, match=r"use 0 < \|gain\| < 0\.559, where"):
+        run(GAINS, fp.Affine(gain=-0.9, weights=(1.0, 19.0)), duration=0.6)

