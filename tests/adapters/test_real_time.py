@@ -6,15 +6,46 @@ import signal
 import subprocess
 import sys
 import warnings
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.tank import PERIOD, TANK, Tank
 
 import fpirhc as fp
+from fpirhc.adapters.tclab import RealTime
 from fpirhc.errors import InvalidProblem
+
+PERIOD = 0.1
+TANK = fp.Plant(
+    {"h": "m"},
+    {"q": "m/s"},
+    {"outlet": fp.Parameter(approximate=0.3, exact=0.3, unit="1/s")},
+    lambda q, u, p: {"h": u.q - p.outlet * q.h},
+    order=1,
+)
+
+
+class Tank:
+    """Another outlet than the model's."""
+
+    def __init__(self, inflow: Callable[[], float], show: Callable[[float], None]) -> None:
+        self.inflow, self.show, self.now, self.level = inflow, show, 0.0, 1.0
+
+    @property
+    def clock(self) -> RealTime:
+        return RealTime(lambda: self.now, self.sleep)
+
+    def begin(self) -> None:
+        self.level = 1.0
+        self.show(self.level)
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+        self.level += seconds * (self.inflow() - 0.5 * self.level)
+        self.show(self.level)
+
 
 LONG = 2.95  # s, for which a write hangs
 LATE = "the cycle of 0.1 s ended 2.85 s late; choose a longer period, or a quicker bus or controller"

@@ -1,6 +1,7 @@
-"""Random settings, samples, faults and instances: what leaves Python answers as the stepper, in double bit by bit."""
+"""Random settings, samples, faults and instances: what leaves Python answers as the stepper, bit by bit; and what may not leave."""
 
 import ctypes
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -8,13 +9,14 @@ from functools import cache
 import numpy as np
 import pytest
 from helpers.exports import COMPILERS, Exported, exported
+from helpers.first_files import messages_of
 from helpers.kinds import slow_but
 from helpers.replay import samples as samples_of
 
 import fpirhc as fp
 from fpirhc import Status
+from fpirhc.__main__ import main
 
-pytestmark = pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 # Controllers of states, of outputs, of a map and of sensors, a plan, and what of each may be live.
 CASES = {
     "torque": ("two_mass", "CTC+FPI (eq 6)", ("deformation.gain", "tracking.rate", "limits.inputs.Q1.1")),
@@ -129,6 +131,7 @@ def back(device: Exported) -> None:
         assert device.stepper.change({path: start[path] for path in device.bounds})
 
 
+@pytest.mark.skipif(not COMPILERS, reason="no C compiler")
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", slow_but(CASES, "outputs", "plan"))
 def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, tmp_path):
@@ -156,3 +159,63 @@ def test_instances_with_settings_of_their_own_answer_as_the_stepper(name, seed, 
     assert not all(refused)
     statuses = {answer[0] for answers in wanted for _, answer in answers}
     assert {int(Status.BAD_SAMPLE), int(Status.BRIDGED)} <= statuses
+
+
+# Refusals: the whole message of each, with what to do instead
+WITH_IPOPT = """import fpirhc as fp
+
+problem = fp.load_problem("two_mass").problem
+controllers = {"ipopt": fp.RecedingHorizon(fp.Ipopt(1e-6), fp.Sigmoid(gain=-0.5, scale=50.0))}
+"""
+ROWS = messages_of("""
+two_mass RHC+FPI --to cc =>
+    the target 'cc' is unknown; one of arduino, c, fmu2, library, wasm, lab
+two_mas RHC+FPI =>
+    problem 'two_mas' is unknown. Did you mean 'two_mass'? Give the path of a problem file, or a name from 'fpirhc list'
+own.py ipopt =>
+    'ipopt' cannot be exported: it calls a solver that is not written as C, but linked as a library (coin-or/IpStdCInterface.h
+    is its header). In place of Ipopt use FixedPointSolver(iterations=1, tolerance=...), which is C of its own
+two_mass RHC+FPI --to wasm =>
+    the target wasm needs ziglang, not installed here: pip install 'fpirhc[compiler]'
+two_mass RHC+FPI --to fmu2 =>
+    the target fmu2 needs fmpy, not installed here: pip install 'fpirhc[fmu]'
+two_mass RHC+FPI --to library =>
+    a shared library needs a C compiler: compilation is turned off (FPIRHC_CC=none); install gcc or clang, or pip install
+    'fpirhc[compiler]'
+two_mass RHC+FPI --out full =>
+    'full' is not an empty folder; nothing in it is replaced; choose another with --out
+two_mass RHC+FPI --name 2nd =>
+    '2nd' cannot be the name of a controller in C: expected at most 40 letters, digits and underscores, a letter first, and no
+    word of C or of the files beside it. Did you mean 'c_2nd'?
+""")
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_what_is_refused_says_why_and_what_to_do(row, tmp_path, monkeypatch, capsys):
+    """Exit code 2, or 3 for a folder; one line, and nothing is written."""
+    words = re.findall(r"RHC\+FPI|\S+", row)
+    (tmp_path / "own.py").write_text(WITH_IPOPT)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for module in ("ziglang", "fmpy"):
+        monkeypatch.setitem(__import__("sys").modules, module, None)
+    if "library" in words:
+        monkeypatch.setenv("FPIRHC_CC", "none")
+    code = main(["export", *words, *([] if "--out" in words else ["--out", "new"])])
+    assert capsys.readouterr().err == f"fpirhc: {ROWS[row]}\n"
+    assert code == (3 if "full" in words else 2)
+    assert not (tmp_path / "new").exists()
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["mine.txt"]
+
+
+def test_a_compiler_that_does_not_work_is_named_and_no_folder(tmp_path, monkeypatch, capsys):
+    """One whose interpreter is not there cannot be started, which is no fault of the folder."""
+    path = tmp_path / "broken"
+    path.write_text("#!/no/such/interpreter\n")
+    path.chmod(0o700)
+    monkeypatch.setenv("FPIRHC_CC", str(path))
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "two_mass", "CTC+FPI (eq 6)", "--to", "library", "--out", "new"]) == 2
+    assert f"'{path}' cannot be started: No such file or directory" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()

@@ -68,7 +68,7 @@ ELSEWHERE = {  # members that need a plant of their own, with the tests that try
     "AdaptiveInverseDynamics": "controllers/test_adaptive_rivals.py",
     "SlotineLi": "controllers/test_adaptive_rivals.py",
     "Cascade": "outputs/test_cascade.py",
-    "FeedforwardOnly": "outputs/test_order_zero.py",
+    "FeedforwardOnly": "outputs/test_cascade.py",
 }
 
 

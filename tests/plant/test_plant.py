@@ -1,11 +1,15 @@
-"""Laws and mistakes of plants."""
+"""Laws and mistakes of plants, of their integrators, and of what a mismatch of P percent means."""
 
+import math
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 from helpers.plants import chain, linear, pendulum
+from helpers.tasks import made
+from scipy import stats
+from scipy.integrate import solve_ivp
 
 import fpirhc as fp
 
@@ -151,3 +155,156 @@ def test_mistakes_are_named(message):
         return
     with pytest.raises(fp.FpirhcError, match=r"(?s)" + message.replace("(", r"\(")):
         fp.Plant(**{**GOOD, **BAD[message]})
+
+
+# Integrators: order of convergence, and methods of scipy that control their error
+
+
+def _after(integrator, period, cycles):
+    plant = pendulum()
+    step, x = integrator.step(plant, period), np.array([1.0, 0.5])
+    for _ in range(cycles):
+        x = step(x, [0.3], plant.exact, [0.0]).full().ravel()
+    return x
+
+
+def _truth(plant, start, command, time, method="DOP853"):
+    def rate(_, x):
+        return plant.equations.rate(x, command, plant.exact).full().ravel()
+
+    return solve_ivp(rate, (0.0, time), start, method, rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+def test_runge_kutta_has_order_four():
+    """Halving the step divides the error by 2^4."""
+    truth = _truth(pendulum(), [1.0, 0.5], [0.3], 1.0)
+    errors = [np.linalg.norm(_after(fp.RungeKutta4(n), 0.1, 10) - truth) for n in (1, 2, 4, 8)]
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    np.testing.assert_allclose(orders, 4.0, atol=0.25, equal_nan=False)
+
+
+def test_forcing_adds_to_the_response():
+    """A forcing w on a free double integrator moves it by w t^2 / 2."""
+    plant = pendulum()
+    rate = plant.equations.forced_rate
+    free, forced = rate([0, 0], [0], plant.exact, [0]), rate([0, 0], [0], plant.exact, [2.5])
+    np.testing.assert_allclose((forced - free).full().ravel(), [0.0, 2.5], equal_nan=False)
+
+
+@pytest.mark.parametrize(("degree", "order"), [(2, 3.0), (3, 5.0)])
+def test_methods_have_their_order(degree, order):
+    """Halving the step divides the error by 2^order, of collocation at d points 2 d - 1."""
+    truth, counts = _truth(pendulum(), [1.0, 0.5], [0.3], 2.0), (1, 2, 4) if degree == 3 else (4, 8, 16)
+    methods = [fp.Collocation(n, degree, newton=5) for n in counts]
+    errors = [np.linalg.norm(_after(method, 0.5, 4) - truth) for method in methods]
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), order, atol=0.2, equal_nan=False)
+
+
+STIFF = fp.Plant(
+    coordinates={"slow": "K", "fast": "K"},
+    inputs={"u": "K"},
+    controlled=("fast",),
+    order=1,
+    response=lambda q, u, p: {"slow": -q.slow + q.fast, "fast": -p.rate * (q.fast - ca.cos(q.slow) - u.u)},
+    parameters={"rate": fp.Parameter(1e5, 1e5, "1/s")},
+)
+
+
+def test_a_stiff_plant_is_sent_to_collocation_which_follows_it():
+    """A mode of 1e5 1/s over steps of 50 ms: within 1e-4 of the truth; sub-steps of Runge-Kutta would be 2 500."""
+    step, x = fp.Collocation().step(STIFF, 0.05), np.array([0.5, 0.0])
+    for _ in range(20):
+        x = step(x, [0.1], STIFF.exact, [0.0, 0.0]).full().ravel()
+    np.testing.assert_allclose(x, _truth(STIFF, [0.5, 0.0], [0.1], 1.0, "Radau"), atol=1e-4, equal_nan=False)
+    reference = fp.Trajectory(lambda t: {"slow": 0.5 + 0 * t, "fast": 1.0 + 0 * t})
+    limits = fp.Limits(inputs={"u": (-2.0, 2.0)})
+    asked = {
+        "duration": 1.0,
+        "plant": STIFF,
+        "reference": reference,
+        "start": {"slow": 0.5, "fast": 0.9},
+        "limits": limits,
+        "period": 0.05,
+    }
+    with pytest.raises(fp.FpirhcError, match=r"use Reality\(..., integrator=Collocation\(\)\)"):
+        fp.Problem(**asked, reality=fp.Reality(STIFF))
+    fp.Problem(**asked, reality=fp.Reality(STIFF), integrator=fp.Collocation())
+
+
+# What a mismatch of P percent means, with a spread and without one
+
+
+def plant(**parameters: fp.Parameter) -> fp.Plant:
+    """A mass on a line that ignores its further parameters."""
+    return fp.Plant(
+        {"y": "m"}, {"u": "N"}, {"b": fp.Parameter(1.0, 1.0, "1/kg"), **parameters}, lambda q, v, u, p: {"y": p.b * u.u}
+    )
+
+
+def parameter(exact: float, spread: Any, **changes) -> fp.Parameter:
+    return fp.Parameter(approximate=exact, exact=exact, unit="1", spread=spread, **changes)
+
+
+def test_distributions_are_those_of_scipy():
+    """Quantiles of the uniform, and of the normal and log-normal cut off at two standard deviations."""
+    shares, cut = np.linspace(0.02, 0.98, 15), stats.truncnorm(-2.0, 2.0)
+    for spread, known in (
+        (fp.Uniform(absolute=0.4), stats.uniform(2.6, 0.8).ppf(shares)),
+        (fp.Normal(absolute=0.3), 3.0 + 0.3 * cut.ppf(shares)),
+        (fp.LogNormal(factor=1.3), 3.0 * np.exp(math.log(1.3) * cut.ppf(shares))),
+    ):
+        assert [spread.quantile(3.0, 1.0, s) for s in shares] == pytest.approx(known)
+
+
+def drawn(one: fp.Plant, percent: float) -> np.ndarray:
+    """Exact parameters of 200 plants that a study draws, shape (200, parameters)."""
+    reference = fp.Trajectory(lambda t: {"y": ca.sin(t)})
+    problem = fp.Problem(plant=one, reference=reference, start={"y": 0.0}, period=0.01, duration=1.0)
+    task = made(problem, {"CTC": fp.ComputedTorque(fp.Exponential(rate=6.0))})
+    return np.array([v.problem.real_plant.exact for v in fp.Draws(200, percent, 1).of(task)])
+
+
+def fills(values: np.ndarray, low: float, high: float) -> bool:
+    """Whether the values stay within an interval and come near both of its ends."""
+    near = 0.1 * (high - low)
+    return bool(low <= values.min() <= low + near and high - near <= values.max() <= high)
+
+
+def test_the_option_scales_spreads_and_keeps_its_meaning_elsewhere():
+    """50 %: half of an absolute width of 4, the square root of a factor at two deviations, and 50 % of what has no spread."""
+    zero = fp.Parameter(0.0, 0.0, "1")
+    parameters = {
+        "a": parameter(300.0, fp.Uniform(absolute=4.0)),
+        "k": parameter(-5.0, fp.LogNormal(factor=1.2)),
+        "zero": zero,
+    }
+    b, a, k, none = drawn(plant(**parameters), 50.0).T
+    assert fills(b, 0.5, 1.5)
+    assert fills(a, 298.0, 302.0)
+    assert fills(k, -5.0 * 1.2, -5.0 / 1.2)
+    assert not none.any()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: fp.Uniform(absolute=-1.0), "absolute: expected a finite number above 0, got -1.0"),
+        (lambda: fp.LogNormal(factor=0.9), "a number above 1"),
+        (
+            lambda: plant(z=parameter(0.0, fp.LogNormal(factor=2.0))),
+            "parameter 'z': spread: it has the value 0.*use Uniform or Normal",
+        ),
+        (lambda: plant(z=fp.Parameter(1.0, 1.0, "1", spread=0.3)), "expected a Spread or None, got 0.3"),  # type: ignore[arg-type]
+        # 100 % has no meaning for a parameter that could change its sign; with spreads everywhere it has.
+        (lambda: drawn(plant(a=parameter(2.0, fp.Uniform(absolute=0.1))), 100.0), "less than 100"),
+        (lambda: drawn(plant(), -1.0), "at least 0"),
+        # 0.5 -+ 0.3 leaves (0.35, 1): half of the spread stays inside.
+        (
+            lambda: drawn(plant(c=parameter(0.5, fp.Uniform(absolute=0.3), bounds=(0.35, 1.0))), 60.0),
+            r"parameter 'c'.*at most 50 % stay inside",
+        ),
+    ],
+)
+def test_wrong_spreads_are_refused(make, message):
+    with pytest.raises(fp.FpirhcError, match=message):
+        make()

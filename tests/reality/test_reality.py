@@ -1,4 +1,4 @@
-"""A reality that is not the model: what moves, what the controller is given, and what "exact" then means."""
+"""A reality that is not the model: what moves, what the controller is given, outputs, signals, and what "exact" then means."""
 
 from dataclasses import replace
 from typing import Any
@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import drives
 from helpers.drives import CONTROLLERS, FPI, PAIRS, PERIOD, SENSING, TAU, TRACK, lagged, parameters, run, task
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import fpirhc as fp
@@ -196,3 +197,173 @@ def test_no_cost_of_states_that_do_not_exist():
     """A plan has the believed tissue; a run is judged by its error, and its cost is left out."""
     costs = [fp.measure(one, run(one, BLOOD))["cost"] for one in (other(duration=0.5), infusion(duration=0.5))]
     assert [bool(one) for one in costs] == [False, True]
+
+
+# A model with outputs: realities have these by name, and states of their own
+MINUTES = 1 / 12  # min
+FOLLOWED = fp.ComputedTorque(fp.Exponential(rate=1.5))
+OF_PATIENT = fp.Sigmoid(gain=-2.0, shift=0.3, scale=20.0)
+PLAN = fp.RecedingHorizon(fp.FixedPointSolver(iterations=3, tolerance=1e-1))
+BY_BIS = fp.KalmanFilter(measured={"bis": 1.0}, noise={"c": 0.01, "e": 0.01})
+SEEN = fp.Sensing(observer=BY_BIS)
+FIRST = {"C1": 2.0, "C2": 0.6, "C3": 0.1, "Ce": 1.5}
+START = 93.0 / (1 + (1.5 / 4.1) ** 1.36)
+RATES = (1.9 + 1.1 + 0.84, 1.1, 0.84, 4.27, 16.0, 238.0)  # clearances, l/min, and volumes, l
+
+
+def depth(site: Any, p: Any, top: float) -> Any:
+    """Depth of anaesthesia by the concentration at the effect site."""
+    return top / (1 + (site / p.C50) ** p.steepness)
+
+
+def constants(half: float, steepness: float, speed: float) -> dict[str, fp.Parameter]:
+    return {
+        "C50": fp.Parameter(half, half, "mg/l"),
+        "steepness": fp.Parameter(steepness, steepness, "1"),
+        "ke0": fp.Parameter(speed, speed, "1/min"),
+    }
+
+
+def model(one: str = "c", site: str = "e") -> fp.Plant:
+    """One compartment and an effect site, under free names."""
+
+    def rates(x: Any, u: Any, p: Any) -> dict[str, Any]:
+        return {one: -0.3 * x[one] + u.u / 8, site: p.ke0 * (x[one] - x[site])}
+
+    return fp.Plant.of_states(
+        states={one: "mg/l", site: "mg/l"},
+        inputs={"u": "mg/min"},
+        parameters=constants(4.5, 1.5, 0.3),
+        rates=rates,
+        outputs={"bis": fp.Output("1", lambda x, p: depth(x[site], p, 92.0))},
+        time_unit="min",
+    )
+
+
+def moved(x: Any, u: Any, ke0: Any) -> list[Any]:
+    """Rates of the patient, of numbers and of expressions: three compartments and an effect site."""
+    out, fast, slow, blood, muscle, fat = RATES
+    return [
+        (-out * x[0] + fast * x[1] + slow * x[2] + u) / blood,
+        fast / muscle * (x[0] - x[1]),
+        slow / fat * (x[0] - x[2]),
+        ke0 * (x[0] - x[3]),
+    ]
+
+
+def patient(unit: str = "1", output: str = "bis") -> fp.Plant:
+    """Three compartments and an effect site, with another curve."""
+    return fp.Plant.of_states(
+        states=dict.fromkeys(FIRST, "mg/l"),
+        inputs={"u": "mg/min"},
+        parameters=constants(4.1, 1.36, 0.2),
+        rates=lambda x, u, p: dict(zip(FIRST, moved([x[n] for n in FIRST], u.u, p.ke0), strict=True)),
+        outputs={output: fp.Output(unit, lambda x, p: depth(x.Ce, p, 93.0))},
+        time_unit="min",
+    )
+
+
+def lightly(t: Any) -> dict[str, Any]:
+    """From light sedation to 50, and to 45."""
+    return {"bis": 50 + (START - 50) * (1 + t / 1.5) * ca.exp(-t / 1.5) - 5 / (1 + ca.exp(-2 * (t - 12)))}
+
+
+def sedation(**changes: Any) -> fp.Problem:
+    """The patient, of whom the bis is measured, with the model of one compartment."""
+    settings: dict[str, Any] = {
+        "plant": model(),
+        "reference": fp.Trajectory(lightly),
+        "start": {"c": 1.5, "e": 1.5},
+        "period": MINUTES,
+        "duration": 20.0,
+        "reality": fp.Reality(patient(), start=FIRST),
+        "sensing": SEEN,
+        "limits": fp.Limits(inputs={"u": (0.0, 400.0)}),
+        "horizon": fp.Horizon(stages=10, step=3 * MINUTES),
+        "cost": fp.Quadratic(outputs={"bis": 1.0, "bis'": 0.1}, rate={"u": 1e-5}),
+    }
+    return fp.Problem(**(settings | changes))
+
+
+def sedated(problem: fp.Problem, controller: Any = FOLLOWED) -> fp.Run:
+    return fp.simulate(problem, controller, seed=0, compiled=False)
+
+
+# A reality
+
+
+def test_it_moves_as_scipy_says():
+    """The commands, held over every cycle, move the patient's own equations alike; the bis is the patient's curve."""
+    result = sedated(sedation(duration=2.0), replace(FOLLOWED, deformation=OF_PATIENT))
+    x, states = np.array(list(FIRST.values())), []
+    for u in np.asarray(result["command"]).ravel():
+        states.append(x)
+        x = solve_ivp(lambda t, x, u=u: moved(x, u, 0.2), (0, MINUTES), x, rtol=1e-11, atol=1e-13).y[:, -1]
+    np.testing.assert_allclose(result["reality_state"], states, rtol=2e-6)
+    np.testing.assert_allclose(result["output.bis"], 93 / (1 + (np.array(states)[:, 3] / 4.1) ** 1.36), rtol=2e-6)
+
+
+# A signal acts in every step of what moves with the value in its middle
+MEAL = 5.0
+INTEGRAL = fp.ComputedTorque(fp.Exponential(rate=0.01))
+
+
+def pulse(t):
+    """10 units in two minutes, from 7 to 9; their cycle is that from 5 to 10."""
+    return 5.0 * ca.logic_and(t >= 7.0, t < 9.0)
+
+
+def stored(step):
+    """A map that stores what comes in."""
+    return fp.Plant.discrete(
+        states={"x": "g", "y": "g"},
+        inputs={"u": "g/min"},
+        next=lambda x, u, p: {"x": x.x + step * p.eaten, "y": x.y + step * u.u},
+        step=step,
+        outputs={"y": fp.Output("g", lambda x, p: x.y)},
+        time_unit="min",
+        parameters={"eaten": fp.outside(nominal=0.0, unit="g/min")},
+    )
+
+
+def flowing():
+    """The same as differential equations."""
+    return fp.Plant.of_states(
+        states={"x": "g", "y": "g"},
+        inputs={"u": "g/min"},
+        rates=lambda x, u, p: {"x": p.eaten, "y": u.u},
+        parameters={"eaten": fp.outside(nominal=0.0, unit="g/min")},
+        outputs={"y": fp.Output("g", lambda x, p: x.y)},
+        time_unit="min",
+    )
+
+
+def eating(plant, reality, signal=pulse, **more):
+    return fp.Problem(
+        plant=plant,
+        reality=reality,
+        reference=fp.Trajectory(lambda t: {"y": 0 * t}),
+        start={"x": 0.0, "y": 0.0},
+        period=MEAL,
+        duration=60.0,
+        signals={"eaten": fp.Unknown(signal)},
+        **more,
+    )
+
+
+@pytest.mark.parametrize(
+    "task",
+    [
+        eating(stored(MEAL), fp.Reality(stored(1.0))),
+        eating(flowing(), fp.Reality(flowing(), integrator=fp.RungeKutta4(substeps=5))),
+        eating(flowing(), fp.Reality(flowing(), integrator=fp.Collocation(substeps=5))),
+    ],
+    ids=["map", "Runge-Kutta", "collocation"],
+)
+def test_what_is_stated_is_what_arrives(task):
+    """All 10 units, in the cycle in which they come; the signal that is shown is the mean over the cycle."""
+    run = fp.simulate(task, INTEGRAL, seed=0, compiled=False)
+    assert run.stop is None
+    x = run["reality_state"][:, 0]
+    assert x == pytest.approx(np.where(run["time"].ravel() > 7.0, 10.0, 0.0), abs=1e-12)
+    assert run["signals.eaten"].sum() * MEAL == pytest.approx(10.0, abs=1e-12)

@@ -1,5 +1,14 @@
-"""The closed loop: laws of adaptation, clipping, finiteness, disturbances, and running in several ways."""
+"""The closed loop: laws of adaptation, clipping, finiteness, disturbances, harm that is warned of, and saved runs."""
 
+import io
+import json
+import os
+import pickle
+import re
+import warnings
+import zipfile
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -9,7 +18,7 @@ from helpers.faults import Failing
 from helpers.plants import heavy, linear, swing
 
 import fpirhc as fp
-from fpirhc.errors import InvalidProblem
+from fpirhc.errors import InvalidProblem, OutputError
 
 TRACK = fp.Exponential(rate=6.0)
 
@@ -149,3 +158,154 @@ def test_eigenvalues_of_both_signs_are_refused():
     problem = line(1.0, 1.0, plant=crossed, reference=reference, start={"y": 0.0, "z": 0.0})
     with pytest.raises(fp.FpirhcError, match="both signs"):
         run(problem, fp.Sigmoid(gain=-0.5, scale=1.0))
+
+
+# A controller that does better without its adaptation is warned of once
+PROBLEM = fp.Problem(
+    plant=linear(1.02, 1.0),
+    reference=fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}),
+    start={"y": 0.0, "y'": 3.0},
+    period=5e-3,
+    duration=4.0,
+    measure_from=1.0,
+)
+GENTLE = fp.ComputedTorque(fp.Exponential(rate=6.0), fp.Affine(gain=-0.05))
+TEXT = (
+    r"ComputedTorque: adaptation does harm, by runs of 300 cycles: on the plant the rms error of y is (\S+) m without adaptation, "
+    r"(\S+) m with it; on its own model, with nothing to adapt the rms error of y is (\S+) m without adaptation, (\S+) m with it\. "
+)
+
+
+def told(problem: fp.Problem, controller) -> list[str]:
+    """Texts of the warnings of one stepper, which then steps."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        stepper = fp.Stepper(problem, controller, compiled=False)
+        memory = stepper.start()
+        for k in range(3):
+            _, memory = stepper.step(k * problem.period, problem.start_state, np.zeros(1), memory)
+    assert all(one.category is fp.HarmfulAdaptation for one in caught)
+    assert all(one.filename == __file__ for one in caught)
+    return [str(one.message) for one in caught]
+
+
+def test_a_gentle_plain_form_is_warned_of_once_with_its_numbers():
+    """The numbers are those of runs of 300 cycles, half of which count."""
+    [text] = told(PROBLEM, GENTLE)
+    found = re.search(TEXT, text)
+    assert found
+    short = replace(PROBLEM, duration=1.5, measure_from=0.75)
+    own = replace(short, plant=linear(1.02, 1.02))
+    runs = [(p, c) for p in (short, own) for c in (GENTLE.with_deformation(fp.Identity()), GENTLE)]
+    rms = [fp.measure(p, fp.simulate(p, c, seed=0, compiled=False)).rms_error["y"] for p, c in runs]
+    assert [float(number) for number in found.groups()] == pytest.approx(rms, rel=6e-3)
+    assert rms[1] > 2 * rms[0]
+    assert rms[3] > rms[0]
+
+
+@pytest.mark.parametrize("map_", [fp.ModelReferenced(fp.Affine(gain=-0.05)), fp.ModelReferenced(fp.Affine(gain=-0.8))])
+def test_the_model_referenced_form_is_not_warned_of(map_):
+    """It leaves an exact model alone, whatever its gain."""
+    assert told(PROBLEM, replace(GENTLE, deformation=map_)) == []
+
+
+def test_as_an_error_it_stops_the_build():
+    """Who wants no such controller on a machine turns the warning into an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", fp.HarmfulAdaptation)
+        with pytest.raises(fp.HarmfulAdaptation, match="adaptation does harm"):
+            fp.Stepper(PROBLEM, GENTLE, compiled=False)
+
+
+# Saved runs: written at once or not at all, and read with a schema whatever the file holds
+
+
+@pytest.fixture(scope="module")
+def saved() -> fp.Run:
+    """A short run."""
+    problem = swing(duration=0.05, measure_from=0.0)
+    return fp.simulate(problem, fp.ComputedTorque(fp.Exponential(rate=6.0)), seed=0, compiled=False)
+
+
+def npy(array: Any) -> bytes:
+    """An array as numpy stores it."""
+    content = io.BytesIO()
+    np.lib.format.write_array(content, np.asarray(array), allow_pickle=True)
+    return content.getvalue()
+
+
+def write(path: Path, **parts: bytes) -> None:
+    """A zip of named parts."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in parts.items():
+            file.writestr(f"{name}.npy", content)
+
+
+def facts_of(path: Path) -> dict[str, Any]:
+    """The facts of a file."""
+    with np.load(path) as stored:
+        facts: dict[str, Any] = json.loads(str(stored["facts"]))
+    return facts
+
+
+HOSTILE = {
+    "no zip": lambda log, facts: b"PK\x03\x04 nothing",
+    "empty": lambda log, facts: b"",
+    "format": lambda log, facts: {**facts, "format": 9},
+    "no mapping": lambda log, facts: [1],
+    "no period": lambda log, facts: {k: v for k, v in facts.items() if k != "period"},
+    "signals of another size": lambda log, facts: {**facts, "signals": facts["signals"][:-1]},
+    "same signal twice": lambda log, facts: {**facts, "signals": [*facts["signals"][:-1], facts["signals"][0]]},
+    "flat log": lambda log, facts: log.ravel(),
+    "log of texts": lambda log, facts: log.astype(str),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_a_hostile_file_is_refused_in_one_way(case, saved, tmp_path):
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    saved.save(good)
+    change = HOSTILE[case](saved.log, facts_of(good))
+    if isinstance(change, bytes):
+        bad.write_bytes(change)
+    elif isinstance(change, np.ndarray):
+        write(bad, log=npy(change), facts=npy(json.dumps(facts_of(good))))
+    else:
+        write(bad, log=npy(saved.log), facts=npy(json.dumps(change)))
+    with pytest.raises(OutputError, match="cannot read a run from"):
+        fp.load_run(bad)
+
+
+def test_a_file_runs_no_code(tmp_path, saved):
+    """Pickles are refused, wherever they stand."""
+
+    class Trap:
+        def __reduce__(self):
+            return (os.mkdir, (str(tmp_path / "ran"),))
+
+    (tmp_path / "bad.npz").write_bytes(pickle.dumps(Trap()))
+    write(tmp_path / "worse.npz", log=npy(np.array([Trap()], dtype=object)), facts=npy("{}"))
+    for name in ("bad.npz", "worse.npz"):
+        with pytest.raises(OutputError):
+            fp.load_run(tmp_path / name)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_folders_and_missing_files_are_refused(tmp_path):
+    for path in (tmp_path, tmp_path / "none.npz"):
+        with pytest.raises(OutputError, match="cannot read a run from"):
+            fp.load_run(path)
+
+
+def test_a_write_that_fails_leaves_the_earlier_file(saved, tmp_path, monkeypatch):
+    saved.save(tmp_path / "run.npz")
+    before = (tmp_path / "run.npz").read_bytes()
+
+    def full(handle: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputError, match=r"cannot write the run to .*No space left on device"):
+        saved.save(tmp_path / "run.npz")
+    assert (tmp_path / "run.npz").read_bytes() == before
+    assert os.listdir(tmp_path) == ["run.npz"]

@@ -1,4 +1,4 @@
-"""Set-points: the filter is exact, every controller follows it as a trajectory, and a run may have others without another build."""
+"""References: set-points whose filter is exact, disturbances, the input before the first cycle, and other exact parameters."""
 
 from dataclasses import replace
 from typing import Any
@@ -10,7 +10,8 @@ from helpers import tasks
 from helpers.plants import chain
 
 import fpirhc as fp
-from fpirhc.errors import InvalidName, InvalidProblem
+from fpirhc.contracts import Disturbance
+from fpirhc.errors import InvalidName, InvalidProblem, InvalidValue
 
 STEPS = {"q1": [(0.0, 2.2), (0.1, 2.4)], "q2": [(0.0, 5.4), (0.1, 5.6), (0.2, 5.3)]}
 
@@ -206,3 +207,149 @@ def test_predicted_says_that_set_points_are_late():
     late = round(0.06 / problem.period)
     lag = run[f"plant_state.{name}"][late:] - run[f"reference.{name}"][:-late]
     assert np.abs(lag).max() < 0.2 * np.abs(run[f"true_error.{name}"]).max()
+
+
+def test_derivatives_up_to_the_order():
+    """For y = sin 2t the k-th derivative is 2^k sin(2t + k pi/2)."""
+    state, response = fp.Trajectory(lambda t: {"y": ca.sin(2 * t)}).function(chain(4))(0.3)
+    result = np.append(state.full().ravel(), float(response))
+    expected = [2**k * np.sin(0.6 + k * np.pi / 2) for k in range(5)]
+    np.testing.assert_allclose(result, expected, rtol=1e-12, equal_nan=False)
+
+
+def test_missing_and_unknown_coordinates():
+    with pytest.raises(InvalidProblem, match=r"(?s)'z' is unknown.*'y' has no nominal motion"):
+        fp.Trajectory(lambda t: {"z": t}).function(chain(2))
+
+
+# Disturbances: what they are at which time
+
+
+TIMES = np.linspace(0, 2, 21)
+
+
+def _values(disturbance, seed=0):
+    return disturbance.values(TIMES, np.random.default_rng(seed))
+
+
+def test_step_and_pulse():
+    """Edges are where they were asked for."""
+    assert _values(fp.Step(at=1.0, size=3.0)).tolist() == [0.0] * 10 + [3.0] * 11
+    assert _values(fp.Step(at=0.5, duration=0.5, size=2.0)).sum() == pytest.approx(10.0)
+
+
+def test_noise_is_drawn_from_the_seed():
+    assert np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 4))
+    assert not np.array_equal(_values(fp.Noise(1.0), 4), _values(fp.Noise(1.0), 5))
+
+
+def test_formula_must_be_finite():
+    np.testing.assert_allclose(_values(fp.Formula(lambda t: ca.exp(-t))), np.exp(-TIMES), equal_nan=False)
+    with pytest.raises(InvalidValue, match="not finite at t = 0"):
+        _values(fp.Formula(lambda t: 1 / t))
+
+
+def test_a_disturbance_of_a_users_own_acts_with_its_values():
+    """A sawtooth on the response of y'' = 0: the speed is its integral, cycle by cycle."""
+
+    class Sawtooth(Disturbance):
+        def values(self, times, random):  # noqa: ARG002
+            return 3.0 * np.mod(times + 1e-12, 0.5)
+
+    reference = fp.Trajectory(lambda t: {"y": 0 * t})
+    problem = fp.Problem(chain(2), reference, {"y": 0.0}, 0.1, 2.0, disturbances={"y": Sawtooth()})
+    still = fp.ComputedTorque(fp.Exponential(rate=1e-9, integral=False))
+    speed = fp.simulate(problem, still, seed=0, compiled=False)["state.y'"]
+    acting = 3.0 * np.mod(0.1 * np.arange(20) + 1e-12, 0.5)
+    np.testing.assert_allclose(speed, 0.1 * np.concatenate([[0.0], np.cumsum(acting)[:-1]]), atol=1e-7)
+
+
+# The input before the first cycle
+MASS, PERIOD = 2.0, 1e-2
+PLANT = fp.Plant(
+    coordinates={"y": "m"},
+    inputs={"u": "N"},
+    parameters={"m": fp.Parameter(MASS, MASS, "kg")},
+    response=lambda q, v, u, p: {"y": u.u / p.m},
+)
+COST = fp.Quadratic(states={"y": 1.0}, effort={"u": 1e-3})
+PROBLEM = fp.Problem(
+    plant=PLANT,
+    reference=fp.Trajectory(lambda t: {"y": 1.0 + 0.0 * ca.sin(t)}),
+    start={"y": 1.0},
+    period=PERIOD,
+    duration=0.2,
+    horizon=fp.Horizon(stages=5, step=PERIOD),
+    cost=COST,
+)
+COMPUTED = fp.ComputedTorque(fp.Exponential(rate=6.0))
+
+
+def planned(problem: fp.Problem, optimiser: fp.Ipopt | fp.FixedPointSolver) -> float:
+    """The first planned input."""
+    run = fp.simulate(replace(problem, duration=PERIOD), fp.RecedingHorizon(optimiser), seed=0, compiled=False)
+    return float(run["command.u"][0])
+
+
+def test_it_is_zero_or_the_nearest_limit_unless_it_is_given():
+    for limits, given, expected in (
+        ({}, {}, 0.0),
+        ({"u": (2.0, 9.0)}, {}, 2.0),
+        ({"u": (-9.0, -3.0)}, {}, -3.0),
+        ({"u": (2.0, 9.0)}, {"u": 5.0}, 5.0),
+    ):
+        problem = replace(PROBLEM, limits=fp.Limits(inputs=limits), input_before=given)
+        assert problem.inputs_before.tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("before", "message"),
+    [
+        ({"w": 1.0}, "input_before: input 'w' is unknown"),
+        ({"u": 99.0}, "'u' must be a finite number within its limits, got 99.0"),
+        ({"u": float("inf")}, "finite"),
+    ],
+)
+def test_mistakes_are_named(before, message):
+    with pytest.raises(InvalidProblem, match=message):
+        replace(PROBLEM, limits=fp.Limits(inputs={"u": (-10.0, 10.0)}), input_before=before)
+
+
+def test_the_first_weight_of_a_rate_is_counted_from_it():
+    """With a rate weight that outweighs everything else the first input stays where the input was."""
+    cost = replace(COST, rate={"u": 1e9})
+    for before in (0.0, 3.0, -7.0):
+        problem = replace(PROBLEM, cost=cost, input_before={"u": before})
+        for optimiser in (fp.Ipopt(), fp.FixedPointSolver(iterations=3, tolerance=1e-3)):
+            assert planned(problem, optimiser) == pytest.approx(before, abs=1e-4)
+
+
+def test_it_acts_until_the_first_command_arrives():
+    """A mass under a constant force: y = 1 + u t^2 / (2 m) for as long as no command has arrived, by hand."""
+    waiting = 0.1
+    late = replace(PROBLEM, dead_time=fp.DeadTime(inputs={"u": waiting}), input_before={"u": 3.0})
+    run = fp.simulate(late, COMPUTED, seed=0, compiled=False)
+    times = run.time[run.time <= waiting + PERIOD / 2]
+    np.testing.assert_allclose(run["plant_state.y"][: times.size], 1 + 3.0 * times**2 / (2 * MASS), rtol=1e-12)
+
+
+LOOPS = {"two_mass": "RHC+FPI", "tumour": "RHC+FPI", "crane_slots": "slots+FPI"}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_run_of_what_is_shared_is_that_of_the_problem_that_is_built_anew(name):
+    """Of the plant that moves and of the model that becomes it, after the first problem has run."""
+    task = fp.load_problem(name)
+    problem = replace(task.problem.of_model, duration=15 * task.problem.period, measure_from=0.0)
+    plain, known = task.controllers[LOOPS[name]], fp.ExactModel(task.controllers[LOOPS[name]])
+    first = fp.simulate(problem, plain, seed=0, compiled=False)
+    exact = problem.plant.exact * 1.05
+    values = zip(problem.plant.parameters.items(), exact, strict=True)
+    anew = replace(
+        problem, plant=replace(problem.plant, parameters={n: replace(p, exact=float(v)) for (n, p), v in values})
+    )
+    for controller in (plain, known):
+        one, other = (fp.simulate(p, controller, seed=0, compiled=False) for p in (problem.with_exact(exact), anew))
+        np.testing.assert_array_equal(one.log, other.log)
+        assert not np.array_equal(one["plant_state"], first["plant_state"])
+    np.testing.assert_array_equal(fp.simulate(problem, plain, seed=0, compiled=False).log, first.log)

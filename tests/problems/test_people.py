@@ -1,10 +1,13 @@
-"""The patients behind a pump: their kinetics are the published ones, a loop of numpy's own has the same runs, and who fares worst.
+"""People behind a pump of an anaesthetic and of insulin: they are the published ones, and loops keep what is said of them.
 
-References: Eleveld et al., Br. J. Anaesth. 120, 2018, for its reference individual; scipy for the compartments.
+References: Eleveld et al., Br. J. Anaesth. 120, 2018, for its reference individual; scipy for the compartments; a loop of numpy's
+own; the run of two days and the states at rest of jxx123/simglucose, commit a6f6777 (Magni et al. for the grid: `test_pictures`).
 """
 
+import csv
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from runpy import run_path
 from types import SimpleNamespace
 from typing import Any
@@ -33,9 +36,7 @@ def written() -> Any:
 
 def patient(name: str) -> SimpleNamespace:
     """Exact parameters of a case, with its dead time in min."""
-    cases = task().cases
-    assert cases is not None
-    changes = cases.changes[name]
+    changes = task().cases.changes[name]
     own = {path.partition(".")[2]: value for path, value in changes.items() if path.startswith("exact.")}
     return SimpleNamespace(**own, late=changes["dead_time.inputs.target"])
 
@@ -120,19 +121,15 @@ class InConcentrations:
 )
 def test_a_loop_of_its_own_has_the_same_run(name, controller, law):
     """With exact compartments in place of Runge-Kutta steps, without noise, over the induction and the beginning of surgery."""
-    cases = task().cases
-    assert cases is not None
-    problem = replace(cases.problem(name, task().problem), sensing=fp.Sensing(), duration=25.0)
+    problem = replace(task().cases.problem(name, task().problem), sensing=fp.Sensing(), duration=25.0)
     run = fp.simulate(problem, task().controllers[controller], seed=0, compiled=False)
     np.testing.assert_allclose(run["plant_state.bis"], own_loop(name, law(), 300), atol=2e-4)
 
 
 def test_the_drawn_people_have_the_published_distribution():
     """Variances of the logarithms within four standard errors of a sample of a hundred; medians of the curve at 35 years."""
-    cases = task("anaesthesia_drawn").cases
-    assert cases is not None
     own = {
-        n: np.array([c[f"exact.{n}"] for c in cases.changes.values()])
+        n: np.array([c[f"exact.{n}"] for c in task("anaesthesia_drawn").cases.changes.values()])
         for n in ("age", "weight", "C50", "ke0", "times_V1")
     }
     people = len(own["age"])
@@ -152,9 +149,8 @@ def test_a_curve_may_be_steeper_beyond_its_middle():
     patient = written().patient
     values = dict(zip(patient.parameters, patient.exact, strict=True))
     values |= {"E0": 93.0, "Emax": 93.0, "C50": 3.0, "steepness": 1.89, "times_above": 1.47 / 1.89}
-    drawn = task("anaesthesia_drawn").cases
-    assert drawn is not None
-    assert all(case[f"exact.{n}"] == values[n] for case in drawn.changes.values() for n in ("steepness", "times_above"))
+    drawn = task("anaesthesia_drawn").cases.changes.values()
+    assert all(case[f"exact.{n}"] == values[n] for case in drawn for n in ("steepness", "times_above"))
     for reached, steepness in ((1.5, 1.89), (6.0, 1.47)):
         state = [reached if e == "own_Ce" else 0.0 for e in patient.state.elements]
         bis = patient.equations.output(state, [0.5], list(values.values()), np.zeros(len(patient.names)))
@@ -173,3 +169,69 @@ def test_the_monitor_is_its_transfer_function():
     _, shown, _ = lsim(system, changes, fine, interp=False)
     index = run["reality_state.index"]
     np.testing.assert_allclose(index, 92.0 + shown[::100][: len(index)], atol=2e-2)
+
+
+TWO_DAYS = Path(__file__).parents[1] / "data" / "diabetes" / "two_days.csv"
+BASAL = 0.0139333333333  # U/min
+# Meals of the recording, by its row of 3 min: the minute of the row in which it begins, g, and the dose of the next row in U/min.
+MEALS = {
+    172: (1, 56, 1.56949166667), 214: (2, 59, 1.948875), 291: (0, 13, 0.375041666667), 369: (2, 79, 2.208375),
+    638: (1, 54, 1.51393333333), 669: (0, 7, 0.543966666667), 709: (2, 63, 1.76393333333), 784: (1, 8, 0.236158333333),
+    828: (0, 73, 2.04170833333),
+}  # fmt: skip
+EATING = 5.0  # g/min
+# Of adolescent#001, in the order of the source: Gp, Gt, Ip, X, I1, Id, Il, two depots, Gs.
+PUBLISHED: tuple[float, ...] = (250.621836, 176.506559902, 4.697517762, 0.0, 97.554, 97.554, 3.19814917262)
+PUBLISHED += (57.951224472, 93.2258828462, 250.621836)
+
+
+def body(name: str) -> tuple[fp.Problem, fp.Plant, np.ndarray, np.ndarray]:
+    """Problem, map of a minute, state at the start and parameters of a person."""
+    problem = task("diabetes").cases.problem(name, task("diabetes").problem)
+    minute = replace(problem.reality.plant, steps=1)
+    return problem, minute, np.array([*problem.start_state, 0.0, 0.0]), np.array(minute.exact)
+
+
+def test_two_published_days_are_met():
+    """The same doses and meals give the glucose of the other simulator, which has a variable step, to 1e-4 mg/dl."""
+    _, minute, x, p = body("adolescent#001")
+    names, calm = list(minute.parameter.elements), np.zeros(len(minute.names))
+    carbs, basal, volume = (names.index(name) for name in ("carbs", "basal", "Vg"))
+    with TWO_DAYS.open() as file:
+        published = {int(k): float(v) for k, v in list(csv.reader(line for line in file if line[0] != "#"))[1:]}
+    left, apart, none = 0.0, [], (0, 0, BASAL)
+    for k in range(max(published)):
+        glucose, dose = [], MEALS.get(k - 1, none)[2]
+        for m in range(3):
+            left += MEALS[k][1] if k in MEALS and MEALS[k][0] == m else 0.0
+            p[carbs] = min(EATING, left)
+            left -= p[carbs]
+            x = np.asarray(minute.equations.next(x, 60 * dose - p[basal], p, calm)).ravel()
+            glucose.append(x[minute.names.index("Gs")] / p[volume])
+        if k + 1 in published:
+            apart.append(abs(np.mean(glucose) - published[k + 1]))
+    assert len(apart) == 48
+    assert max(apart) < 1e-4
+
+
+def test_everybody_rests_with_the_basal_dose():
+    """Nothing moves in a minute, by 1e-10, in any person of the table; the first one's rest is the published one."""
+    _, minute, x, _ = body("adolescent#001")
+    for own in task("diabetes").cases.changes.values():
+        start = np.array([own.get(f"start.{n}", 0.0) for n in minute.names])
+        parameters = np.array([own.get(f"exact.{n}", 0.0) for n in minute.parameter.elements])
+        after = np.asarray(minute.equations.next(start, 0.0, parameters, np.zeros(len(minute.names)))).ravel()
+        assert np.abs(after - start).max() < 1e-10
+    names = ("Gp", "Gt", "Ip", "X", "I1", "Id", "Il", "depot1", "depot2", "Gs")
+    np.testing.assert_allclose(x[[minute.names.index(n) for n in names]], PUBLISHED, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(f"child#{k:03d}", marks=[] if k == 4 else pytest.mark.slow) for k in range(1, 11)]
+)
+def test_children_eat_what_is_stated_and_are_safe_with_the_pid_law(name):
+    """Five meals of 220 g a day, minute by minute; the lowest glucose of every child is at least 94 mg/dl."""
+    of = task("diabetes")
+    run = fp.simulate(of.cases.problem(name, of.problem), of.controllers["PID"], seed=0, compiled=False)
+    assert run["signals.carbs"].sum() * of.problem.period == pytest.approx(2 * 220.0, rel=1e-12)
+    assert run["plant_output.glucose"].min() >= 94.0
