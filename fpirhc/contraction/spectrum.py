@@ -167,8 +167,6 @@ class ContractionReport:
     """
 
     predicted: float  # max|1 - a lambda|, the factor of an error of the request per cycle
-    effective_gain: float  # a of the deformation
-    own: tuple[str, float]  # the gain that the user sets, per unit of the effective gain
     linear_limit: tuple[float, float]  # interval of the effective gain in which small errors converge
     sector_limit: tuple[float, float]  # interval of the effective gain in which errors of any size converge
     text: str  # the verdict, for a reader
@@ -191,7 +189,7 @@ def assess_gain(
         linear, sector = linear_limit(eigenvalues), sector_limit(deformation, eigenvalues)
     except NotContractive as error:
         none = (0.0, 0.0)
-        return ContractionReport(predicted, gain, (name, 0.0), none, none, str(error))
+        return ContractionReport(predicted, none, none, str(error))
     scale, what, fault = value / gain, with_its_gain(deformation), ""
     near, any_size = ((max(lower, -largest), min(upper, largest)) for lower, upper in (linear, sector))
     ends = [abs(scale * sum(limit)) for limit in (near, any_size)]  # one end of a limit is zero
@@ -213,7 +211,7 @@ def assess_gain(
         converging = remedy
     if fault:
         text, converging = f"{fault}; {converging}", ""
-    return ContractionReport(predicted, gain, (name, scale), near, any_size, text, converging)
+    return ContractionReport(predicted, near, any_size, text, converging)
 
 
 _WINDOW = 15  # times (number of coordinates + 1): the cycles that are used; the transient of a useful gain is shorter

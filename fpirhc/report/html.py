@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from fpirhc.simulation.picture import Drawing
     from fpirhc.studies import View
-    from fpirhc.studies.compare import Comparison, Contraction
+    from fpirhc.studies.compare import Comparison
 
 
 @dataclass(frozen=True)
@@ -62,17 +62,26 @@ def render(comparison: Comparison) -> str:
     for e in comparison.entries:
         if e.run.spans():
             slots.setdefault(e.run.layout["desired"].elements, []).append(e.name)
+    drawn = {line["name"] for chart in series["charts"] if "only" in chart for line in chart["series"]}
     return render_page(
         "comparison.html",
         comparison.view,
         (*scripts, f"const DATA={data};\n{asset('report.js')}"),
         slots=slots,
+        curves={n: what for n, what in CURVES.items() if n in drawn},
         bands=BANDS,
         real=any("real" in chart for chart in series["charts"]),
         own=own,
         motions=motions,
-        contraction=any("across" in chart for chart in series["charts"]),
     )
+
+
+CURVES = {
+    "nominal": "what the plan or the reference foresees",
+    "desired": "what the controller wants, with feedback of the error",
+    "deformed": "the request that the model gets in its place, where it differs",
+    "realised": "what the plant did",
+}  # of responses
 
 
 def own_pictures(comparison: Comparison) -> tuple[list[Image], list[dict[str, Any]]]:
@@ -123,8 +132,7 @@ def render_page(name: str, view: View, scripts: Sequence[str] = (), **context: A
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-    illustrated = ["Contraction"] if context.get("contraction") else []  # lists that stand above their pictures
-    context |= {"in_full": IN_FULL, "policy": Markup(policy), "illustrated": illustrated, "chart": context.get("chart")}
+    context |= {"in_full": IN_FULL, "policy": Markup(policy), "chart": context.get("chart")}
     return template.render(view=view, styles=styles, scripts=every, **context)
 
 
@@ -200,7 +208,6 @@ def chart_data(comparison: Comparison) -> dict[str, Any]:
         if n not in real[0].run.layout["state"].elements:  # the model does not have it
             lines = [(e.name, e.run[f"reality_state.{n}"]) for e in real]
             charts.append({**_chart(n, real[0].run.unit(f"reality_state.{n}"), lines, edges), "real": True})
-    charts += contraction_charts(comparison)
     middles = 0.5 * np.diff(edges) * longest.period
     shown = [{"name": e.name, "color": colours[e.name], "ended": bool(e.run.stop)} for e in entries]
     for one, e in zip(shown, entries, strict=True):
@@ -231,7 +238,6 @@ def _round(values: Sequence[float] | np.ndarray) -> list[float]:
     return [float(f"{v:.5g}") for v in np.asarray(values).tolist()]
 
 
-_BEYOND = 1.2  # of the linear limit, up to which the factor is drawn
 _GOLDEN = 0.618034  # of a turn, from hue to hue
 
 
@@ -241,26 +247,3 @@ def colours_of(comparison: Comparison) -> dict[str, str]:
     extra = (f"#{''.join(f'{round(255 * one):02x}' for one in colour)}" for colour in more)
     of_file = dict(zip(comparison.task.controllers, (*PALETTE, *extra), strict=False))
     return {e.name: of_file[e.name] for e in comparison.entries if e.run.cycles > 1}
-
-
-def contraction_charts(comparison: Comparison) -> list[dict[str, Any]]:
-    """Return a chart of the factor for every gain by its own name and scale, where a run has measured it."""
-    groups: dict[tuple[str, float], list[tuple[str, Contraction]]] = {}
-    for entry in comparison.entries:
-        if (known := entry.contraction) is not None and np.isfinite(known.measured):
-            name, scale = known.report.own  # where no gain converges: of the effective gain
-            own = (name, float(f"{scale:.9g}")) if scale else ("effective gain", 1.0)
-            groups.setdefault(own, []).append((entry.name, known))
-    return [_chart_of_factor(name, scale, same) for (name, scale), same in groups.items()]
-
-
-def _chart_of_factor(gain: str, scale: float, entries: Sequence[tuple[str, Contraction]]) -> dict[str, Any]:
-    own, spectrum = [one.report.effective_gain for _, one in entries], entries[0][1].spectrum
-    limit = max((end for _, one in entries for end in one.report.linear_limit), key=abs) or 1.0
-    gains = np.unique(scale * np.append(np.linspace(0, _BEYOND * limit, INTERVALS), own))
-    bound = np.abs(1 - gains[:, None] / scale * spectrum.ravel()).max(axis=1)
-    lines = [("bound", bound), ("limit", np.ones(gains.size))]
-    lines += [(n, np.where(gains == scale * one.report.effective_gain, one.measured, np.nan)) for n, one in entries]
-    series = [{"name": name, "values": finite_alone(_round(line))} for name, line in lines]
-    across = {"label": gain, "values": _round(gains)}
-    return {"title": "contraction factor of the iteration alone", "unit": "1", "series": series, "across": across}

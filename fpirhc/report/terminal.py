@@ -46,6 +46,7 @@ STYLES: dict[Outcome | None, str] = {  # by the outcome that a sentence states
     Outcome.NOT_COMPARABLE: "dim",
     Outcome.LIMIT_LEFT: "bold red",
     Outcome.LEAVES: "bold red",
+    Outcome.NOT_GOOD: "yellow",
 }
 _GLUE = "\ue000"  # in place of a space that is held
 _NAMED = 24  # characters of a name that stand on one line where there is little room
@@ -72,10 +73,8 @@ def show(view: View, report: Path, *, verbose: bool = False) -> None:
     `verbose`: print every sentence, every column and everything else that is said of a study.
     """
     say(view.study.title, "bold", f" {view.conditions}")
-    sentences = list(view.sentences)
-    show_sentences(shown := sentences if verbose else sentences[:1])
+    show_sentences(one for k, one in enumerate(view.sentences) if verbose or not k or one[1] in IN_FULL)
     say(f"other pairs: {view.others}") if view.others and not verbose else None
-    show_sentences(one for one in sentences[len(shown) :] if one[1] in IN_FULL)
     for table in view.tables:
         if table.rows:
             narrow = replace(table.narrow, title="" if table.title == view.study.title else table.title)

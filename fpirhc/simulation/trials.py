@@ -24,10 +24,10 @@ from fpirhc.deformation.base import Deformation
 from fpirhc.describe import identity
 from fpirhc.errors import FpirhcError, HarmfulAdaptation
 from fpirhc.fields.user_code import users_level
-from fpirhc.plant.motion import with_exact_parameters, with_space
+from fpirhc.plant.motion import derivative_unit, with_exact_parameters, with_space
 from fpirhc.plant.plant import Plant
 from fpirhc.simulation.metrics import by_name
-from fpirhc.simulation.metrics.shipped import at_limit, rms_error
+from fpirhc.simulation.metrics.shipped import at_limit, rms_error, total_variation
 from fpirhc.simulation.run import Run, judged_motion
 from fpirhc.simulation.simulate import Simulator, simulator
 from fpirhc.summary import written_out
@@ -224,6 +224,7 @@ class ErrorPair:
     # share of the cycles in which a command stands at a limit, of the run where it is smaller; NaN where one ended before
     # errors count
     at_limit: float = 0.0
+    movement: str = ""  # total variation of every command without adaptation and with it, in words
 
     @property
     def worst(self) -> str:
@@ -265,7 +266,13 @@ def errors_of(problem: Problem, runs: Sequence[Run], names: frozenset[str] | Non
     every = ({n: v for n, v in rms_error(problem, run).items() if names is None or n in names} for run in runs)
     before, after = ({n: v if math.isfinite(v) else math.inf for n, v in one.items()} for one in every)
     stuck = float(np.min([at_limit(problem, run) for run in runs]))  # NaN where one of them is
-    return ErrorPair(before, after, _ranges(problem, runs[0]), problem.plant.followed, stuck)
+    moved = [total_variation(problem, run) for run in runs]
+    each = (
+        f"{n} {' -> '.join(written_out(m[n]) for m in moved)}{with_space(derivative_unit(unit, 1, problem.time_unit))}"
+        for n, unit in problem.plant.inputs.items()
+    )
+    movement = f"total variation: {', '.join(each)}"
+    return ErrorPair(before, after, _ranges(problem, runs[0]), problem.plant.followed, stuck, movement)
 
 
 def _ranges(problem: Problem, run: Run) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -20,7 +20,7 @@ from fpirhc.errors import FpirhcError, InvalidName, InvalidProblem, Mistakes, No
 from fpirhc.fields.checked import checked_call
 from fpirhc.fields.kinds import Seed
 from fpirhc.plant.chain import response_names
-from fpirhc.plant.motion import SECONDS, with_space
+from fpirhc.plant.motion import SECONDS
 from fpirhc.problem_files.problem_file import Task, pair_of
 from fpirhc.problem_files.shipped import shipped_folders
 from fpirhc.review.experiments import slips
@@ -75,20 +75,13 @@ class Contraction:
     growing: float  # share of the cycles in which small errors grow
     measured: float  # NaN: the response is late, or does not move in every direction
     report: ContractionReport
-    spectrum: np.ndarray
 
-    def said(self, run: Run, lost: Collection[str]) -> str:
-        """What it leaves of an error, which gains converge, and the rms distance of every response from what was desired."""
-        near = np.sqrt(np.mean((run["realised"][1:] - run["desired"][:-1]) ** 2, axis=0))
-        named = zip(run.layout["desired"].elements, near, strict=True)
-        each = (f"{n} {written_out(v)}{with_space(run.unit(f'desired.{n}'))}" for n, v in named)
-        one, text = self.report, "No factor is measured: the response is late, or does not move in every direction"
-        if np.isfinite(self.measured):  # a fit is right within two hundredths
-            wrong = one.converging and self.measured > one.predicted + 0.02
-            text = f"Measured factor {written_out(self.measured)}{': the bound does not hold here' * bool(wrong)}"
-        if one.converging and run.controller not in lost:
-            text = f"The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review. {text}"
-        return f"{one.text}. {text}; realised - desired, rms: {', '.join(each)}."
+    def said(self, lost: bool) -> str:
+        """What it leaves of an error, which gains converge, and what the run shows."""
+        one, text = self.report, f"{self.report.text}."
+        if one.converging and not lost:
+            text += f" The iteration alone converges for {one.converging}; the loop may bear less: fpirhc review."
+        return text + f" The run shows {written_out(self.measured)}." * bool(np.isfinite(self.measured))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,26 +159,28 @@ class Comparison(Study):
         docs = {c.metric: (c.metric.function.__doc__ or "").partition("\n")[0] for c in shown}
         said = {metric: text.removeprefix("Return ").rstrip(".") for metric, text in docs.items()}
         heads = [Column(c.heading, c.short if c.metric.main else None, note=said[c.metric]) for c in shown]
-        heads = [Column("controller"), *heads, Column("cycle / 99 % / longest [us]"), Column("status", left=True)]
+        heads = [Column("controller"), Column("status", left=True), *heads, Column("cycle / 99 % / longest [us]")]
         caption = "; ".join(f"{m.short or m.heading}: {text}" for m, text in said.items() if m.main and text)
         table = Table(self.title, heads, caption)
         for e in self.entries:
             numbers = [(c, c.number(e.metrics)) for c in shown]
-            marked = [k for k, (c, v) in enumerate(numbers, 1) if e.name in rivals and v == best.get(c, np.nan)]
+            marked = [k for k, (c, v) in enumerate(numbers, 2) if e.name in rivals and v == best.get(c, np.nan)]
             texts = [c.text(v, missing="", none="none") for c, v in numbers]
             cycle = " / ".join(map(written_out, e.cycle[:3]))
-            table.add([e.name, *texts, cycle, self._status(e)], "red" if e.left else "", marked)
+            table.add([e.name, self._status(e), *texts, cycle], "red" if e.left else "", marked)
         problem = self.task.problem
         about = f"Errors from t = {number(problem.measure_from)} {problem.time_unit} on, seed {self.seed}."
         notes = [CLOCK] * any(e.cycle for e in self.entries)
         notes += [f"{e.name}: {note}" for e in self.entries for note in e.notes]
-        sentences = [(finding.text, finding.outcome) for finding in self.findings]
-        null = [f"{e.name}: {e.null.sentence}" for e in self.entries if e.null is not None]
+        colours = [f.outcome for f in self.findings]
+        if colours[0] is Outcome.BETTER and Outcome.NOT_GOOD in colours:
+            colours[0] = Outcome.NOT_GOOD
+        null = [f"{e.name}: {e.null.sentence}; {e.null.movement}" for e in self.entries if e.null is not None]
         lists = {"Notes": notes, f"Null tests: {NULL}": null}
         lost = {f.pair[1] for f in self.findings if f.pair and f.outcome in (Outcome.WORSE, Outcome.NOT_COMPARABLE)}
         lost |= self.lost
-        lists["Contraction"] = [f"{e.name}: {e.contraction.said(e.run, lost)}" for e in self.entries if e.contraction]
-        return View(self, sentences, about, (table.filled,), self._facts(), lists)
+        lists["Contraction"] = [f"{e.name}: {c.said(e.name in lost)}" for e in self.entries if (c := e.contraction)]
+        return View(self, [*zip(self.verdict, colours, strict=True)], about, (table.filled,), self._facts(), lists)
 
     def _status(self, entry: Entry) -> str:
         """What speaks against a run; 'ok' where nothing does."""
@@ -193,6 +188,7 @@ class Comparison(Study):
             said = ["ended early" if stop in self.findings[0].text else f"ended early: {stop.partition(';')[0]}"]
         else:
             said = ["does not follow"] * (entry.name in self.lost) + [status_shares(entry.metrics.statuses)]
+            said += [s for s, _ in self._yard.shortfalls(entry, not said[0] and self.task.headline_metric is None)]
         said += [f"late {in_percent(late)}" for late in entry.cycle[3:] if late > LATE]
         said += [f"leaves {', '.join(one.name for one in entry.left)}"] * bool(entry.left)
         return ", ".join(filter(None, said)) or "ok"
@@ -312,7 +308,7 @@ def _contraction(problem: Problem, controller: Controller, run: Run, metrics: Me
     growing, measured = metrics["contraction.growing"][""], metrics["contraction.measured"].get("", np.nan)
     growing = 0.0 if late else growing  # behind a delay the iteration is another one, which was asked before the run
     largest = largest_behind_estimator(problem, controller.deformation)
-    return Contraction(growing, measured, assess_gain(controller.deformation, spectrum, late, largest), spectrum)
+    return Contraction(growing, measured, assess_gain(controller.deformation, spectrum, late, largest))
 
 
 def _has_exact_model(problem: Problem, controller: Controller) -> bool:

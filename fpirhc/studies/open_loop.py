@@ -42,11 +42,8 @@ class Certificate:
         curvature: least eigenvalue of M^-1 H; a plan where it is not positive is no strict minimum.
         active: number of limits of states with a multiplier.
         complementarity: largest product of a multiplier and the distance of its limit, in units of the cost.
-        broken: the worst violations of limits in words.
     """
 
-    stationarity: float
-    feasibility: float
     factor: float
     error: float
     input_error: float
@@ -55,20 +52,18 @@ class Certificate:
     curvature: float
     active: int = 0
     complementarity: float = 0.0
-    broken: tuple[str, ...] = ()
 
 
 @checked_call
 def certify(plan: Plan) -> Certificate:
     """Return what is known about a plan, a solved horizon, for full Gauss-Newton steps."""
-    _, stationarity, feasibility = plan.verify()
     slope, hessian = _second_order(plan, plan.inputs)
     free, held = _free(plan, plan.inputs, slope), _active_limits(plan)
     active = len(held.rows)
-    about = active, held.complementarity, plan.violations()
+    about = active, held.complementarity
     basis = _directions(free, held)
     if not basis.shape[1]:
-        return Certificate(stationarity, feasibility, 0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
+        return Certificate(0.0, 0.0, 0.0, 0.0, 0, float("inf"), *about)
     model, pull = basis.T @ _model(plan) @ basis, basis.T @ slope
     norm = model + _ROUNDING * np.trace(model) * np.eye(model.shape[0])
     move = np.linalg.solve(model, pull)
@@ -85,8 +80,7 @@ def certify(plan: Plan) -> Certificate:
     spread = float(np.sqrt(np.einsum("ij,jk,ik->i", basis, np.linalg.inv(model), basis).max()))
     suboptimality = length**2 / (2 * (1 - factor)) + held.complementarity * active if factor < 1 else float("nan")
     least, back = float(values.min()), _largest_return(held, free)
-    known = stationarity, feasibility, factor, error, spread * error + back, suboptimality, basis.shape[1], least
-    return Certificate(*known, *about)
+    return Certificate(factor, error, spread * error + back, suboptimality, basis.shape[1], least, *about)
 
 
 def _second_order(plan: Plan, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

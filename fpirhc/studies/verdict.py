@@ -132,9 +132,10 @@ class Outcome(StrEnum):
     NOT_COMPARABLE = "not comparable"
     LIMIT_LEFT = "hard limit left"  # of whatever error
     LEAVES = "leaves a limit"  # of controllers, and of no pair
+    NOT_GOOD = "not good yet"  # of one controller, whatever it is compared with
 
 
-IN_FULL = None, Outcome.LEAVES  # of the sentences that short outputs show beside the first one
+IN_FULL = None, Outcome.LEAVES, Outcome.NOT_GOOD  # of the sentences that short outputs show beside the first one
 
 
 @dataclass(frozen=True)
@@ -145,13 +146,14 @@ class Finding:
     outcome: Outcome | None = None  # of the pair that it is about; None for a remark
     pair: tuple[str, str] | None = None  # names without and with adaptation
     ratios: Mapping[str, float] = field(default_factory=dict)  # error with adaptation over that without, largest first
+    price: str = ""  # the end of the text of one that is better: what it costs
 
 
 HELPS, HURTS = 0.9, 1.1  # ratios below and above which an error has changed
 STILL = 1e-5  # of the limits' range, or of the rms command, in a cycle: what moves less stands still
 WILD, TO_AND_FRO = 10.0, 10  # times the total variation of the partner, and its own range: chatter
 UNSOLVED = 0.05  # of the plans
-AT_LIMITS = 0.2  # of the cycles: a command that is at a limit more often
+AT_LIMITS, REMAINS = 0.2, 0.1  # of the cycles, a command at a limit; of the motion, an error: what is more is not good
 SWING = 0.05  # of the limits' range: as a sine from end to end in 11 cycles, or jumps between the ends every 10
 MINOR, ROUNDING = 0.01, 1e-9  # of the largest relative error, and of the range, below which an error does not count
 _SAMPLES = 2000
@@ -208,7 +210,28 @@ class Yardstick:
 
     def beyond(self, entry: Entry, name: str) -> bool:
         """Whether an error is larger than the motion itself, and than what stands for it where nothing is to move."""
-        return entry.errors[name] > max(one[name] for one in (self.scales, self.resting) if name in one)
+        return entry.errors[name] > self._motion(name)
+
+    def _motion(self, name: str) -> float:
+        return max(one[name] for one in (self.scales, self.resting) if name in one)
+
+    def shortfalls(self, entry: Entry, by_error: bool) -> list[tuple[str, str]]:
+        """Return what is not good yet of a run that ends: in the words of a table, and of a sentence."""
+        shares = self._remains(entry) if by_error else 0.0, entry.metrics["at_limit"][""]
+        error, stands = map(in_percent, shares)
+        far = f"errs {error}", f"still errs by {error} of the motion in the second half"
+        stuck = f"at a limit {stands}", f"stands at a limit in {stands} of the cycles"
+        return [far] * (REMAINS < shares[0] < math.inf) + [stuck] * (shares[1] > AT_LIMITS)
+
+    def _remains(self, entry: Entry) -> float:
+        """The rms error in the second half of the cycles that count, when a start is over, as a share of the motion."""
+        counted, errors = np.flatnonzero(measured_cycles(self.problem, entry.run)), np.abs(entry.run["true_error"])
+        late, sizes = errors[counted[len(counted) // 2 :]], dict[str, float]()
+        for name, first in zip(self.problem.judged_names, errors[0], strict=True):
+            steps = not self.problem.disturbances and first > 0.99 * self.scales[name]  # from the start to a set-point
+            sizes[name] = self.scales[name] if steps else self._motion(name)
+        every = dict(zip(sizes, np.sqrt((late**2).sum(axis=0) / max(len(late), 1)).tolist(), strict=True))
+        return relative({n: v for n, v in every.items() if entry.weighed is None or n in entry.weighed}, sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,12 +294,6 @@ def _swing(pair: Pair) -> float:
     return float((far / np.maximum(high - low, TINY)).max(initial=0.0))
 
 
-def _misfit(pair: Pair) -> float:
-    """The measured contraction factor, where the error falls all the same."""
-    fell = all(pair.adaptive.errors[n] < pair.plain.errors[n] for n in pair.names)
-    return pair.adaptive.metrics["contraction.measured"].get("", math.nan) if fell else math.nan
-
-
 def _at(pair: Pair) -> str:
     """The limit at which a command stands most."""
     problem, run = pair.yard.problem, pair.adaptive.run
@@ -336,8 +353,6 @@ FLAGS = (  # of rows with one measure the first that is raised
     Flag(_moved, 2.0, "the total variation of its command is {value} times that without adaptation"),
     Flag(lambda pair: math.nan if pair.adaptive.contraction is None else pair.adaptive.contraction.growing, 0.05,
          "its contraction factor is above 1 in {value:%} of the cycles: see the gain in fpirhc review"),
-    Flag(_misfit, 1.0, "its measured contraction factor is {value}, though errors fall: noise, friction, rounding or a limit is in "
-         "the fit, too"),
     Flag(_diverges, 0.0, f"with {NULL} it diverges", True),
     Flag(_null, 10.0, _HARMS, True),
     Flag(_null, 0.0, _HARMS),
@@ -388,7 +403,8 @@ def judge(plain: Entry, adaptive: Entry, yard: Yardstick) -> Finding:
     units = {n: with_space(run.unit(f"error.{n}")) for n in ratios}
     errors = ", ".join(f"{n} {written_out(before[n])} -> {written_out(after[n])}{unit}" for n, unit in units.items())
     text = f"{names[1]} against {names[0]}: {outcome} (rms error {errors or 'of rounding'}, {yard.span})."
-    return Finding(" ".join([text, *(f"{s[0].upper()}{s[1:]}." for s in said)]), outcome, names, ratios)
+    more = " ".join(f"{s[0].upper()}{s[1:]}." for s in said)
+    return Finding(f"{text} {more}".rstrip(), outcome, names, ratios, more if outcome is Outcome.BETTER else "")
 
 
 def _of_lost(lost: Collection[str], adaptive: Entry) -> Outcome:
@@ -438,10 +454,20 @@ def findings(
         judged = [Finding("No controller is here both with and without adaptation.", Outcome.NOT_COMPARABLE)]
     left, first = leaves(entries), judged[0]
     own = any(by_name[name].left for name in first.pair or ())
-    judged[0] = replace(first, text=" ".join([*causes, *[left] * own, first.text]))
+    judged[0] = replace(first, text=" ".join([*causes, *[left] * own, first.text.removesuffix(first.price).rstrip()]))
     judged += [Finding(left, Outcome.LEAVES)] * bool(left and not own)
+    judged[1:1] = [*_not_good(first, by_name, yard, aim.metric is None), *[Finding(first.price)] * bool(first.price)]
     judged += [Finding(text) for text in _remarks(entries, pairs, yard)]
     return (*judged, *(Finding(f"Not run: {', '.join(names)} ({why}).") for why, names in by_reason(skipped).items()))
+
+
+def _not_good(first: Finding, entries: Mapping[str, Entry], yard: Yardstick, by_error: bool) -> list[Finding]:
+    """A sentence about the better one of the first pair; of two that are alike, about the simpler one."""
+    if first.pair is None or first.outcome in (Outcome.NOT_COMPARABLE, Outcome.LIMIT_LEFT):
+        return []
+    name = first.pair[first.outcome in (Outcome.BETTER, Outcome.DOUBTFUL, Outcome.MIXED)]
+    texts = [text for _, text in yard.shortfalls(entries[name], by_error)]
+    return [Finding(f"{name} {' and '.join(texts)}.", Outcome.NOT_GOOD)] if texts else []
 
 
 def follows(entry: Entry, yard: Yardstick) -> bool:

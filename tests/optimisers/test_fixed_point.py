@@ -292,15 +292,6 @@ def test_bounds_hold_with_active_limits_of_states():
         assert np.abs(plan.inputs - best.inputs).max() <= certificate.input_error + 1e-8
 
 
-def test_violated_limits_are_named_in_the_certificate():
-    """A horizon that no input can keep: the limit, its stage, and by how much."""
-    limits = fp.Limits(inputs={"torque": (-0.1, 0.1)}, states={"angle": (0.9, 1.0)})
-    ocp, data = pendulum_problem(limits=limits)
-    plan = fp.solve(ocp, fp.FixedPointSolver(iterations=1, tolerance=1e-6), np.array([0.6, 0.0]), data)
-    assert plan.status == fp.Status.INFEASIBLE
-    assert "below 0.9, at stage" in fp.certify(plan).broken[1]
-
-
 # At rest on the reference the first plan is the feedforward: the optimum of cost zero, wherever the set-point is
 MANY = 12  # set-points of every plant
 

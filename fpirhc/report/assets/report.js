@@ -10,7 +10,6 @@ const LINES = {
   nominal: ["#009e73", 1.6, [2, 4]],
   reference: [null, 1.2, [5, 4]],
   "set-point": [null, 1.2, [1, 3]],
-  limit: [null, 1.2, [5, 4]],
 };
 const styles = getComputedStyle(document.documentElement), ink = styles.getPropertyValue("--ink").trim();
 // The palette's black is the page's ink, which is light where the page is dark.
@@ -26,7 +25,7 @@ function zoomAll(source, key) {
   if (key !== "x" || zooming) return;
   zooming = true;
   const { min, max } = source.scales.x;
-  for (const plot of plots) if (plot.chart !== source && !plot.spec.across) plot.chart.setScale("x", { min, max });
+  for (const plot of plots) if (plot.chart !== source) plot.chart.setScale("x", { min, max });
   zooming = false;
 }
 
@@ -66,7 +65,7 @@ function follow(chart) {
   if (chart.cursor.left >= 0) for (const one of players) one.follow(chart.posToVal(chart.cursor.left, "x"));
 }
 function point(time) {
-  for (const { chart, box, spec } of plots) if (!box.hidden && !spec.across) chart.setCursor({ left: chart.valToPos(time, "x"), top: -10 }, false);
+  for (const { chart, box } of plots) if (!box.hidden) chart.setCursor({ left: chart.valToPos(time, "x"), top: -10 }, false);
 }
 
 // All boxes stand in the grid before a chart is drawn: a box that is alone in it is as wide as the page.
@@ -78,13 +77,13 @@ function place(spec) {
   const bounded = (low ?? high ?? null) === null ? "" : `, limits ${low ?? "-∞"} to ${high ?? "∞"}`;
   title.textContent = `${spec.title} [${spec.unit}]${bounded}`;
   box.append(title);
-  document.getElementById(spec.only ? "responses" : spec.real ? "reality" : spec.across ? "contraction" : "charts").append(box);
+  document.getElementById(spec.only ? "responses" : spec.real ? "reality" : "charts").append(box);
   return { box, spec };
 }
 
 function draw({ box, spec }) {
-  const across = spec.across || { label: "t [" + DATA.timeUnit + "]", values: DATA.time };
-  const series = [{ label: across.label }].concat(
+  const label = "t [" + DATA.timeUnit + "]";
+  const series = [{ label }].concat(
     spec.series.map((s) => {
       const [color, width, dash] = LINES[s.name] || [null, 1.2];
       return {
@@ -103,12 +102,12 @@ function draw({ box, spec }) {
     height: HEIGHT,
     series,
     scales: { x: { time: false }, y: { range: rangeOfValues(() => ended(spec), spec.limits) } },
-    axes: [{ ...axis, ...labelled, values: AXIS_OF_VALUES.values, label: across.label }, { ...axis, ...AXIS_OF_VALUES }],
-    cursor: spec.across ? {} : { sync: { key: sync.key } },
+    axes: [{ ...axis, ...labelled, values: AXIS_OF_VALUES.values, label }, { ...axis, ...AXIS_OF_VALUES }],
+    cursor: { sync: { key: sync.key } },
     legend: { markers: { dash: (_, k) => (series[k].label === "set-point" ? "dotted" : series[k].dash ? "dashed" : "solid") } }, // names with the line that they name; values while the mouse is there
-    hooks: spec.across ? {} : { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => limits(chart, spec)] },
+    hooks: { setCursor: [follow], setScale: [zoomAll], drawClear: [(chart) => bands(chart, spec)], draw: [(chart) => limits(chart, spec)] },
   };
-  const chart = new uPlot(options, [across.values, ...spec.series.map((s) => s.values)], box);
+  const chart = new uPlot(options, [DATA.time, ...spec.series.map((s) => s.values)], box);
   plots.push({ chart, box, spec });
 }
 
@@ -126,7 +125,6 @@ function show() {
       box.hidden = !shown.has(spec.only) || shown.size > 2;
       continue;
     }
-    box.hidden = Boolean(spec.across) && !spec.series.some((s) => shown.has(s.name));
     spec.series.forEach((s, k) => {
       if (s.name in colors) chart.setSeries(k + 1, { show: shown.has(s.name) });
     });
