@@ -1,19 +1,23 @@
-"""Rivals: each law does what its textbook says, fits or is refused before a run, and is one step in C as in CasADi."""
+"""Rivals: each law does what its source says, is the iteration where theory says so, and fits or is refused before a run."""
 
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 import pytest
-from helpers.plants import chain, linear, pendulum
+from helpers.plants import chain, linear, swing
 from helpers.plants import simulated as simulate
+from scipy.linalg import expm
 
 import fpirhc as fp
 from fpirhc.errors import InvalidProblem
 
 RATE = 6.0
+
 TRACK = fp.Exponential(rate=RATE)
+
 SIGMOID = fp.Sigmoid(gain=-0.5, scale=10.0)
+LOAD = {"y": fp.Step(at=0.3, size=-2.0)}
 
 
 def resting(plant, start=1.0, *, name="y", **changes):
@@ -25,13 +29,6 @@ def resting(plant, start=1.0, *, name="y", **changes):
         "period": 1e-2,
         "duration": 3.0,
     }
-    return fp.Problem(**{**settings, **changes})
-
-
-def swing(**changes):
-    """A pendulum along a sine, with a wrong model."""
-    settings = {"reference": fp.Trajectory(lambda t: {"angle": 0.5 * ca.sin(2 * t)}), "start": {"angle": 0.1}}
-    settings |= {"plant": pendulum(), "period": 1e-3, "duration": 4.0, "measure_from": 2.0}
     return fp.Problem(**{**settings, **changes})
 
 
@@ -225,7 +222,122 @@ def test_adaptation_has_the_computed_limit(share, grows):
     assert (speeds[200:].max() > speeds[:60].max()) == grows
 
 
-# What fits, and what does not
+# Where they are the fixed-point iteration, command by command
+
+
+def first_order():
+    """Y' = 1.7 u, believed y' = u, and the response is the last difference: what deadbeat observers have."""
+    moving, last = fp.Trajectory(lambda t: {"y": ca.sin(3 * t)}), fp.Sensing(estimator=fp.VelocityDifference())
+    first = {"b": fp.Parameter(1.0, 1.7, "1")}
+    plant = fp.Plant({"y": "m"}, {"u": "N"}, first, lambda q, u, p: {"y": p.b * u.u}, order=1)
+    return resting(plant, 0.2, reference=moving, sensing=last, duration=1.0, disturbances=LOAD)
+
+
+def assert_same(problem, one, other):
+    """Both give the same commands, to rounding."""
+    first, second = (simulate(problem, c)["command"] for c in (one, other))
+    assert np.ptp(second) > 0.1
+    np.testing.assert_allclose(first, second, rtol=0, atol=1e-12 * max(1.0, np.abs(second).max()))
+
+
+def iterated(gain, tracking=TRACK):
+    """Computed torque with the model-referenced affine map of that effective gain."""
+    return fp.ComputedTorque(tracking, fp.ModelReferenced(fp.Affine(gain=-2 * gain)))
+
+
+@pytest.mark.parametrize("limits", [(-50.0, 50.0), (-1.5, 1.5)])
+def test_indi_is_the_iteration_of_unit_gain(limits):
+    """The law u + G^-1 (d - f) and the affine map of unit gain, with a wrong model, also where commands are clipped."""
+    problem = swing(limits=fp.Limits(inputs={"torque": limits}))
+    assert_same(problem, fp.rivals.INDI(TRACK), iterated(1.0))
+    late = replace(problem, dead_time=fp.DeadTime({"torque": 0.02}, measurement=0.01))
+    assert fp.rivals.INDI(TRACK).notes(problem) == ()
+    assert "a command 0.03 s older: dead time is not compensated" in fp.rivals.INDI(TRACK).notes(late)[0]
+
+
+def test_deadbeat_observer_of_adrc_is_the_iteration_of_unit_gain():
+    """For order one z_2 is the last difference less b_0 u."""
+    law = fp.Exponential(rate=RATE, integral=False)
+    assert_same(first_order(), fp.rivals.ADRC(RATE, observer=1e6), iterated(1.0, law))
+
+
+def test_l1_is_the_iteration_on_differences_as_its_predictor_gets_slow():
+    """Of the effective gain 1 - exp(-w_c T)."""
+    problem, law = first_order(), fp.Exponential(rate=RATE, integral=False)
+    rival = fp.rivals.L1Adaptive(law, bandwidth=60.0, predictor=1e-10)
+    assert_same(problem, rival, iterated(-np.expm1(-60.0 * problem.period), law))
+
+
+# Published equations
+
+
+def test_filter_of_indi_has_the_poles_of_its_transfer_function():
+    """w^2 / (s^2 + 2 zeta w s + w^2) with w = 50 rad/s and zeta = 0.55 (Smeur, Chu, de Croon 2016), and gain one at rest."""
+    period, frequency, damping = 1 / 512, 50.0, 0.55
+    first, second = fp.rivals.INDI(TRACK, frequency).filter(period)
+    poles = np.roots([1.0, -first, -second])
+    wanted = np.exp(period * np.roots([1.0, 2 * damping * frequency, frequency**2]))
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(wanted), rtol=1e-9)
+
+
+@pytest.mark.parametrize(("frequency", "gain", "grows"), [(None, 1.9, False), (None, 2.1, True), (50.0, 2.1, False)])
+def test_indi_diverges_beyond_twice_the_gain_of_the_model_unless_it_is_filtered(frequency, gain, grows):
+    law = fp.rivals.INDI(fp.Exponential(rate=1.0), frequency)
+    load = {"y": fp.Step(at=0.1, duration=0.05, size=1.0)}
+    responses = simulate(resting(linear(gain, 1.0), 0.2, disturbances=load), law)
+    late = np.abs(responses["realised.y"][-20:] - responses["desired.y"][-21:-1]).max()
+    assert late > 1.0 if grows else late < 0.02
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_observer_of_adrc_has_all_poles_at_its_bandwidth(order):
+    """Eigenvalues of (1 - l c) Phi (Miklosovic, Radke, Gao 2006), and its published gains for orders one and two."""
+    period, plant, law = 1e-2, chain(order), fp.rivals.ADRC(2.0, observer=20.0)
+    pole, moves = np.exp(-0.2), expm(np.eye(order + 1, k=1) * period)
+    gains = np.array(law.corrections(plant, order, period))
+    polynomial = np.poly(moves - np.outer(gains, moves[0]))
+    np.testing.assert_allclose(polynomial, np.poly(np.full(order + 1, pole)), atol=1e-9)
+    published = {1: [1 - pole**2, (1 - pole) ** 2 / period]}
+    published[2] = [1 - pole**3, 1.5 * (1 - pole) ** 2 * (1 + pole) / period, (1 - pole) ** 3 / period**2]
+    if order in published:
+        np.testing.assert_allclose(gains, published[order], rtol=1e-9)
+
+
+def test_adrc_estimates_the_total_disturbance_of_a_motion_system():
+    """Y'' = -1.41 y' + 23.2 T_d + 23.2 u, told as y'' = 40 u: z_3 is all of the rest, and the load leaves no error (Gao 2003)."""
+    plant = fp.Plant(
+        {"y": "rev"},
+        {"u": "V"},
+        {"b": fp.Parameter(40.0, 23.2, "rev/(s^2 V)"), "c": fp.Parameter(0.0, 1.41, "1/s")},
+        lambda q, v, u, p: {"y": p.b * u.u - p.c * v.y},
+    )
+    load = {"y": fp.Step(at=2.0, size=-23.2)}
+    result = simulate(
+        resting(plant, 0.2, disturbances=load, duration=5.0, period=1e-3), fp.rivals.ADRC(20.0, observer=100.0)
+    )
+    rest = -23.2 - 1.41 * result["state.y'"] + (23.2 - 40.0) * result["command.u"]
+    assert result["extended_state.y''"][-1] == pytest.approx(rest[-1], rel=1e-6)
+    assert abs(result["error.y"][-1]) < 1e-9
+    assert np.abs(result["error.y"][2000:]).max() > 1e-3
+
+
+@pytest.mark.parametrize("predictor", [1.0, 20.0])
+def test_l1_leaves_the_published_share_of_a_load(predictor):
+    """The piecewise-constant law estimates exp(-a_s T) of the mean residual of the last cycle."""
+    problem = resting(chain(2), 0.2, disturbances=LOAD)
+    seen = simulate(problem, fp.rivals.L1Adaptive(TRACK, bandwidth=200.0, predictor=predictor))[
+        "response_disturbance.y"
+    ]
+    assert seen[-1] == pytest.approx(-2.0 * np.exp(-predictor * problem.period), rel=1e-6)
+
+
+def test_every_rival_has_its_name_in_one_module():
+    """What is a controller of the literature is found there, and by its name at the top."""
+    for name in fp.rivals.__all__:
+        assert getattr(fp, name) is getattr(fp.rivals, name)
+
+
+# What does not fit
 
 
 def cart_pole():
