@@ -1,6 +1,7 @@
-"""Calls with values that nobody expected raise an error of the library, which says what is wrong, and no raw one."""
+"""Whatever a user names or gives: what is not there or nobody expected is one clear error of the library, and no raw one."""
 
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -10,10 +11,13 @@ import pytest
 from helpers import tasks
 
 import fpirhc as fp
-from fpirhc.errors import InvalidField, InvalidName
+from fpirhc.errors import InvalidField, InvalidName, InvalidProblem, NotSupported
 
-brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.02, measure_from=0.0))
-adaptive = cache(lambda: tasks.two_mass.controllers["CTC+FPI (eq 6)"])
+brief = cache(lambda: replace(tasks.two_mass.problem, duration=0.05, measure_from=0.0))
+NAME = "CTC+FPI (eq 6)"
+
+adaptive = cache(lambda: tasks.two_mass.controllers[NAME])
+
 HUGE = 10**400  # a whole number that is no float
 
 
@@ -85,3 +89,97 @@ def test_names_of_the_inner_modules_are_offered_as_those_of_the_package():
         with pytest.raises(InvalidName, match=f"Did you mean '{meant}'"):
             getattr(module, name)
         assert not hasattr(module, "_no_such_name")
+
+
+# Whatever has names as keys: a name that is not there is one error with the nearest valid one
+
+
+def mappings(value: Any, path: str, seen: set[int]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Every mapping in public fields of a value of this library, and of the values in them, with its path."""
+    if id(value) in seen:
+        return
+    seen.add(id(value))
+    inner: list[tuple[str, Any]] = []
+    if isinstance(value, Mapping):
+        if all(isinstance(key, str) for key in value):
+            yield path, value
+        inner = [(f"{path}[{key!r}]", content) for key, content in value.items()]
+    elif isinstance(value, tuple):
+        inner = [(f"{path}[{k}]", content) for k, content in enumerate(value)]
+    elif is_dataclass(value) and type(value).__module__.startswith("fpirhc"):
+        names = [f.name for f in fields(value) if not f.name.startswith("_")]
+        inner = [(f"{path}.{name}", getattr(value, name)) for name in names]
+    for where, content in inner:
+        yield from mappings(content, where, seen)
+
+
+def measured() -> Any:
+    """A run and its metrics."""
+    run = fp.simulate(brief(), tasks.two_mass.controllers["RHC+FPI"], seed=0, compiled=False)
+    found = fp.measure(brief(), run)
+    return run, found, found.statuses, found["cost"], found["plans"]
+
+
+def stepped() -> Any:
+    """What a stepper tells, with live settings."""
+    stepper = fp.Stepper(brief(), tasks.two_mass.controllers["RHC+FPI"], live=["deformation.gain"], compiled=False)
+    stepper.step_measured(0.0, np.zeros(len(stepper.measures)), stepper.start())
+    return stepper.trace(), stepper.numbers, stepper.setpoints
+
+
+def reviewed() -> Any:
+    return fp.review(brief(), {NAME: adaptive()}, mismatch=5.0, seed=0)
+
+
+# The problem, its plant and limits, the controllers and the ranges of the tuning; and results.
+MADE = [(lambda: tasks.two_mass, 12), (measured, 20), (stepped, 3), (reviewed, 8)]
+
+
+@pytest.mark.parametrize(("made", "least"), MADE)
+def test_every_mapping_has_one_error_for_a_missing_name(made, least):
+    value = made()
+    found = list(mappings(value, type(value).__name__, set()))
+    assert len(found) >= least
+    lost = ("no such name", 3, ["a list"])
+    assert [path for path, mapping in found if not all(tells(mapping, n) for n in lost)] == []
+
+
+def tells(mapping: Mapping[str, Any], name: Any) -> bool:
+    """Whether a missing name has the one error, with the name."""
+    try:
+        mapping[name]
+    except InvalidName as error:
+        return str(name) in str(error)
+    except (KeyError, TypeError):
+        return False
+    return False
+
+
+def test_the_nearest_name_is_offered():
+    with pytest.raises(InvalidName, match=r"^Task\.controllers has no '.*'\. Did you mean 'RHC\+FPI'"):
+        tasks.two_mass.controllers["RHC+FP"]
+    with pytest.raises(InvalidName, match=r"^Plant\.parameters has no"):
+        tasks.two_mass.problem.plant.parameters["mm"]
+    with pytest.raises(KeyError):
+        tasks.two_mass.controllers["nothing like it"]
+
+
+@pytest.mark.parametrize("name", ["q1_rate", "q1_dot", "q1dot", "dq1", "q1_velocity", "speed_q1"])
+def test_a_derivative_is_known_by_the_spellings_of_others(name):
+    with pytest.raises(InvalidProblem, match=f"state '{name}' is unknown. Did you mean \"q1'\""):
+        replace(tasks.two_mass.problem, start={**tasks.two_mass.problem.start, name: 0.0})
+    with pytest.raises(InvalidName, match=r"For a derivative: .*Largest\(\"state.q1'\""):
+        fp.study(tasks.two_mass, fp.Draws(1), metric=f"rms_error.{name}")
+
+
+def test_what_a_frozen_value_holds_stays():
+    """A start that was changed in place was shown, and the run began at the old one; the error says what to do."""
+    problem = tasks.two_mass.problem
+    start: Any = problem.start
+    body: Any = problem.plant.parameters
+    with pytest.raises(NotSupported, match=r"Problem\.start cannot be changed in place.*\{\*\*start, name: value\}"):
+        start["q1"] = 1.0
+    for change in (body.clear, body.popitem, lambda: body.pop("m1"), lambda: body.update({})):
+        with pytest.raises(NotSupported, match=r"Plant\.parameters cannot be changed"):
+            change()
+    assert replace(problem, start={**problem.start, "q1": 1.0}).start_state[0] == 1.0
